@@ -1,0 +1,1 @@
+"""Procedures: a plan, the analysis of its frames, a calibration."""

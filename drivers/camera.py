@@ -1,0 +1,178 @@
+"""The camera interface."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.device import Device
+from drivers.frame import Frame
+
+TriggerMode = Literal["free_run", "software", "hardware"]
+
+
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """A region of interest in sensor pixels before binning."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def as_tuple(self) -> tuple[int, int, int, int]:
+        """Return ``(top, left, height, width)``."""
+        return (self.top, self.left, self.height, self.width)
+
+
+class Camera(Device):
+    """An area camera.
+
+    Each ``set_...`` asks the device for a value and returns what the device says it now has. A value
+    outside the device's limits raises :class:`~drivers.errors.LimitError` and changes nothing.
+    Settings may not be changed while a sequence runs, except exposure and gain.
+    """
+
+    # What the sensor is ------------------------------------------------------------------------
+    @property
+    @abstractmethod
+    def sensor_shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the whole sensor in pixels, before binning."""
+
+    @property
+    @abstractmethod
+    def pixel_pitch_um(self) -> float:
+        """Pitch of the unbinned pixels, micrometres."""
+
+    @property
+    @abstractmethod
+    def pixel_formats(self) -> tuple[str, ...]:
+        """Pixel formats that the camera offers, by their GenICam names."""
+
+    # Settings ----------------------------------------------------------------------------------
+    @property
+    @abstractmethod
+    def exposure_ms(self) -> float:
+        """Exposure time, milliseconds."""
+
+    @property
+    @abstractmethod
+    def exposure_limits_ms(self) -> tuple[float, float]:
+        """Shortest and longest exposure, milliseconds."""
+
+    @abstractmethod
+    def set_exposure_ms(self, exposure_ms: float) -> float:
+        """Set the exposure; returns what the device made of it, milliseconds."""
+
+    @property
+    @abstractmethod
+    def gain(self) -> float:
+        """Electronic gain as a factor (1.0 = base gain)."""
+
+    @property
+    @abstractmethod
+    def gain_limits(self) -> tuple[float, float]:
+        """Smallest and largest gain factor."""
+
+    @abstractmethod
+    def set_gain(self, gain: float) -> float:
+        """Set the gain factor; returns what the device made of it."""
+
+    @property
+    @abstractmethod
+    def black_level(self) -> float:
+        """Offset that the camera adds, counts."""
+
+    @abstractmethod
+    def set_black_level(self, black_level: float) -> float:
+        """Set the offset in counts; returns what the device made of it."""
+
+    @property
+    @abstractmethod
+    def roi(self) -> Roi:
+        """Region of interest in sensor pixels before binning."""
+
+    @abstractmethod
+    def set_roi(self, roi: Roi | None) -> Roi:
+        """Set the region of interest (None: the whole sensor); returns what the device made of it."""
+
+    @property
+    @abstractmethod
+    def binning(self) -> int:
+        """Sensor pixels summed along each axis."""
+
+    @property
+    @abstractmethod
+    def binnings(self) -> tuple[int, ...]:
+        """The binning factors that the camera offers."""
+
+    @abstractmethod
+    def set_binning(self, binning: int) -> int:
+        """Set the binning; returns what the device made of it."""
+
+    @property
+    @abstractmethod
+    def pixel_format(self) -> str:
+        """Pixel format by its GenICam name."""
+
+    @abstractmethod
+    def set_pixel_format(self, pixel_format: str) -> str:
+        """Set the pixel format; returns what the device made of it."""
+
+    @property
+    @abstractmethod
+    def significant_bits(self) -> int:
+        """Bits that carry signal in the present pixel format."""
+
+    @property
+    @abstractmethod
+    def trigger_mode(self) -> TriggerMode:
+        """What starts an exposure."""
+
+    @abstractmethod
+    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
+        """Choose what starts an exposure; returns what the device made of it."""
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the frames that the present ROI and binning give."""
+        roi = self.roi
+        return (roi.height // self.binning, roi.width // self.binning)
+
+    # Taking images -----------------------------------------------------------------------------
+    @abstractmethod
+    def snap(self) -> Frame:
+        """Take one frame whose exposure begins after this call, and wait for it.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            When no frame came in the time the exposure and read-out need, with a margin.
+        StoppedError
+            When ``stop_sequence`` was called from another thread meanwhile.
+        """
+
+    @abstractmethod
+    def start_sequence(self, n_buffers: int = 8) -> None:
+        """Start continuous acquisition into a fixed ring of ``n_buffers`` frames."""
+
+    @abstractmethod
+    def next_frame(self, timeout_s: float) -> Frame:
+        """Return the oldest frame of the running sequence not yet fetched; waits up to ``timeout_s``.
+
+        When the ring overflowed, the frames lost are counted in the returned frame's ``dropped_before``.
+        """
+
+    @abstractmethod
+    def trigger(self) -> None:
+        """Send one software trigger to a sequence that runs in trigger mode ``"software"``."""
+
+    @abstractmethod
+    def stop_sequence(self) -> None:
+        """End the running sequence (or a pending ``snap``) at once. Without one it does nothing."""
+
+    @property
+    @abstractmethod
+    def is_streaming(self) -> bool:
+        """Whether a sequence runs."""

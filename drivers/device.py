@@ -1,0 +1,87 @@
+"""What every device has in common: identity, open and close, settings as read back."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Who a device says it is.
+
+    ``simulated`` is true for every device without hardware behind it; windows, logs and files then show
+    the word SIMULATED.
+    """
+
+    kind: str
+    """``"camera"``, ``"stage"``, ``"led_array"`` or ``"slm"``."""
+    driver: str
+    """Name under which the driver is registered, e.g. ``"simulated"``."""
+    vendor: str
+    model: str
+    serial_number: str
+    firmware: str
+    simulated: bool
+
+    def __str__(self) -> str:
+        mark = " (SIMULATED)" if self.simulated else ""
+        return f"{self.vendor} {self.model}, serial {self.serial_number}, firmware {self.firmware}{mark}"
+
+
+class Device(ABC):
+    """A device that can be opened, asked who it is, asked for its settings, and closed.
+
+    ``close`` brings the device to its safe state (light off, motion stopped, streaming ended) and never
+    raises because it was closed before. A device is a context manager.
+    """
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """The device as error messages name it, e.g. ``"stage (simulated)"``."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect and bring the device to its safe state. Opening an open device does nothing.
+
+        Raises
+        ------
+        DeviceError
+            When it is missing, busy or does not answer.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Bring the device to its safe state and disconnect. Closing a closed device does nothing."""
+
+    @property
+    @abstractmethod
+    def is_open(self) -> bool:
+        """Whether the device is connected."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> DeviceIdentity:
+        """Who the device says it is; needs an open device."""
+
+    @abstractmethod
+    def settings(self) -> Mapping[str, Setting]:
+        """All settings as the device reports them now, with units in the names; needs an open device."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,102 @@
+"""The LED array interface and the patterns it shows."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.device import Device
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class LedPattern:
+    """Which LEDs are lit and how brightly.
+
+    Attributes
+    ----------
+    description : str
+        In words, as logs and metadata show it: ``"off"``, ``"bright field NA 0.25"``, ``"LED 12"``.
+    levels : tuple of (index, (red, green, blue))
+        LEDs that are on; each level 0 to 255. All others are dark.
+    """
+
+    description: str
+    levels: tuple[tuple[int, Rgb], ...] = ()
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether no LED is lit."""
+        return all(rgb == (0, 0, 0) for _, rgb in self.levels)
+
+
+OFF = LedPattern("off")
+
+
+class LedArray(Device):
+    """An array of RGB LEDs. It is dark after ``open`` and after ``close``."""
+
+    @property
+    @abstractmethod
+    def led_positions_mm(self) -> npt.NDArray[np.float64]:
+        """``(n_leds, 3)`` positions x, y, z of the LEDs in millimetres, in the array's own frame."""
+
+    @property
+    @abstractmethod
+    def led_na(self) -> npt.NDArray[np.float64]:
+        """``(n_leds, 2)`` sines of the illumination angle in x and y at the array's centre of view."""
+
+    @property
+    @abstractmethod
+    def wavelengths_nm(self) -> tuple[float, float, float]:
+        """Centre wavelengths of red, green and blue, nanometres."""
+
+    @property
+    @abstractmethod
+    def pattern(self) -> LedPattern:
+        """The pattern shown now."""
+
+    @abstractmethod
+    def set_pattern(self, pattern: LedPattern) -> LedPattern:
+        """Show a pattern and return it once the device has confirmed.
+
+        Raises
+        ------
+        LimitError
+            When an index or a level is out of range; the pattern shown stays.
+        """
+
+    @abstractmethod
+    def off(self) -> None:
+        """Turn every LED off. Callable from any thread; overtakes whatever is running."""
+
+    # Patterns every array can make ---------------------------------------------------------------
+    def single(self, index: int, rgb: Rgb = (255, 255, 255)) -> LedPattern:
+        """One LED."""
+        return LedPattern(f"LED {index} rgb {rgb}", ((index, rgb),))
+
+    def bright_field(self, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
+        """All LEDs whose illumination falls inside the numerical aperture ``na``."""
+        return self._select(f"bright field NA {na:g} rgb {rgb}", self._radius() <= na, rgb)
+
+    def dark_field(self, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
+        """All LEDs whose illumination falls outside the numerical aperture ``na``."""
+        return self._select(f"dark field NA {na:g} rgb {rgb}", self._radius() > na, rgb)
+
+    def dpc_half(self, side: str, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
+        """Half of the bright field (A.2); ``side`` is ``"left"``, ``"right"``, ``"top"`` or ``"bottom"``."""
+        x, y = self.led_na[:, 0], self.led_na[:, 1]
+        halves = {"left": x < 0, "right": x > 0, "top": y > 0, "bottom": y < 0}
+        if side not in halves:
+            raise ValueError(f"DPC half {side!r} is unknown; choose one of {', '.join(halves)}.")
+        return self._select(f"DPC {side} NA {na:g} rgb {rgb}", halves[side] & (self._radius() <= na), rgb)
+
+    def _radius(self) -> npt.NDArray[np.float64]:
+        return np.hypot(self.led_na[:, 0], self.led_na[:, 1])
+
+    def _select(self, description: str, chosen: npt.NDArray[np.bool_], rgb: Rgb) -> LedPattern:
+        return LedPattern(description, tuple((int(i), rgb) for i in np.flatnonzero(chosen)))

@@ -1,0 +1,1 @@
+"""The simulated bench: the embedded default, shown everywhere as SIMULATED."""

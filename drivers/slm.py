@@ -1,0 +1,48 @@
+"""The spatial light modulator interface."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.device import Device
+
+
+class Slm(Device):
+    """A spatial light modulator that shows 8-bit grey levels. It is blank (all zero) after ``open``."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """``(height, width)`` in pixels."""
+
+    @property
+    @abstractmethod
+    def pixel_pitch_um(self) -> float:
+        """Pixel pitch, micrometres."""
+
+    @property
+    @abstractmethod
+    def settle_ms(self) -> float:
+        """Time from a confirmed image to settled optics, milliseconds; ``display`` waits for it."""
+
+    @abstractmethod
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Show ``(height, width)`` uint8 grey levels, confirmed and settled when this returns.
+
+        Raises
+        ------
+        LimitError
+            When shape or dtype do not fit; the image shown stays.
+        """
+
+    @property
+    @abstractmethod
+    def displayed(self) -> npt.NDArray[np.uint8]:
+        """The grey levels shown now, ``(height, width)`` uint8, read only."""
+
+    def blank(self) -> None:
+        """Show all zeros."""
+        self.display(np.zeros(self.shape, np.uint8))

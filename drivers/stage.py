@@ -1,0 +1,114 @@
+"""The motion stage interface."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.device import Device
+
+
+@dataclass(frozen=True, slots=True)
+class StageAxis:
+    """One axis of a stage.
+
+    ``name`` ends in the axis' unit: ``x_um``, ``y_um``, ``z_um``, ``roll_mrad``, ``pitch_mrad``,
+    ``yaw_mrad``.
+    The limits are soft limits in that unit; speed is in units a second; ``resolution`` is the smallest step.
+    """
+
+    name: str
+    lower_limit: float
+    upper_limit: float
+    speed_per_s: float
+    resolution: float
+
+    @property
+    def unit(self) -> str:
+        """The part of the name after the last underscore."""
+        return self.name.rsplit("_", 1)[-1]
+
+
+class Stage(Device):
+    """A motion stage of one to six axes.
+
+    Positions are in the units that the axis names end in. A target outside the soft limits raises
+    :class:`~drivers.errors.LimitError` that names every offending axis, and nothing moves: no move is ever
+    clipped. ``stop`` may be called from any thread at any time, overtakes a running move and makes the
+    call that waits for it raise :class:`~drivers.errors.StoppedError`.
+    """
+
+    @property
+    @abstractmethod
+    def axes(self) -> tuple[StageAxis, ...]:
+        """The stage's axes."""
+
+    @abstractmethod
+    def position(self) -> dict[str, float]:
+        """Where the stage says it is, by axis name."""
+
+    @abstractmethod
+    def home(self) -> None:
+        """Find the reference of every axis; blocks until done."""
+
+    @property
+    @abstractmethod
+    def is_homed(self) -> bool:
+        """Whether positions refer to a known reference."""
+
+    @abstractmethod
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        """Move the named axes to absolute positions; the others stay.
+
+        Parameters
+        ----------
+        target : mapping of axis name to position
+        wait : bool
+            Block until the move has ended.
+
+        Returns
+        -------
+        dict
+            The position reached (or, without waiting, the position as the move starts).
+
+        Raises
+        ------
+        LimitError
+            When any target is outside its soft limits or no finite number, an axis is unknown, or the
+            stage is not homed.
+        StoppedError
+            When ``stop`` ended the move.
+        """
+
+    def move_by(self, delta: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        """Move the named axes by the given amounts from the commanded position; errors as ``move_to``."""
+        here = self.commanded_position()
+        return self.move_to({axis: here.get(axis, 0.0) + step for axis, step in delta.items()}, wait=wait)
+
+    @abstractmethod
+    def commanded_position(self) -> dict[str, float]:
+        """Return the last target asked for (after ``stop`` or ``home``: where the stage says it is)."""
+
+    @property
+    @abstractmethod
+    def is_moving(self) -> bool:
+        """Whether any axis moves."""
+
+    @abstractmethod
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Block until a running move has ended; errors as ``move_to``."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop every axis at once. Callable from any thread; without a move it does nothing."""
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Soft limits by axis name."""
+        return {axis.name: (axis.lower_limit, axis.upper_limit) for axis in self.axes}
+
+    def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
+        """Estimated seconds for a move; axes move together, so the slowest counts."""
+        speeds = {axis.name: axis.speed_per_s for axis in self.axes}
+        return max((abs(target[a] - start[a]) / speeds[a] for a in target if a in start), default=0.0)

@@ -1,0 +1,1 @@
+"""The assembled bench: configuration, safety, acquisition, run store, command line."""

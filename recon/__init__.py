@@ -1,0 +1,1 @@
+"""Numbers only: optics, operators, priors, solvers, analysis. Knows no device, no file format, no window."""

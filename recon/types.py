@@ -1,0 +1,79 @@
+"""The data types that cross from measurement to reconstruction.
+
+Coordinates everywhere in the project: right-handed with the origin at the centre of the diffuser's aperture
+and the sensor's centre opposite to it; ``x`` along the sensor's columns (to the right in an image), ``y`` along
+its rows (downwards in an image), ``z`` from the diffuser towards the scene. A source at ``(x, y, z)`` shifts the
+pattern on the sensor by ``-(x, y) d / z`` (Kuo 2020, Eqs. 3.1 and 3.2): a picture on the sensor's grid stands
+upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / d``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """The optics that a calibration was taken with.
+
+    ``pixel_pitch_um`` is the pitch of the PSF images' pixels, after all binning. Unknown entries are None
+    (a PSF file from elsewhere tells nothing about its optics).
+    """
+
+    pixel_pitch_um: float | None = None
+    diffuser_distance_mm: float | None = None
+    """From the diffuser's textured side to the sensor."""
+    aperture_mm: tuple[float, float] | None = None
+    """``(height, width)`` of the aperture on the diffuser."""
+    wavelength_nm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Point spread functions with the source positions they belong to.
+
+    Attributes
+    ----------
+    psfs : ndarray, float32, (n_sources, n_channels, height, width)
+        Background removed, non-negative. ``n_channels`` is 1 for a grey camera. Not normalised: relative
+        brightness between sources is kept.
+    source_positions_um : ndarray, float64, (n_sources, 3)
+        ``x, y, z`` of the source for each PSF, micrometres; NaN where unknown.
+    background : ndarray, float32, (n_channels, height, width), or None
+        What was subtracted (dark frame and stray light), in counts.
+    geometry : Geometry
+    quality : mapping
+        Figures of merit by name, JSON-compatible.
+    provenance : mapping
+        Where it came from (run, bench, software versions), JSON-compatible.
+    """
+
+    psfs: npt.NDArray[np.float32]
+    source_positions_um: npt.NDArray[np.float64]
+    background: npt.NDArray[np.float32] | None = None
+    geometry: Geometry = field(default_factory=Geometry)
+    quality: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.psfs.ndim != 4 or self.psfs.dtype != np.float32:
+            raise ValueError(
+                "psfs must be float32 (n_sources, n_channels, height, width), "
+                f"not {self.psfs.dtype} {self.psfs.shape}."
+            )
+        if self.source_positions_um.shape != (len(self.psfs), 3):
+            raise ValueError(
+                f"source_positions_um must be ({len(self.psfs)}, 3) for {len(self.psfs)} PSFs, "
+                f"not {self.source_positions_um.shape}."
+            )
+        if self.background is not None and self.background.shape != self.psfs.shape[1:]:
+            raise ValueError(
+                f"background must have the shape of one PSF {self.psfs.shape[1:]}, not {self.background.shape}."
+            )
