@@ -6,7 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict
 
 Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
 
@@ -34,12 +36,44 @@ class DeviceIdentity:
         return f"{self.vendor} {self.model}, serial {self.serial_number}, firmware {self.firmware}{mark}"
 
 
+class DriverOptions(BaseModel):
+    """The keys that a driver adds to its device's table in ``bench.toml``; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SharedPart(ABC):
+    """What several drivers of one bench share, built once: the simulated world, a multi-device controller.
+
+    Its options come from the top-level table ``table`` of ``bench.toml``.
+    """
+
+    table: ClassVar[str]
+    Options: ClassVar[type[DriverOptions]]
+
+    @abstractmethod
+    def __init__(self, options: DriverOptions) -> None: ...
+
+
 class Device(ABC):
     """A device that can be opened, asked who it is, asked for its settings, and closed.
 
     ``close`` brings the device to its safe state (light off, motion stopped, streaming ended) and never
-    raises because it was closed before. A device is a context manager.
+    raises because it was closed before. A device is a context manager. Constructing one touches no hardware.
+
+    Parameters
+    ----------
+    options : DriverOptions
+        An instance of the driver's own ``Options``: the keys of its table in ``bench.toml``.
+    shared : SharedPart, optional
+        The bench's instance of the class that the driver names as ``Shared``, if it names one.
     """
+
+    Options: ClassVar[type[DriverOptions]] = DriverOptions
+    Shared: ClassVar[type[SharedPart] | None] = None
+
+    @abstractmethod
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None: ...
 
     @property
     @abstractmethod

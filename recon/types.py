@@ -1,10 +1,10 @@
 """The data types that cross from measurement to reconstruction.
 
-Coordinates everywhere in the project: right-handed with the origin at the centre of the diffuser's aperture
-and the sensor's centre opposite to it; ``x`` along the sensor's columns (to the right in an image), ``y`` along
-its rows (downwards in an image), ``z`` from the diffuser towards the scene. A source at ``(x, y, z)`` shifts the
-pattern on the sensor by ``-(x, y) d / z`` (Kuo 2020, Eqs. 3.1 and 3.2): a picture on the sensor's grid stands
-upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / d``.
+Coordinates everywhere in the project: the origin is the centre of the diffuser's aperture, the sensor's centre
+lies opposite to it; ``x`` runs along the sensor's columns (to the right in an image), ``y`` along its rows
+(downwards in an image), ``z`` from the diffuser towards the scene. A source at ``(x, y, z)`` shifts the pattern
+on the sensor by ``-(x, y) d / z`` (Kuo 2020, Eqs. 3.1 and 3.2): a picture on the sensor's grid stands upside
+down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / d``.
 """
 
 from __future__ import annotations
@@ -75,5 +75,6 @@ class Calibration:
             )
         if self.background is not None and self.background.shape != self.psfs.shape[1:]:
             raise ValueError(
-                f"background must have the shape of one PSF {self.psfs.shape[1:]}, not {self.background.shape}."
+                f"background must have the shape of one PSF {self.psfs.shape[1:]}, "
+                f"not {self.background.shape}."
             )
