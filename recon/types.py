@@ -1,10 +1,10 @@
 """The data types that cross from measurement to reconstruction.
 
-Coordinates everywhere in the project: the origin is the centre of the diffuser's aperture, the sensor's centre
-lies opposite to it; ``x`` runs along the sensor's columns (to the right in an image), ``y`` along its rows
-(downwards in an image), ``z`` from the diffuser towards the scene. A source at ``(x, y, z)`` shifts the pattern
-on the sensor by ``-(x, y) d / z`` (Kuo 2020, Eqs. 3.1 and 3.2): a picture on the sensor's grid stands upside
-down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / d``.
+Coordinates everywhere in the project: the origin is the centre of the diffuser's aperture, the sensor's
+centre lies opposite to it; ``x`` runs along the sensor's columns (to the right in an image), ``y`` along its
+rows (downwards in an image), ``z`` from the diffuser towards the scene. A source at ``(x, y, z)`` shifts the
+pattern on the sensor by ``-(x, y) d / z`` (Kuo 2020, Eqs. 3.1 and 3.2): a picture on the sensor's grid stands
+upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / d``.
 """
 
 from __future__ import annotations
