@@ -1,0 +1,178 @@
+"""Pictures of results, drawn without a screen (Matplotlib's Agg canvas; no global state is touched)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Image = npt.NDArray[np.floating]
+
+_INK = "#22303c"
+_FAINT = "#8496a5"
+_ACCENT = "#d1495b"
+_SECOND = "#00798c"
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One picture of a summary: grey (height, width) or colour (height, width, 3), any scale."""
+
+    title: str
+    image: Image
+    caption: str = ""
+    pixel_mm: float | None = None
+    """Size of one pixel, for a scale bar; None draws none."""
+    gamma: float = 1.0
+    """Display value = (value / white) ** gamma; below 1 lifts the shadows."""
+    white: float | None = None
+    """Value shown as white; the 99.8th percentile by default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """Error against time, for the plot below the pictures."""
+
+    seconds: Sequence[float]
+    values: Sequence[float]
+    label: str
+    reached: str = ""
+    """A word or two at the last point, e.g. ``"26.1 dB"``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What one run of the bench shows at a glance: four pictures, the sweep, and the convergence."""
+
+    title: str
+    panels: Sequence[Panel]
+    convergence: Convergence
+    sweep: Sequence[Panel] = ()
+    lines: Sequence[tuple[str, str]] = field(default_factory=tuple)
+    """Facts listed beside the plot: name and value."""
+    simulated: bool = False
+    """Writes SIMULATED over the figure."""
+
+
+def summary_figure(summary: Summary) -> Figure:
+    """Draw a summary: pictures on top, the axial sweep as a strip, convergence and facts below.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        In a notebook it shows itself; :func:`save_figure` writes it.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = 3 if summary.sweep else 2
+    heights = [3.1, 1.15, 2.5] if summary.sweep else [3.1, 2.5]
+    figure = Figure(figsize=(14.0, sum(heights) + 1.5), dpi=100, facecolor="white")
+    FigureCanvasAgg(figure)
+    outer = figure.add_gridspec(
+        rows, 1, height_ratios=heights, hspace=0.34, left=0.035, right=0.985, top=0.885, bottom=0.075
+    )
+    pictures = outer[0].subgridspec(1, len(summary.panels), wspace=0.06)
+    for column, panel in enumerate(summary.panels):
+        _draw_panel(figure.add_subplot(pictures[0, column]), panel)
+    if summary.sweep:
+        strip = outer[1].subgridspec(1, len(summary.sweep), wspace=0.05)
+        for column, panel in enumerate(summary.sweep):
+            _draw_panel(figure.add_subplot(strip[0, column]), panel, small=True)
+    bottom = outer[rows - 1].subgridspec(1, 2, width_ratios=[1.25, 1.0], wspace=0.12)
+    _draw_convergence(figure.add_subplot(bottom[0, 0]), summary.convergence)
+    _draw_facts(figure.add_subplot(bottom[0, 1]), summary.lines)
+    figure.text(0.035, 0.955, summary.title, fontsize=17, color=_INK, weight="bold", va="center")
+    if summary.simulated:
+        figure.text(
+            0.985,
+            0.955,
+            "SIMULATED",
+            fontsize=14,
+            weight="bold",
+            color="white",
+            ha="right",
+            va="center",
+            bbox={"boxstyle": "round,pad=0.35", "facecolor": _ACCENT, "edgecolor": "none"},
+        )
+    return figure
+
+
+def save_figure(figure: Figure, path: Path | str) -> Path:
+    """Write a figure as PNG (or what the name's ending says) and return its path."""
+    target = Path(path)
+    figure.savefig(target)
+    return target
+
+
+def _draw_panel(axes: Axes, panel: Panel, *, small: bool = False) -> None:
+    white = panel.white if panel.white is not None else float(np.percentile(panel.image, 99.8))
+    shown = np.clip(panel.image / max(white, 1e-12), 0.0, 1.0) ** panel.gamma
+    axes.imshow(shown, cmap="gray", vmin=0.0, vmax=1.0, interpolation="antialiased")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_edgecolor(_FAINT)
+        spine.set_linewidth(0.6)
+    axes.set_title(panel.title, fontsize=9 if small else 13, color=_INK, loc="left", pad=3 if small else 5)
+    if panel.caption:
+        axes.set_xlabel(panel.caption, fontsize=8 if small else 10, color=_FAINT, loc="left", labelpad=4)
+    if panel.pixel_mm is not None:
+        _draw_scale_bar(axes, panel.image.shape[1], panel.image.shape[0], panel.pixel_mm)
+
+
+def _draw_scale_bar(axes: Axes, width: int, height: int, pixel_mm: float) -> None:
+    length_mm = _round_length(0.22 * width * pixel_mm)
+    length = length_mm / pixel_mm
+    left, y = 0.05 * width, 0.93 * height
+    axes.plot([left, left + length], [y, y], color="white", linewidth=2.5, solid_capstyle="butt")
+    name = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
+    axes.text(left, y - 0.025 * height, name, color="white", fontsize=9, va="bottom")
+
+
+def _round_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not longer than ``length``."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * (1 + 1e-9)))
+
+
+def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
+    seconds, values = np.asarray(convergence.seconds), np.asarray(convergence.values)
+    axes.plot(seconds, values, color=_SECOND, linewidth=2)
+    if len(seconds):
+        axes.plot(seconds[-1:], values[-1:], "o", color=_ACCENT, markersize=6)
+        axes.annotate(
+            convergence.reached,
+            (seconds[-1], values[-1]),
+            xytext=(-6, 9),
+            textcoords="offset points",
+            ha="right",
+            color=_ACCENT,
+            fontsize=11,
+            weight="bold",
+        )
+        axes.margins(x=0.02, y=0.18)
+    axes.set_xlabel("seconds of reconstruction", fontsize=10, color=_INK)
+    axes.set_title(convergence.label, fontsize=13, color=_INK, loc="left", pad=5)
+    axes.grid(True, color="#e3e8ec", linewidth=0.8)
+    axes.tick_params(labelsize=9, colors=_INK, length=0)
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_edgecolor(_FAINT)
+
+
+def _draw_facts(axes: Axes, lines: Sequence[tuple[str, str]]) -> None:
+    axes.set_axis_off()
+    step = 1.0 / max(len(lines), 8)
+    for index, (name, value) in enumerate(lines):
+        y = 1.0 - (index + 0.4) * step
+        axes.text(0.0, y, name, transform=axes.transAxes, fontsize=10.5, color=_FAINT, va="center")
+        axes.text(0.34, y, value, transform=axes.transAxes, fontsize=10.5, color=_INK, va="center")
