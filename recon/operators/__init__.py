@@ -1,0 +1,7 @@
+"""Linear operators: how an object becomes data, with exact adjoints."""
+
+from recon.operators.base import Composition, LinearOperator, estimate_norm
+from recon.operators.convolution import PadCropConvolution
+from recon.operators.erasures import Erasures
+
+__all__ = ["Composition", "Erasures", "LinearOperator", "PadCropConvolution", "estimate_norm"]

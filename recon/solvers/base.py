@@ -1,0 +1,104 @@
+"""What every iterative solver has in common: one step, a history, an end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.solvers.stopping import IterationRecord, StopCheck, StoppingRules, StopReason
+
+Array = npt.NDArray[Any]
+Callback = Callable[["Solver", IterationRecord], object]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run reached: the object on the operator's domain, how, and why it ended."""
+
+    solution: Array
+    history: tuple[IterationRecord, ...]
+    stop_reason: StopReason
+    seconds: float
+
+
+class Solver(ABC):
+    """An iterative solver of ``min_x 1/2 ||A x - b||^2 + prior(x)``.
+
+    A subclass implements :meth:`step` and :attr:`solution`, and names in ``state_names`` the attributes that
+    make up its state; that is enough for :meth:`checkpoint` and :meth:`restore`.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self) -> None:
+        self.iteration = 0
+
+    @abstractmethod
+    def step(self) -> IterationRecord:
+        """Do one iteration and return what is known of it; :meth:`run` fills in its number and time."""
+
+    @property
+    @abstractmethod
+    def solution(self) -> Array:
+        """The present iterate on the operator's domain. A view or copy: not to be written to."""
+
+    def run(
+        self,
+        rules: StoppingRules | None = None,
+        *,
+        callback: Callback | None = None,
+        cancel: threading.Event | None = None,
+    ) -> Outcome:
+        """Iterate until a rule fires.
+
+        Parameters
+        ----------
+        rules : StoppingRules, optional
+        callback : callable, optional
+            ``callback(solver, record)`` after each iteration; its time is not counted.
+        cancel : threading.Event, optional
+            Set from any thread (or from the callback) to end the run after the iteration in progress.
+        """
+        check = StopCheck(rules or StoppingRules())
+        history: list[IterationRecord] = []
+        reason: StopReason | None = None
+        start = self.solution.copy()
+        seconds = 0.0
+        while reason is None:
+            began = time.perf_counter()
+            known = self.step()
+            self.iteration += 1
+            seconds += time.perf_counter() - began
+            record = replace(known, iteration=self.iteration, seconds=seconds)
+            history.append(record)
+            reason = check(record)
+            if callback is not None:
+                callback(self, record)
+            if reason is None and cancel is not None and cancel.is_set():
+                reason = StopReason.CANCELLED
+        solution = self.solution
+        if not np.isfinite(solution).all():
+            reason, solution = StopReason.NOT_FINITE, start
+        return Outcome(solution.copy(), tuple(history), reason, seconds)
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return a copy of the state: arrays and numbers by name, to be kept and given to :meth:`restore`."""
+        state = {name: getattr(self, name) for name in ("iteration", *self.state_names)}
+        return {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in state.items()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        for name in ("iteration", *self.state_names):
+            value = state[name]
+            present = getattr(self, name)
+            if isinstance(present, np.ndarray):
+                present[...] = value
+            else:
+                setattr(self, name, value)

@@ -1,0 +1,94 @@
+"""When a solver stops, and what it records on the way."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+class StopReason(enum.StrEnum):
+    """Why a solver stopped."""
+
+    NOISE_LEVEL = "the residual is down to the expected noise"
+    CONVERGED = "the change per iteration fell below the tolerance"
+    TIME = "the time budget is spent"
+    ITERATIONS = "the number of iterations is reached"
+    CANCELLED = "cancelled"
+    NOT_FINITE = "the iterate is no longer finite; the starting point is returned"
+
+
+@dataclass(frozen=True, slots=True)
+class IterationRecord:
+    """What one iteration reached. NaN stands for what the solver does not know at this iteration."""
+
+    iteration: int
+    """Counted from 1."""
+    seconds: float
+    """Wall time since the run began, without callbacks."""
+    objective: float = np.nan
+    """``1/2 ||A x - b||^2 + prior(x)``."""
+    data_residual: float = np.nan
+    """``||A x - b||``; compare with the expected noise norm."""
+    primal_residual: float = np.nan
+    """How far the split variables disagree, relative to their size (splitting methods)."""
+    dual_residual: float = np.nan
+    """How far the optimality condition is missed, relative to its terms (splitting methods)."""
+    change: float = np.nan
+    """``||x - x_previous|| / ||x||``."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoppingRules:
+    """The rules; whichever fires first ends the run.
+
+    Attributes
+    ----------
+    iterations : int or None
+        At most so many.
+    time_s : float or None
+        Wall time budget, seconds; the iteration that runs out of it is completed.
+    tolerance : float
+        Stop when the change per iteration (and, where the solver knows them, primal and dual residual)
+        has been below this for ``patience`` iterations in a row; 0 disables.
+    noise_norm : float or None
+        Expected ``||noise||`` over the valid data; stop when the residual norm is down to it.
+    patience : int
+    """
+
+    iterations: int | None = 1000
+    time_s: float | None = None
+    tolerance: float = 1e-4
+    noise_norm: float | None = None
+    patience: int = 3
+
+    def __post_init__(self) -> None:
+        if self.iterations is None and self.time_s is None and self.tolerance <= 0:
+            raise ValueError("A run needs an end: give iterations, time_s or a tolerance above 0.")
+
+
+@dataclass(slots=True)
+class StopCheck:
+    """Applies :class:`StoppingRules` to a run as it goes."""
+
+    rules: StoppingRules
+    _calm: int = field(default=0, init=False)
+
+    def __call__(self, record: IterationRecord) -> StopReason | None:
+        """Return the reason to stop after this iteration, or None."""
+        rules = self.rules
+        if not all(np.isfinite(v) or np.isnan(v) for v in (record.data_residual, record.objective)):
+            return StopReason.NOT_FINITE
+        if rules.noise_norm is not None and record.data_residual <= rules.noise_norm:
+            return StopReason.NOISE_LEVEL
+        worst = np.nanmax([record.change, record.primal_residual, record.dual_residual, 0.0])
+        measured = not np.isnan(record.change)
+        self._calm = self._calm + 1 if measured and worst < rules.tolerance else 0
+        if rules.tolerance > 0 and self._calm >= rules.patience:
+            return StopReason.CONVERGED
+        if rules.time_s is not None and record.seconds >= rules.time_s:
+            return StopReason.TIME
+        if rules.iterations is not None and record.iteration >= rules.iterations:
+            return StopReason.ITERATIONS
+        return None

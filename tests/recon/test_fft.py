@@ -1,0 +1,114 @@
+"""The FFT layer against scipy.fft, and independence of the number of threads."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+import scipy.fft
+
+from recon import fft
+from recon.threads import in_blocks
+
+
+@pytest.fixture
+def threads():
+    before = fft.get_threads()
+    yield fft.set_threads
+    fft.set_threads(before)
+
+
+SHAPES = [((6, 7), 2), ((2, 5, 8), 2), ((2, 3, 4, 6), 3), ((9,), 1), ((1, 1), 2)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("shape", "axes"), SHAPES)
+def test_agrees_with_scipy(shape, axes, dtype):
+    x = np.random.default_rng(0).standard_normal(shape).astype(dtype)
+    X = fft.rfft(x, axes=axes)
+    tolerance = 1e-5 if dtype == np.float32 else 1e-13
+    assert pytest.approx(scipy.fft.rfftn(x, axes=range(-axes, 0)), abs=tolerance) == X
+    assert X.dtype == fft.complex_dtype(dtype)
+    back = fft.irfft(X, shape[-1], axes=axes)
+    assert back == pytest.approx(x, abs=tolerance)
+    assert back.dtype == dtype
+
+
+def test_writes_into_the_arrays_it_is_given():
+    x = np.random.default_rng(0).random((2, 6, 8))
+    out, back = np.empty((2, 6, 5), complex), np.empty_like(x)
+    assert fft.rfft(x, out=out) is out
+    assert fft.irfft(out, 8, out=back) is back
+    assert back == pytest.approx(x)
+
+
+def test_refuses_arrays_that_do_not_fit():
+    x = np.zeros((4, 6))
+    with pytest.raises(ValueError, match="complex128"):
+        fft.rfft(x, out=np.empty((4, 4), np.complex64))
+    with pytest.raises(ValueError, match="C-contiguous"):
+        fft.irfft(np.zeros((4, 8), complex)[:, ::2], 6)
+
+
+def test_fast_lengths():
+    for n in range(1, 200):
+        assert fft.fast_length(n) >= n
+        assert fft.fast_length(n, real=True) % 2 == 0
+    assert fft.fast_shape((599, 799)) == (600, 800)
+
+
+def test_result_does_not_depend_on_threads(threads):
+    x = np.random.default_rng(0).standard_normal((2, 300, 400)).astype(np.float32)
+    threads(1)
+    one = fft.rfft(x)
+    threads(3)
+    assert np.array_equal(one, fft.rfft(x))
+    with pytest.raises(ValueError, match="at least 1"):
+        threads(0)
+
+
+def test_blocks_cover_every_row_once(threads):
+    for n in (1, 2, 5):
+        threads(n)
+        for length in (1, 4, 17):
+            hits = np.zeros(length, int)
+            in_blocks(lambda a, b, hits=hits: hits[a:b].__iadd__(1), length)
+            assert (hits == 1).all()
+
+
+def test_blocks_pass_errors_on(threads):
+    threads(2)
+
+    def fail(start, _stop):
+        if start > 0:
+            raise RuntimeError("from a worker")
+
+    with pytest.raises(RuntimeError, match="from a worker"):
+        in_blocks(fail, 10)
+
+
+def test_blocks_serve_several_callers_at_once(threads):
+    threads(2)
+    totals = np.zeros((4, 100))
+
+    def caller(row):
+        for _ in range(20):
+            in_blocks(lambda a, b: totals[row, a:b].__iadd__(1), 100)
+
+    callers = [threading.Thread(target=caller, args=(i,)) for i in range(4)]
+    for c in callers:
+        c.start()
+    for c in callers:
+        c.join()
+    assert (totals == 20).all()
+
+
+def test_import_is_light():
+    code = (
+        "import sys, recon, recon.operators, recon.solvers, recon.priors, recon.metrics;"
+        "sys.exit('numba' in sys.modules or 'scipy' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,110 @@
+"""Operators: exact adjoints, agreement with brute force, safe norm bounds, centring."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import convolve2d
+
+from recon.operators import Erasures, LinearOperator, PadCropConvolution, estimate_norm
+
+
+def matrix(operator: LinearOperator) -> np.ndarray:
+    columns = np.eye(int(np.prod(operator.domain_shape)), dtype=operator.dtype)
+    return np.stack([operator.forward(c.reshape(operator.domain_shape)).ravel() for c in columns], axis=1)
+
+
+def dot_test(operator: LinearOperator, seed: int = 0) -> float:
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(operator.domain_shape).astype(operator.dtype)
+    y = rng.standard_normal(operator.range_shape).astype(operator.dtype)
+    ax, aty = operator.forward(x).astype(float), operator.adjoint(y).astype(float)
+    return abs(np.vdot(ax, y) - np.vdot(x, aty)) / (np.linalg.norm(ax) * np.linalg.norm(y))
+
+
+CASES = [
+    ((1, 7, 9), (7, 9), 1),
+    ((1, 8, 6), (8, 6), 3),
+    ((3, 5, 4), (7, 10), 3),
+    ((1, 12, 11), (6, 5), 1),
+    ((2, 1, 1), (4, 3), 2),
+    ((1, 1, 1), (1, 1), 1),
+]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("psf_shape", "sensor_shape", "n_channels"), CASES)
+def test_convolution_adjoint(psf_shape, sensor_shape, n_channels, dtype):
+    psfs = np.random.default_rng(1).random(psf_shape)
+    operator = PadCropConvolution(psfs, sensor_shape, n_channels=n_channels, dtype=dtype)
+    assert dot_test(operator) < (1e-5 if dtype == np.float32 else 1e-13)
+    assert operator.forward(np.ones(operator.domain_shape, dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize(("psf_shape", "sensor_shape", "n_channels"), CASES)
+def test_convolution_equals_direct_sum(psf_shape, sensor_shape, n_channels):
+    rng = np.random.default_rng(2)
+    psfs = rng.random(psf_shape)
+    operator = PadCropConvolution(psfs, sensor_shape, n_channels=n_channels, dtype=np.float64)
+    height, width = operator.field_shape
+    x = np.zeros(operator.domain_shape)
+    x[:, :height, :width] = rng.random((n_channels, height, width))
+    for channel, data in enumerate(operator.forward(x)):
+        # "valid" of scipy swaps its inputs when the second is larger; the full sum cropped does not.
+        full = convolve2d(x[channel, :height, :width], psfs[channel % len(psfs)])
+        top, left = psf_shape[1] - 1, psf_shape[2] - 1
+        assert data == pytest.approx(full[top : top + sensor_shape[0], left : left + sensor_shape[1]])
+
+
+def test_pixels_beyond_the_field_do_not_reach_the_sensor():
+    operator = PadCropConvolution(np.ones((1, 6, 6)), (6, 6), dtype=np.float64)
+    height, width = operator.field_shape
+    assert operator.grid_shape > operator.field_shape
+    x = np.ones(operator.domain_shape)
+    x[:, :height, :width] = 0
+    assert np.abs(operator.forward(x)).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("psf_shape", "sensor_shape"), [((7, 9), (7, 9)), ((8, 6), (8, 6)), ((5, 4), (8, 11))]
+)
+def test_a_point_on_the_axis_casts_the_psf_with_centre_on_centre(psf_shape, sensor_shape):
+    psf = np.random.default_rng(3).random(psf_shape)
+    operator = PadCropConvolution(psf[None], sensor_shape, dtype=np.float64)
+    x = np.zeros(operator.domain_shape)
+    x[0, operator.centre[0], operator.centre[1]] = 1
+    image = operator.forward(x)[0]
+    expected = np.zeros(sensor_shape)
+    top, left = (s // 2 - p // 2 for s, p in zip(sensor_shape, psf_shape, strict=True))
+    expected[top : top + psf_shape[0], left : left + psf_shape[1]] = psf
+    assert image == pytest.approx(expected)
+    shifted = operator.forward(np.roll(x, (1, -1), (1, 2)))[0]
+    assert shifted[1:, :-1] == pytest.approx(expected[:-1, 1:])
+
+
+def test_norm_bound_is_above_the_norm():
+    psfs = np.random.default_rng(4).random((2, 5, 6))
+    operator = PadCropConvolution(psfs, (6, 7), dtype=np.float64)
+    norm = np.linalg.norm(matrix(operator), 2)
+    assert norm <= operator.norm_bound < 1.5 * norm
+    assert estimate_norm(operator, iterations=300) == pytest.approx(norm, rel=1e-3)
+
+
+def test_erasures_compose_with_the_camera():
+    rng = np.random.default_rng(5)
+    camera = PadCropConvolution(rng.random((1, 4, 5)), (5, 6), n_channels=2, dtype=np.float64)
+    valid = rng.random((5, 6)) > 0.5
+    erased = Erasures(valid, camera.range_shape, np.float64) @ camera
+    assert dot_test(erased) < 1e-13
+    x = rng.random(camera.domain_shape)
+    assert np.array_equal(erased @ x, (camera @ x) * valid)
+    assert matrix(erased) == pytest.approx(matrix(camera) * np.tile(valid.ravel(), 2)[:, None])
+    assert erased.norm_bound >= np.linalg.norm(matrix(erased), 2)
+
+
+def test_composition_refuses_what_does_not_fit():
+    camera = PadCropConvolution(np.ones((1, 4, 5)), (5, 6))
+    with pytest.raises(ValueError, match=r"takes .1, 6, 5., the inner one gives .1, 5, 6."):
+        Erasures(np.ones((6, 5), bool), (1, 6, 5)) @ camera
+    with pytest.raises(ValueError, match="2 PSFs do not serve 3 channels"):
+        PadCropConvolution(np.ones((2, 4, 5)), (5, 6), n_channels=3)
