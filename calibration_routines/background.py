@@ -47,8 +47,8 @@ def remove_low_frequencies(
     return np.maximum(values - background, 0.0), background
 
 
-def block_sum(image: npt.NDArray[np.floating], factor: int) -> npt.NDArray[np.float32]:
-    """Sum ``factor x factor`` blocks of pixels over the last two axes; left-over rows and columns are cut.
+def block_mean(image: npt.NDArray[np.floating], factor: int) -> npt.NDArray[np.float32]:
+    """Average ``factor x factor`` blocks over the last two axes; left-over rows and columns are cut.
 
     Parameters
     ----------
@@ -66,5 +66,5 @@ def block_sum(image: npt.NDArray[np.floating], factor: int) -> npt.NDArray[np.fl
         raise ValueError(f"An image of {image.shape[-2:]} pixels cannot be binned by {factor}.")
     cropped = np.asarray(image[..., : height * factor, : width * factor], np.float32)
     blocks = cropped.reshape(*image.shape[:-2], height, factor, width, factor)
-    summed: npt.NDArray[np.float32] = blocks.sum(axis=(-3, -1), dtype=np.float32)
-    return summed
+    averaged: npt.NDArray[np.float32] = blocks.mean(axis=(-3, -1), dtype=np.float32)
+    return averaged

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import theilslopes
 
-from calibration_routines.background import block_sum
+from calibration_routines.background import block_mean
 
 MIN_SNR = 10.0
 """Signal to noise per pixel, inside the support, below which a PSF is called noisy."""
@@ -89,7 +89,7 @@ def measure_psf(
     """
     grey = image.sum(axis=0, dtype=np.float32)
     factor = max(1, min(grey.shape) // _BLOCKS)
-    coarse = block_sum(grey, factor) / factor**2
+    coarse = block_mean(grey, factor)
     support = _support(coarse)
     findings: list[str] = []
     if saturated_pixels:
@@ -177,7 +177,7 @@ def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None
     return tuple(judged)
 
 
-def temporal_noise(frames: npt.NDArray[np.floating]) -> float:
+def temporal_noise(frames: npt.NDArray[np.floating] | npt.NDArray[np.unsignedinteger]) -> float:
     """Estimate the noise of one pixel of the average of ``frames``, counts.
 
     Parameters

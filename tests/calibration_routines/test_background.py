@@ -1,11 +1,11 @@
-"""Background removal by DCT, and block sums."""
+"""Background removal by DCT, and block means."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from calibration_routines.background import block_sum, remove_low_frequencies
+from calibration_routines.background import block_mean, remove_low_frequencies
 
 
 def test_a_slow_gradient_under_sharp_spots_goes_and_the_spots_stay() -> None:
@@ -43,9 +43,9 @@ def test_an_order_larger_than_the_image_is_refused(order: int) -> None:
         remove_low_frequencies(np.zeros((4, 6)), order)
 
 
-def test_block_sums_keep_the_light_of_whole_blocks() -> None:
+def test_block_means_cut_what_fills_no_block() -> None:
     image = np.arange(35.0).reshape(5, 7)
-    assert block_sum(image, 2).tolist() == [[16.0, 24.0, 32.0], [72.0, 80.0, 88.0]]
-    assert block_sum(image[None], 5).tolist() == [[[float(image[:, :5].sum())]]]
+    assert block_mean(image, 2).tolist() == [[4.0, 6.0, 8.0], [18.0, 20.0, 22.0]]
+    assert block_mean(image[None], 5).tolist() == [[[float(image[:, :5].mean())]]]
     with pytest.raises(ValueError, match="cannot be binned by 6"):
-        block_sum(image, 6)
+        block_mean(image, 6)
