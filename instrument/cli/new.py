@@ -1,0 +1,36 @@
+"""``diffuserbench new``: write a commented bench.toml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from instrument.atomic import write_text
+from instrument.cli.app import command_app, examples
+from instrument.config_file import DEFAULT_NAME, default_text
+from instrument.errors import FileError
+
+app = command_app()
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench new",
+        "diffuserbench new benches/microscope.toml",
+        "diffuserbench new --force          overwrite an existing bench.toml",
+    )
+)
+def new(
+    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path(DEFAULT_NAME),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+) -> None:
+    """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
+    if file.is_dir():
+        raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
+    if file.exists() and not force:
+        raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+    write_text(file, default_text())
+    typer.echo(f"Wrote {file}: a SIMULATED bench, with every key explained.")
+    typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")

@@ -1,0 +1,106 @@
+"""Runs one command: its module, its errors as sentences, its exit status, signals turned into exceptions."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+import typer
+
+from drivers.errors import DeviceError
+from instrument.cli.commands import Command
+from instrument.errors import BenchError
+
+DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
+INTERRUPTED = 130
+# What typer raises for wrong options; its public subclass is the stable way to name it.
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+
+class Terminated(SystemExit):
+    """The process was asked to end (SIGTERM, SIGHUP): raised in the main thread so that contexts close."""
+
+
+def run_command(name: str, command: Command, arguments: Sequence[str], *, debug: bool = False) -> int:
+    """Run a command with its arguments and return the exit status."""
+    debug = debug or os.environ.get(DEBUG_VARIABLE, "") not in ("", "0")
+    logging.basicConfig(
+        level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+    _end_on_signals()
+    try:
+        app: typer.Typer = importlib.import_module(command.module).app
+        result = app(args=list(arguments), prog_name=f"diffuserbench {name}", standalone_mode=False)
+    except BaseException as error:
+        if debug and not isinstance(error, _UsageError | typer.Abort | SystemExit):
+            raise
+        return report(error)
+    return result if isinstance(result, int) else 0
+
+
+def report(error: BaseException) -> int:
+    """Say on stderr what went wrong and return the exit status; what is no known mistake is raised again."""
+    if isinstance(error, typer.Abort) and error.__cause__ is not None:
+        error = error.__cause__  # typer's wrapping of Ctrl-C
+    if isinstance(error, _UsageError):
+        error.show()  # type: ignore[attr-defined]
+        return 2
+    if isinstance(error, SystemExit):
+        code = error.code if isinstance(error.code, int) else 1
+        _say("stopped by a signal." if isinstance(error, Terminated) else "", error)
+        return code
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
+        _say("interrupted.", error)
+        return INTERRUPTED
+    if isinstance(error, BenchError):
+        _say(str(error), error)
+        return error.exit_code
+    if isinstance(error, DeviceError):
+        _say(str(error), error)
+        return 1
+    if isinstance(error, OSError) and (sentence := _file_trouble(error)):
+        _say(sentence, error)
+        return 2
+    raise error
+
+
+def _file_trouble(error: OSError) -> str:
+    """Return a sentence for trouble with a named file or a full disk, else nothing."""
+    reasons = {
+        errno.EACCES: "no permission. Check who owns it, or choose another place.",
+        errno.EPERM: "not permitted. Check who owns it, or choose another place.",
+        errno.EROFS: "the disk is read-only. Choose another place.",
+        errno.ENOSPC: "no space left on the disk. Free some, or choose another place.",
+        errno.EDQUOT: "your disk quota is used up. Free some, or choose another place.",
+        errno.ENOENT: "there is no such file or folder.",
+        errno.EISDIR: "is a folder; a file is expected.",
+        errno.ENOTDIR: "a part of this path is a file, not a folder.",
+        errno.ENAMETOOLONG: "the name is too long.",
+    }
+    if error.filename is None and error.errno != errno.ENOSPC:
+        return ""
+    where = f"{os.fsdecode(error.filename)}: " if error.filename is not None else ""
+    return where + reasons.get(error.errno or 0, f"{error.strerror or error}.")
+
+
+def _say(text: str, error: BaseException) -> None:
+    for line in (text, *getattr(error, "__notes__", ())):
+        if line:
+            sys.stderr.write(f"{line}\n")
+
+
+def _end_on_signals() -> None:
+    def end(number: int, _frame: FrameType | None) -> None:
+        raise Terminated(128 + number)
+
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        # A signal that the parent chose to ignore (nohup) stays ignored.
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)

@@ -1,0 +1,77 @@
+"""What can go wrong above the devices, in words a person can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class BenchError(Exception):
+    """A mistake that the person at the bench can put right; its text is all that the command line shows.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit status of the command line: 2 for a user's mistake (configuration, files, arguments).
+    """
+
+    exit_code = 2
+
+
+class FileError(BenchError):
+    """A file or folder that cannot be used as asked.
+
+    Parameters
+    ----------
+    path : path
+        The file or folder.
+    problem : str
+        What was found and what was expected, as a sentence that follows the path.
+    remedy : str, optional
+        What to do about it.
+    """
+
+    def __init__(self, path: Path | str, problem: str, remedy: str = "") -> None:
+        self.path = Path(path)
+        self.problem = problem
+        self.remedy = remedy
+        super().__init__(f"{path}: {problem}" + (f" {remedy}" if remedy else ""))
+
+
+class OperatorNeededError(BenchError):
+    """A step needs a person's hand (a lamp, a screen) and nobody can be asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigProblem:
+    """One mistake in a configuration file.
+
+    ``line`` counts from 1 and is None for what is missing as a whole; ``where`` names the key, e.g.
+    ``[camera] exposure_ms``.
+    """
+
+    line: int | None
+    where: str
+    text: str
+
+
+class ConfigError(BenchError):
+    """A configuration file with mistakes: all of them, in the order of their lines.
+
+    Parameters
+    ----------
+    path : path or str
+        The file, or a name for a text that is no file.
+    problems : sequence of ConfigProblem
+    """
+
+    def __init__(self, path: Path | str, problems: Sequence[ConfigProblem]) -> None:
+        self.path = path
+        self.problems = tuple(sorted(problems, key=lambda p: (p.line is None, p.line or 0)))
+        count = len(self.problems)
+        lines = [f"{path}: {count} mistake{'s' if count != 1 else ''}. Nothing was opened."]
+        for problem in self.problems:
+            place = f"{path}:{problem.line}" if problem.line is not None else f"{path}"
+            lines.append(f"  {place}: {problem.where}: {problem.text}")
+        super().__init__("\n".join(lines))

@@ -1,0 +1,166 @@
+"""Whatever fails: the light goes off, motion stops, every device is closed, and what failed is named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from drivers.errors import DeviceError, LimitError
+from instrument.bench import Bench, open_bench
+from instrument.config_file import parse_config
+from instrument.errors import BenchError, OperatorNeededError
+from instrument.safety import StepsFailedError
+from tests.mocks.devices import MockWorld
+
+pytestmark = pytest.mark.usefixtures("mock_drivers")
+
+KINDS = ("camera", "stage", "led_array", "slm")
+SAFE_STEPS = ["led_array.off", "stage.stop", "camera.stop_sequence", "slm.display"]
+CLOSING = ["slm.close", "led_array.close", "stage.close", "camera.close"]
+
+
+def bench_with(
+    faults: dict[str, Sequence[str]] | None = None,
+    *,
+    interrupts: dict[str, Sequence[str]] | None = None,
+    extra: str = "",
+    kinds: Sequence[str] = KINDS,
+) -> Bench:
+    text = extra
+    for kind in kinds:
+        fail, interrupt = list((faults or {}).get(kind, ())), list((interrupts or {}).get(kind, ()))
+        text += f'\n[{kind}]\ndriver = "mock"\nfail = {fail}\ninterrupt = {interrupt}\n'
+    return Bench(parse_config(text, None))
+
+
+def calls(bench: Bench) -> list[str]:
+    world = bench.shared["mock"]
+    assert isinstance(world, MockWorld)
+    return world.calls
+
+
+def test_devices_open_in_order_and_close_safe_in_reverse() -> None:
+    with bench_with().open() as bench:
+        opened = list(calls(bench))
+    assert opened == [f"{kind}.open" for kind in KINDS]
+    assert calls(bench)[len(opened) :] == SAFE_STEPS + CLOSING
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_device_that_does_not_open_is_named_and_the_others_are_closed(kind: str) -> None:
+    bench = bench_with({kind: ["open"]})
+    with pytest.raises(DeviceError, match=rf"{kind} \(mock\): open failed"):
+        bench.open()
+    assert not any(device.is_open for device in bench.devices.values())
+    assert all(call in calls(bench) for call in CLOSING)
+
+
+FAULTS = {
+    "led_array": ["off", "close"],
+    "stage": ["stop", "close"],
+    "camera": ["stop_sequence", "close"],
+    "slm": ["display", "close"],
+}
+
+
+@pytest.mark.parametrize(("kind", "method"), [(k, m) for k, methods in FAULTS.items() for m in methods])
+@pytest.mark.parametrize("how", ["fail", "interrupt"])
+def test_every_step_is_tried_even_when_one_fails(kind: str, method: str, how: str) -> None:
+    fault = {kind: [method]}
+    bench = bench_with(fault).open() if how == "fail" else bench_with(interrupts=fault).open()
+    with pytest.raises(StepsFailedError if how == "fail" else KeyboardInterrupt) as caught:
+        bench.close()
+    assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
+    told = str(caught.value) + "".join(getattr(caught.value, "__notes__", ()))
+    assert f"{kind} (mock)" in told
+
+
+def test_when_everything_fails_everything_is_still_tried_and_named() -> None:
+    bench = bench_with(FAULTS).open()
+    with pytest.raises(StepsFailedError) as caught:
+        bench.close()
+    assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
+    assert len(caught.value.failures) == 8
+
+
+def test_an_error_inside_the_context_stays_the_error_and_carries_what_could_not_be_made_safe() -> None:
+    with pytest.raises(ZeroDivisionError) as caught, bench_with({"led_array": ["off"]}).open() as bench:
+        raise ZeroDivisionError
+    assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
+    assert "light off, led_array (mock)" in "".join(caught.value.__notes__)
+
+
+def test_the_slm_keeps_its_image_when_so_configured() -> None:
+    bench = bench_with(kinds=("camera",), extra='[slm]\ndriver = "mock"\nblank_when_safe = false').open()
+    bench.safe_state()
+    assert "slm.display" not in calls(bench)
+    bench.close()
+
+
+def test_an_unapplied_camera_setting_is_an_error_and_the_camera_is_closed() -> None:
+    extra = '[camera]\ndriver = "mock"\nexposure_ms = 5000'
+    bench = bench_with(kinds=(), extra=extra)
+    with pytest.raises(LimitError, match="5000"):
+        bench.open()
+    assert calls(bench)[-1] == "camera.close"
+
+
+def test_snap_averages_and_completes_the_metadata() -> None:
+    with bench_with().open() as bench:
+        single, mean = bench.snap(), bench.snap(average=3)
+    assert single.image.dtype == "uint16"
+    assert single.image[0, 0] == 101
+    assert mean.image.dtype == "float32"
+    assert mean.image[0, 0] == pytest.approx(103.0)
+    assert mean.metadata.dropped_before == 3
+    assert mean.metadata.stage_position == {"x_um": 0.0, "z_um": 0.0}
+    assert mean.metadata.led_pattern == "off"
+    assert len(mean.metadata.slm_image_hash) == 64
+    with pytest.raises(BenchError, match="not 0"):
+        bench.snap(average=0)
+
+
+def test_the_source_is_placed_through_the_configured_offset() -> None:
+    with bench_with(extra="[source]\noffset_um = [5.0, 0.0, 1000.0]\n").open() as bench:
+        assert bench.place_source(x_um=15.0, y_um=0.0, z_um=3000.0) == (15.0, 0.0, 3000.0)
+        assert bench.stage is not None
+        assert bench.stage.position() == {"x_um": 10.0, "z_um": 2000.0}
+        with pytest.raises(BenchError, match="no axis y_um"):
+            bench.place_source(y_um=1.0)
+        with pytest.raises(LimitError):
+            bench.place_source(x_um=1000.0)
+        bench.source_on()
+        assert bench.led_array is not None
+        assert not bench.led_array.pattern.is_dark
+        bench.source_off()
+        assert bench.led_array.pattern.is_dark
+
+
+def test_the_simulated_scene_is_switched_and_dark_after_closing() -> None:
+    with bench_with(extra='[scene]\ncontrol = "simulated"\n').open() as bench:
+        world = bench.shared["mock"]
+        assert isinstance(world, MockWorld)
+        bench.scene_on()
+        assert world.scene_lit
+    assert not world.scene_lit
+
+
+def test_an_operator_is_asked_once_for_each_change() -> None:
+    asked: list[str] = []
+    with open_bench(bench_with().config, ask=asked.append) as bench:
+        bench.scene_on()
+        bench.scene_on()
+        bench.scene_off()
+    assert asked == ["Please light the scene.", "Please darken the scene."]
+
+
+def test_where_nobody_can_be_asked_that_is_an_error() -> None:
+    with bench_with().open() as bench, pytest.raises(OperatorNeededError, match="light the scene"):
+        bench.scene_on()
+
+
+def test_the_bench_says_that_it_is_simulated() -> None:
+    with bench_with().open() as bench:
+        assert "SIMULATED" in bench.label
+        assert str(bench).count("SIMULATED") == 5
