@@ -2,6 +2,14 @@
 
 from recon.operators.base import Composition, LinearOperator, estimate_norm
 from recon.operators.convolution import PadCropConvolution
+from recon.operators.convolution3d import Convolution3D
 from recon.operators.erasures import Erasures
 
-__all__ = ["Composition", "Erasures", "LinearOperator", "PadCropConvolution", "estimate_norm"]
+__all__ = [
+    "Composition",
+    "Convolution3D",
+    "Erasures",
+    "LinearOperator",
+    "PadCropConvolution",
+    "estimate_norm",
+]

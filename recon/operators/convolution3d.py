@@ -1,0 +1,147 @@
+"""The camera of many depths: every plane with its own PSF, summed on the sensor (Kuo 2020, Eq. 4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from recon import fft
+from recon.errors import InputError
+from recon.operators.base import Array, LinearOperator
+from recon.operators.planes import PlaneGroups
+
+
+class Convolution3D(LinearOperator):
+    """Sum over depth of two-dimensional convolutions, cropped to the sensor.
+
+    ``A x = C F^-1 sum_z diag(H_z) F x_z``: n_z + 1 two-dimensional transforms, and no three-dimensional array
+    besides object and transfer functions. (The dissertation writes the same sum as one slice of a circular
+    three-dimensional convolution, Eq. A.5.) Centring and grid are those of
+    :class:`~recon.operators.convolution.PadCropConvolution`.
+
+    Parameters
+    ----------
+    psfs : ndarray, (n_z, n_channels or 1, psf_height, psf_width)
+        One PSF a depth, as in :class:`recon.types.Calibration`; one a channel or one for all channels.
+    sensor_shape : (int, int)
+        ``(height, width)`` of the data.
+    n_channels : int, optional
+        Number of channels of object and data when one PSF serves all; default as many as ``psfs`` has.
+    dtype : dtype
+        float32 or float64.
+
+    Attributes
+    ----------
+    domain_shape : (n_channels, n_z, grid_height, grid_width)
+    range_shape : (n_channels, height, width)
+    field_shape, grid_shape, centre, corner
+        As in ``PadCropConvolution``.
+    spectrum : ndarray, complex, (n_channels or 1, n_z, grid_height, grid_width // 2 + 1)
+        Transfer functions.
+    """
+
+    def __init__(
+        self,
+        psfs: Array,
+        sensor_shape: tuple[int, int],
+        *,
+        n_channels: int | None = None,
+        dtype: npt.DTypeLike = np.float32,
+    ) -> None:
+        if psfs.ndim != 4:
+            raise InputError(f"psfs must be (n_z, n_channels, height, width), not {psfs.shape}.")
+        if len(psfs) == 0:
+            raise InputError("The list of depths is empty: a volume needs at least one PSF.")
+        n_channels = psfs.shape[1] if n_channels is None else n_channels
+        if psfs.shape[1] not in (1, n_channels):
+            raise InputError(
+                f"PSFs of {psfs.shape[1]} channels do not serve {n_channels}: give 1 or {n_channels}."
+            )
+        psf_shape = psfs.shape[2:]
+        self.sensor_shape = (int(sensor_shape[0]), int(sensor_shape[1]))
+        self.field_shape = tuple(s + p - 1 for s, p in zip(self.sensor_shape, psf_shape, strict=True))
+        self.grid_shape = fft.fast_shape(self.field_shape)
+        self.corner = (psf_shape[0] - 1, psf_shape[1] - 1)
+        self.centre = (
+            self.sensor_shape[0] // 2 + psf_shape[0] - 1 - psf_shape[0] // 2,
+            self.sensor_shape[1] // 2 + psf_shape[1] - 1 - psf_shape[1] // 2,
+        )
+        n_z = len(psfs)
+        super().__init__((n_channels, n_z, *self.grid_shape), (n_channels, *self.sensor_shape), dtype)
+        self.spectrum = np.empty(
+            (psfs.shape[1], n_z, *fft.spectrum_shape(self.grid_shape)), fft.complex_dtype(self.dtype)
+        )
+        padded = np.zeros(self.grid_shape, self.dtype)
+        for channel in range(psfs.shape[1]):
+            for z in range(n_z):
+                padded[: psf_shape[0], : psf_shape[1]] = psfs[z, channel]
+                fft.rfft(padded, out=self.spectrum[channel, z])
+        self.groups = PlaneGroups(n_z)
+        plane = fft.spectrum_shape(self.grid_shape)
+        self._sums = np.empty((self.groups.count, *plane), self.spectrum.dtype)
+        self._scratch = np.empty((self.groups.count, *plane), self.spectrum.dtype)
+        self._work = np.empty(self.grid_shape, self.dtype)
+        self._norm_bound = float(np.sqrt(max(float(self.power(c).max()) for c in range(psfs.shape[1]))))
+
+    def power(self, channel: int = 0) -> Array:
+        """``sum_z |H_z|^2`` of one channel: eigenvalues of ``A A^H`` before the crop."""
+        total = np.zeros(self.spectrum.shape[2:], self.dtype)
+        for H in self.spectrum[channel]:
+            total += H.real**2 + H.imag**2
+        return total
+
+    @property
+    def sensor_window(self) -> tuple[slice, slice]:
+        """Where the sensor lies on the grid."""
+        (top, left), (height, width) = self.corner, self.sensor_shape
+        return (slice(top, top + height), slice(left, left + width))
+
+    def channel_spectrum(self, channel: int) -> Array:
+        """Return the transfer functions that serve ``channel``: (n_z, grid_height, grid_width // 2 + 1)."""
+        spectrum: Array = self.spectrum[channel if len(self.spectrum) > 1 else 0]
+        return spectrum
+
+    def forward(self, x: Array, out: Array | None = None) -> Array:
+        """Return what the sensor sees of the volume ``x``."""
+        from recon.operators import _plane_kernels as kernels
+
+        if out is None:
+            out = np.empty(self.range_shape, self.dtype)
+        x = np.ascontiguousarray(x, self.dtype).reshape(self.domain_shape)
+        for channel, volume in enumerate(x):
+            H = self.channel_spectrum(channel)
+            self._sums[...] = 0
+            self.groups.run(
+                lambda group, z0, z1, volume=volume, H=H: kernels.forward_planes(
+                    volume, H, self._sums[group], self._scratch[group], z0, z1
+                )
+            )
+            total = self._sums[0]
+            for other in self._sums[1:]:
+                total += other
+            out[channel] = fft.irfft(total, self.grid_shape[1], out=self._work)[self.sensor_window]
+        return out
+
+    def adjoint(self, y: Array, out: Array | None = None) -> Array:
+        """Correlate sensor data with every depth's PSF."""
+        from recon.operators import _plane_kernels as kernels
+
+        if out is None:
+            out = np.empty(self.domain_shape, self.dtype)
+        for channel in range(self.domain_shape[0]):
+            H = self.channel_spectrum(channel)
+            self._work[...] = 0
+            self._work[self.sensor_window] = y[channel]
+            E = fft.rfft(self._work, out=self._sums[0])
+            volume = out[channel]
+            self.groups.run(
+                lambda group, z0, z1, volume=volume, H=H, E=E: kernels.adjoint_planes(
+                    E, H, volume, self._scratch[group], z0, z1
+                )
+            )
+        return out
+
+    @property
+    def norm_bound(self) -> float:
+        """``sqrt(max sum_z |H_z|^2)``: cropping can only lessen the norm of the circular sum."""
+        return self._norm_bound

@@ -1,0 +1,82 @@
+"""The 3D camera against brute force, and its adjoint."""
+
+import numpy as np
+import pytest
+from scipy.signal import convolve2d
+
+from recon import threads
+from recon.errors import InputError
+from recon.operators.base import estimate_norm
+from recon.operators.convolution import PadCropConvolution
+from recon.operators.convolution3d import Convolution3D
+
+
+def dot_test(operator, rtol, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(operator.domain_shape).astype(operator.dtype)
+    y = rng.standard_normal(operator.range_shape).astype(operator.dtype)
+    left = np.vdot(operator.forward(x).astype(np.float64), y)
+    right = np.vdot(x.astype(np.float64), operator.adjoint(y))
+    scale = np.linalg.norm(operator.forward(x)) * np.linalg.norm(y)
+    assert abs(left - right) <= rtol * scale
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 1e-6), (np.float64, 1e-14)])
+@pytest.mark.parametrize(
+    ("psf_shape", "sensor", "n_z", "channels"),
+    [((7, 6), (9, 11), 3, 1), ((12, 13), (5, 4), 2, 3), ((1, 1), (1, 1), 1, 1), ((8, 8), (8, 8), 11, 2)],
+    ids=["odd", "PSF larger than sensor", "one pixel", "many planes"],
+)
+def test_adjoint(psf_shape, sensor, n_z, channels, dtype, rtol):
+    psfs = np.random.default_rng(1).random((n_z, 1, *psf_shape)).astype(dtype)
+    dot_test(Convolution3D(psfs, sensor, n_channels=channels, dtype=dtype), rtol)
+
+
+def test_equals_a_sum_of_full_convolutions():
+    rng = np.random.default_rng(2)
+    psfs = rng.random((3, 2, 5, 6))
+    operator = Convolution3D(psfs, (7, 8), dtype=np.float64)
+    x = np.zeros(operator.domain_shape)
+    height, width = operator.field_shape
+    x[..., :height, :width] = rng.random((2, 3, height, width))
+    expected = np.zeros(operator.range_shape)
+    for c in range(2):
+        for z in range(3):
+            expected[c] += convolve2d(x[c, z, :height, :width], psfs[z, c], "valid")
+    np.testing.assert_allclose(operator.forward(x), expected, rtol=1e-12)
+
+
+def test_one_depth_is_the_camera_of_one_depth():
+    rng = np.random.default_rng(3)
+    psf = rng.random((1, 1, 6, 5))
+    flat = PadCropConvolution(psf[0], (8, 9), dtype=np.float64)
+    deep = Convolution3D(psf, (8, 9), dtype=np.float64)
+    x = rng.random(flat.domain_shape)
+    np.testing.assert_allclose(deep.forward(x[:, None]), flat.forward(x), rtol=1e-12)
+    assert deep.centre == flat.centre
+    assert deep.norm_bound == pytest.approx(flat.norm_bound)
+
+
+def test_norm_bound_holds():
+    operator = Convolution3D(np.random.default_rng(4).random((4, 1, 8, 8)), (8, 8), dtype=np.float64)
+    assert 0.3 * operator.norm_bound < estimate_norm(operator) <= operator.norm_bound
+
+
+def test_threads_do_not_change_a_bit():
+    rng = np.random.default_rng(5)
+    operator = Convolution3D(rng.random((13, 1, 9, 8)).astype(np.float32), (9, 8))
+    x = rng.random(operator.domain_shape).astype(np.float32)
+    before = threads.get_threads()
+    try:
+        results = []
+        for n in (1, 3):
+            threads.set_threads(n)
+            results.append(operator.forward(x))
+    finally:
+        threads.set_threads(before)
+    np.testing.assert_array_equal(*results)
+
+
+def test_refuses_an_empty_depth_list():
+    with pytest.raises(InputError, match="list of depths is empty"):
+        Convolution3D(np.zeros((0, 1, 4, 4), np.float32), (4, 4))
