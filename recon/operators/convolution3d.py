@@ -111,11 +111,11 @@ class Convolution3D(LinearOperator):
         for channel, volume in enumerate(x):
             H = self.channel_spectrum(channel)
             self._sums[...] = 0
-            self.groups.run(
-                lambda group, z0, z1, volume=volume, H=H: kernels.forward_planes(
-                    volume, H, self._sums[group], self._scratch[group], z0, z1
-                )
-            )
+
+            def job(group: int, z0: int, z1: int, volume: Array = volume, H: Array = H) -> None:
+                kernels.forward_planes(volume, H, self._sums[group], self._scratch[group], z0, z1)
+
+            self.groups.run(job)
             total = self._sums[0]
             for other in self._sums[1:]:
                 total += other
@@ -128,17 +128,18 @@ class Convolution3D(LinearOperator):
 
         if out is None:
             out = np.empty(self.domain_shape, self.dtype)
+        E = self._sums[0]
         for channel in range(self.domain_shape[0]):
             H = self.channel_spectrum(channel)
             self._work[...] = 0
             self._work[self.sensor_window] = y[channel]
-            E = fft.rfft(self._work, out=self._sums[0])
+            fft.rfft(self._work, out=E)
             volume = out[channel]
-            self.groups.run(
-                lambda group, z0, z1, volume=volume, H=H, E=E: kernels.adjoint_planes(
-                    E, H, volume, self._scratch[group], z0, z1
-                )
-            )
+
+            def job(group: int, z0: int, z1: int, volume: Array = volume, H: Array = H) -> None:
+                kernels.adjoint_planes(E, H, volume, self._scratch[group], z0, z1)
+
+            self.groups.run(job)
         return out
 
     @property
