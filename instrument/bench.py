@@ -327,6 +327,18 @@ class Bench:
         """Darken the scene: the simulated world does it, or the operator is asked."""
         self._switch_scene(lit=False)
 
+    @property
+    def can_switch_scene(self) -> bool:
+        """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
+        if self.config.scene.control == "operator":
+            return self._ask is not None
+        return self._scene_switch() is not None
+
+    @property
+    def can_switch_source(self) -> bool:
+        """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
+        return self.led_array is not None or self._ask is not None
+
     def _switch_scene(self, *, lit: bool) -> None:
         if self.config.scene.control == "operator":
             self._ask_once("the scene", lit=lit)
