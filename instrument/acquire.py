@@ -1,0 +1,104 @@
+"""From a plan and an open bench to a run: check, make the folder, carry out."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from instrument.bench import Bench
+from instrument.plan import BenchAbilities, Plan, check
+from instrument.runner import Progress, Runner
+from instrument.store import BenchRecord, Run, RunWriter
+
+
+def acquire(
+    bench: Bench,
+    plan: Plan,
+    folder: Path | str | None = None,
+    *,
+    on_progress: Progress | None = None,
+    calibrations: Sequence[str] = (),
+) -> Run:
+    """Check a plan, carry it out and return the run.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    plan : Plan
+    folder : path, optional
+        Where the run's folder is made; None means the bench's own data folder.
+    on_progress : callable, optional
+        Called with a :class:`~instrument.runner.RunStatus` after every step.
+    calibrations : sequence of str
+        Identifiers of the calibrations in use, kept with the run.
+
+    Raises
+    ------
+    PlanError
+        When the plan cannot be carried out; nothing moved and nothing was written.
+    DeviceError, RunError
+        When a device or the disk fails; the bench is safe and the run is marked as failed.
+    """
+    return prepare(bench, plan, folder, on_progress=on_progress, calibrations=calibrations).execute()
+
+
+def prepare(
+    bench: Bench,
+    plan: Plan,
+    folder: Path | str | None = None,
+    *,
+    on_progress: Progress | None = None,
+    calibrations: Sequence[str] = (),
+) -> Runner:
+    """Check a plan, make the run's folder and return the runner, for those who want to pause or stop it."""
+    folder = Path(folder) if folder is not None else bench.config.data_folder
+    check(plan, abilities_of(bench, folder))
+    writer = RunWriter.create(
+        folder, label=plan.label, bench=record_of(bench), plan=plan, calibrations=calibrations
+    )
+    return Runner(bench, plan, writer, on_progress=on_progress)
+
+
+def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
+    """Read once what plans are checked against: the devices' limits, and the free space in ``folder``."""
+    camera, stage, slm = bench.camera, bench.stage, bench.slm
+    colour = camera.pixel_format.startswith(("RGB", "BGR"))
+    return BenchAbilities(
+        frame_shape=(*camera.image_shape, 3) if colour else camera.image_shape,
+        frame_dtype=np.dtype(np.uint8) if camera.significant_bits <= 8 else np.dtype(np.uint16),
+        exposure_ms=camera.exposure_ms,
+        exposure_limits_ms=camera.exposure_limits_ms,
+        gain_limits=camera.gain_limits,
+        stage_axes=stage.axes if stage is not None else (),
+        stage_position=stage.position() if stage is not None else {},
+        stage_target=(lambda source: bench.stage_target(*source)) if stage is not None else None,
+        can_switch_source=bench.can_switch_source,
+        can_switch_scene=bench.can_switch_scene,
+        n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
+        slm_shape=slm.shape if slm is not None else None,
+        slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
+        free_bytes=free_bytes(folder) if folder is not None else None,
+    )
+
+
+def record_of(bench: Bench) -> BenchRecord:
+    """Return what a run keeps about its bench."""
+    return BenchRecord(
+        config=bench.config.as_dict(),
+        toml=bench.config.text,
+        devices={kind: str(device.identity) for kind, device in bench.devices.items()},
+        simulated=bool(bench.simulated_kinds),
+        pixel_pitch_um=bench.camera.pixel_pitch_um * bench.camera.binning,
+    )
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the disk that ``folder`` is or will be on."""
+    folder = folder.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free

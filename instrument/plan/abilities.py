@@ -1,0 +1,214 @@
+"""Hold a plan against what a bench can do, and estimate it, without touching a device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.stage import StageAxis
+from instrument.errors import FileError
+from instrument.plan.errors import PlanError
+from instrument.plan.model import Plan, Step
+from instrument.plan.positions import SourcePosition
+from instrument.plan.slm_images import read_slm_image
+
+SPARE_BYTES = 256 * 2**20
+"""Disk space that a run leaves free."""
+BYTES_A_FRAME_BESIDE_THE_IMAGE = 6_000
+"""Log line, folders and part-filled disk blocks of one stored frame."""
+
+
+@dataclass(frozen=True)
+class BenchAbilities:
+    """What a plan is checked against: the bench's limits as they were read once.
+
+    Attributes
+    ----------
+    frame_shape : tuple of int
+        ``(height, width)`` or ``(height, width, 3)`` of the camera's frames.
+    frame_dtype : numpy dtype
+    exposure_ms, exposure_limits_ms, gain_limits
+        The camera's present exposure and its limits.
+    stage_axes : tuple of StageAxis
+        Empty without a stage.
+    stage_position : mapping
+        Where the stage is now.
+    stage_target : callable, optional
+        The stage position that puts the point source at ``(x, y, z)`` micrometres; None without a source
+        that can be placed.
+    can_switch_source, can_switch_scene : bool
+        Whether the point source and the scene can be lit and darkened, by a device or by asking the
+        operator.
+    n_leds : int
+        0 without an LED array.
+    slm_shape : tuple of int, optional
+    slm_settle_ms : float
+    free_bytes : int, optional
+        Free space where the run will be kept; None leaves the disk unchecked.
+    """
+
+    frame_shape: tuple[int, ...]
+    frame_dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
+    exposure_ms: float
+    exposure_limits_ms: tuple[float, float]
+    gain_limits: tuple[float, float]
+    stage_axes: tuple[StageAxis, ...] = ()
+    stage_position: Mapping[str, float] | None = None
+    stage_target: Callable[[SourcePosition], Mapping[str, float]] | None = None
+    can_switch_source: bool = True
+    can_switch_scene: bool = True
+    n_leds: int = 0
+    slm_shape: tuple[int, int] | None = None
+    slm_settle_ms: float = 0.0
+    free_bytes: int | None = None
+
+    def target(self, step: Step) -> Mapping[str, float]:
+        """Return where a step puts the stage; empty where it stays."""
+        if step.source_um is not None and self.stage_target is not None:
+            return self.stage_target(step.source_um)
+        return step.stage
+
+
+@dataclass(frozen=True, slots=True)
+class PlanEstimate:
+    """What a plan will cost."""
+
+    frames: int
+    """Frames stored."""
+    exposures: int
+    """Frames taken, averaged ones counted singly."""
+    moves: int
+    image_bytes: int
+    total_bytes: int
+    """Everything the run will write, metadata included."""
+    seconds: float
+    """Exposures, moves, settling and waiting; read-out and disk are not known beforehand."""
+
+
+def stored_dtype(plan: Plan, camera_dtype: np.dtype[np.uint8] | np.dtype[np.uint16]) -> np.dtype[np.generic]:
+    """Return the type frames are stored with: the camera's own, float32 as soon as any step averages."""
+    return np.dtype(np.float32) if plan.averages else np.dtype(camera_dtype)
+
+
+def estimate(plan: Plan, abilities: BenchAbilities) -> PlanEstimate:
+    """Return what a plan will cost on a bench."""
+    frame_bytes = math.prod(abilities.frame_shape) * stored_dtype(plan, abilities.frame_dtype).itemsize
+    speeds = {axis.name: axis.speed_per_s for axis in abilities.stage_axes}
+    position = dict(abilities.stage_position or {})
+    seconds, part_start, part, moves = 0.0, 0.0, -1, 0
+    slm_image, exposure_ms = None, abilities.exposure_ms
+    for step in plan.steps():
+        if step.part != part:
+            part, part_start = step.part, seconds
+        seconds = max(seconds, part_start + step.start_after_s)
+        target = abilities.target(step)
+        if any(position.get(axis) != value for axis, value in target.items()):
+            moves += 1
+            seconds += max(abs(v - position.get(a, v)) / speeds.get(a, math.inf) for a, v in target.items())
+            position.update(target)
+        if step.slm_image is not None and step.slm_image != slm_image:
+            slm_image = step.slm_image
+            seconds += abilities.slm_settle_ms / 1e3
+        exposure_ms = step.exposure_ms if step.exposure_ms is not None else exposure_ms
+        seconds += step.average * exposure_ms / 1e3
+    n = len(plan)
+    return PlanEstimate(
+        frames=n,
+        exposures=plan.exposures,
+        moves=moves,
+        image_bytes=n * frame_bytes,
+        total_bytes=n * (frame_bytes + BYTES_A_FRAME_BESIDE_THE_IMAGE),
+        seconds=seconds,
+    )
+
+
+def check(plan: Plan, abilities: BenchAbilities) -> None:
+    """Refuse a plan that the bench cannot carry out.
+
+    Raises
+    ------
+    PlanError
+        Naming every reason with the steps it concerns.
+    """
+    found: dict[str, list[int]] = {}
+    for step in plan.steps():
+        for problem in _step_problems(step, abilities):
+            found.setdefault(problem, []).append(step.index)
+    problems = [f"{_ranges(steps)}: {problem}" for problem, steps in found.items()]
+    for path in sorted({step.slm_image for step in plan.steps() if step.slm_image is not None}):
+        problems.extend(_slm_image_problems(path, abilities))
+    need = estimate(plan, abilities).total_bytes
+    if abilities.free_bytes is not None and need + SPARE_BYTES > abilities.free_bytes:
+        problems.append(
+            f"{len(plan)} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to spare, but only "
+            f"{abilities.free_bytes / 1e9:.2f} GB are free on the disk. Free some, or choose another folder."
+        )
+    if problems:
+        raise PlanError(plan.label, problems)
+
+
+def _step_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
+    yield from _position_problems(step, abilities)
+    if step.light.kind == "pattern":
+        if abilities.n_leds == 0:
+            yield f'light "{step.light}", but the bench has no LED array.'
+        elif beyond := [led[0] for led in step.light.leds if led[0] >= abilities.n_leds]:
+            yield f"LED {beyond[0]} does not exist; the array has LEDs 0 to {abilities.n_leds - 1}."
+    if step.light.kind != "pattern" and not abilities.can_switch_source:
+        yield f'light "{step.light}", but the bench has no LED array and nobody can be asked to see to it.'
+    if not abilities.can_switch_scene:
+        yield (
+            f"the scene must be {'lit' if step.scene_lit else 'dark'}, but nothing switches it and nobody "
+            "can be asked to. Run it in a terminal, or see [scene] in bench.toml."
+        )
+    low, high = abilities.exposure_limits_ms
+    if step.exposure_ms is not None and not low <= step.exposure_ms <= high:
+        yield f"exposure {step.exposure_ms:g} ms is outside the camera's {low:g} to {high:g} ms."
+    low, high = abilities.gain_limits
+    if step.gain is not None and not low <= step.gain <= high:
+        yield f"gain {step.gain:g} is outside the camera's {low:g} to {high:g}."
+    if step.slm_image is not None and abilities.slm_shape is None:
+        yield f"SLM image {step.slm_image}, but the bench has no SLM."
+
+
+def _position_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
+    if step.source_um is not None and abilities.stage_target is None:
+        yield "a source position, but the bench has no stage that places its source."
+        return
+    axes = {axis.name: axis for axis in abilities.stage_axes}
+    for name, value in abilities.target(step).items():
+        if name not in axes:
+            yield f"stage axis {name!r} does not exist; the stage has {', '.join(axes) or 'none'}."
+        elif not axes[name].lower_limit <= value <= axes[name].upper_limit:
+            yield (
+                f"{name} = {value:g} is outside the stage's limits "
+                f"{axes[name].lower_limit:g} to {axes[name].upper_limit:g}."
+            )
+
+
+def _slm_image_problems(path: Path, abilities: BenchAbilities) -> Iterable[str]:
+    if abilities.slm_shape is None:
+        return
+    try:
+        shape = read_slm_image(path).shape
+    except FileError as error:
+        yield str(error)
+        return
+    if shape != abilities.slm_shape:
+        yield f"SLM image {path} is {shape}, but the SLM has {abilities.slm_shape} pixels."
+
+
+def _ranges(steps: list[int]) -> str:
+    """Return ``"step 3"`` or ``"steps 0-7, 9"``."""
+    runs: list[list[int]] = []
+    for step in steps:
+        if runs and step == runs[-1][1] + 1:
+            runs[-1][1] = step
+        else:
+            runs.append([step, step])
+    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+    return f"step{'s' if len(steps) > 1 else ''} {text}"

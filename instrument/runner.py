@@ -1,0 +1,312 @@
+"""Carry out a plan on a bench, step by step, into a run.
+
+::
+
+    IDLE --execute--> RUNNING --pause--> PAUSED --resume--> RUNNING
+                         |                  |
+                         +-- last step, abort (between steps), stop (at once), error --> ENDING --> FINISHED
+
+On every way out of RUNNING and PAUSED the bench is made safe (light off, motion stopped, SLM blank if so
+configured) and the run's files are closed, in that order, each tried even when the one before failed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from drivers.errors import StoppedError
+from instrument.bench import Bench, Snapshot
+from instrument.plan import Plan, Step
+from instrument.safety import StepsFailedError, try_all
+from instrument.step_settings import StepSettings
+from instrument.store import FinishReason, FrameToStore, Run, RunWriter
+
+_log = logging.getLogger(__name__)
+_STOP_REPEAT_S = 0.005
+_STOP_WAIT_S = 2.0
+
+
+class RunState(StrEnum):
+    """Where a runner is."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    PAUSED = "paused"
+    ENDING = "ending"
+    """The bench is being made safe and the files are being closed."""
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True, slots=True)
+class RunStatus:
+    """A snapshot of a runner, for a progress bar or a window.
+
+    Attributes
+    ----------
+    done, total : int
+        Steps whose frames are on the disk, and steps of the plan.
+    step : Step or None
+        The step being done, or the last one.
+    seconds : float
+        Since the run was started or resumed.
+    seconds_left : float or None
+        Estimated from the steps done so far; None before the first.
+    dropped : int
+        Frames that the camera dropped during exposures of this run.
+    saturated_fraction : float
+        Of the newest frame.
+    reason : FinishReason or None
+        Why it ended, once it has.
+    """
+
+    state: RunState
+    done: int
+    total: int
+    step: Step | None = None
+    seconds: float = 0.0
+    seconds_left: float | None = None
+    dropped: int = 0
+    saturated_fraction: float = 0.0
+    reason: FinishReason | None = None
+
+
+Progress = Callable[[RunStatus], None]
+
+
+class _EndedEarlyError(Exception):
+    """Carries the reason out of the step loop."""
+
+    def __init__(self, reason: FinishReason) -> None:
+        self.reason = reason
+
+
+class Runner:
+    """Does a plan's steps and stores one frame for each.
+
+    ``execute`` blocks in the thread that calls it; ``pause``, ``resume``, ``abort``, ``stop`` and ``status``
+    may be called from any thread.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    plan : Plan
+    writer : RunWriter
+        The run; the runner finishes and closes it.
+    todo : sequence of int, optional
+        Indices of the steps to do, in order; None means all.
+    on_progress : callable, optional
+        Called with the status after every step and change of state, in the thread that executes.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        plan: Plan,
+        writer: RunWriter,
+        *,
+        todo: Sequence[int] | None = None,
+        on_progress: Progress | None = None,
+    ) -> None:
+        self._bench = bench
+        self._plan = plan
+        self._writer = writer
+        self._todo = frozenset(range(len(plan)) if todo is None else todo)
+        self._on_progress = on_progress
+        self._settings = StepSettings(bench)
+        self._condition = threading.Condition()
+        self._pausing = False
+        self._aborting = False
+        self._stopping = threading.Event()
+        self._finished = threading.Event()
+        self._status = RunStatus(RunState.IDLE, len(plan) - len(self._todo), len(plan))
+        self._started_s = 0.0
+        self._thread: threading.Thread | None = None
+
+    # From any thread -----------------------------------------------------------------------------
+    @property
+    def status(self) -> RunStatus:
+        """Where the run is now."""
+        with self._condition:
+            return self._status
+
+    def pause(self) -> None:
+        """Wait before the next step, light off, until ``resume``."""
+        with self._condition:
+            self._pausing = True
+            self._condition.notify_all()
+
+    def resume(self) -> None:
+        """Go on after ``pause``."""
+        with self._condition:
+            self._pausing = False
+            self._condition.notify_all()
+
+    def abort(self) -> None:
+        """End before the next step."""
+        with self._condition:
+            self._aborting = True
+            self._condition.notify_all()
+
+    def stop(self) -> None:
+        """End at once: light off and motion stopped when this returns, whatever was going on.
+
+        Raises
+        ------
+        StepsFailedError
+            When a device could not be made safe; all were tried.
+        """
+        self._stopping.set()
+        with self._condition:
+            self._condition.notify_all()
+        self._bench.stop()
+        if self._thread is None or self._thread is threading.current_thread():
+            return
+        # The executing thread may have been about to start a move or an exposure when the stop came: repeat
+        # until it has seen that it must end.
+        deadline_s = time.monotonic() + _STOP_WAIT_S
+        while not self._finished.wait(_STOP_REPEAT_S) and time.monotonic() < deadline_s:
+            if self.status.state in (RunState.RUNNING, RunState.PAUSED):
+                self._bench.stop()
+
+    # In one thread -------------------------------------------------------------------------------
+    def execute(self) -> Run:
+        """Do the steps; returns the finished run, whose ``reason`` says how it ended.
+
+        Raises
+        ------
+        DeviceError, BenchError
+            What made the run fail; it was marked as failed, and the bench made safe. A note says where the
+            run is.
+        KeyboardInterrupt, SystemExit
+            After the run was marked as aborted and the bench made safe.
+        """
+        self._thread = threading.current_thread()
+        self._started_s = time.monotonic()
+        self._report(state=RunState.RUNNING)
+        try:
+            self._writer.note("started", steps=len(self._todo))
+            self._do_steps()
+        except _EndedEarlyError as early:
+            run = self._end(early.reason)
+        except StoppedError as error:
+            if not self._stopping.is_set():
+                self._end(FinishReason.FAILED, error)
+                raise
+            run = self._end(FinishReason.STOPPED)
+        except Exception as error:
+            self._end(FinishReason.STOPPED if self._stopping.is_set() else FinishReason.FAILED, error)
+            raise
+        except BaseException as error:
+            self._end(FinishReason.ABORTED, error)
+            raise
+        else:
+            run = self._end(FinishReason.COMPLETED)
+        return run
+
+    def _do_steps(self) -> None:
+        part, part_started_s = -1, 0.0
+        for step in self._plan.steps():
+            if step.index not in self._todo:
+                continue
+            self._between_steps()
+            if step.part != part:
+                part, part_started_s = step.part, time.monotonic()
+            self._wait_until(part_started_s + step.start_after_s)
+            self._report(step=step)
+            snapshot = self._take(step)
+            self._writer.write(
+                [FrameToStore(step.index, snapshot.image, snapshot.metadata, snapshot.average)]
+            )
+            self._report_stored(snapshot)
+
+    def _take(self, step: Step) -> Snapshot:
+        for setting in self._settings.actions(step):
+            self._raise_if_stopping()
+            setting()
+        self._raise_if_stopping()
+        snapshot = self._bench.snap(step.average)
+        self._raise_if_stopping()  # the light may have gone out during the exposure
+        return snapshot
+
+    def _between_steps(self) -> None:
+        with self._condition:
+            paused = self._pausing
+        if paused and not self._aborting and not self._stopping.is_set():
+            self._settings.darken()
+            self._writer.note("paused")
+            self._report(state=RunState.PAUSED)
+            with self._condition:
+                self._condition.wait_for(
+                    lambda: not self._pausing or self._aborting or self._stopping.is_set()
+                )
+            self._writer.note("resumed")
+            self._report(state=RunState.RUNNING)
+        self._raise_if_stopping()
+        if self._aborting:
+            raise _EndedEarlyError(FinishReason.ABORTED)
+
+    def _wait_until(self, when_s: float) -> None:
+        while (left_s := when_s - time.monotonic()) > 0:
+            self._settings.darken()
+            with self._condition:
+                self._condition.wait_for(
+                    lambda: self._pausing or self._aborting or self._stopping.is_set(), left_s
+                )
+            self._between_steps()
+
+    def _raise_if_stopping(self) -> None:
+        if self._stopping.is_set():
+            raise _EndedEarlyError(FinishReason.STOPPED)
+
+    # The way out ---------------------------------------------------------------------------------
+    def _end(self, reason: FinishReason, error: BaseException | None = None) -> Run:
+        """Make the bench safe, then finish the run; a failure here never hides ``error``."""
+        with contextlib.suppress(Exception):
+            self._report(state=RunState.ENDING)
+        text = "" if error is None else str(error) or type(error).__name__
+        ended: list[Run] = []
+        steps = [
+            ("bench made safe", self._bench.safe_state),
+            ("run finished", lambda: ended.append(self._writer.finish(reason, text))),
+        ]
+        try:
+            try_all(steps)
+        except StepsFailedError as failure:
+            if error is None:
+                raise
+            _log.error("%s", failure)
+            error.add_note(str(failure))
+        finally:
+            self._finished.set()
+            with contextlib.suppress(Exception):
+                self._report(state=RunState.FINISHED, reason=reason)
+        if error is not None:
+            error.add_note(f"What was acquired is in {self._writer.path}")
+        return ended[0] if ended else Run.open(self._writer.path)
+
+    # Status --------------------------------------------------------------------------------------
+    def _report_stored(self, snapshot: Snapshot) -> None:
+        now = self.status
+        done_here = now.done + 1 - (now.total - len(self._todo))
+        seconds = time.monotonic() - self._started_s
+        self._report(
+            done=now.done + 1,
+            seconds=seconds,
+            seconds_left=seconds / done_here * (len(self._todo) - done_here),
+            dropped=now.dropped + snapshot.metadata.dropped_before,
+            saturated_fraction=snapshot.metadata.saturated_fraction,
+        )
+
+    def _report(self, **changes: object) -> None:
+        with self._condition:
+            self._status = replace(self._status, **changes)  # type: ignore[arg-type]
+            status = self._status
+        if self._on_progress is not None:
+            self._on_progress(status)

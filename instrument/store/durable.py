@@ -1,0 +1,115 @@
+"""Writing so that what was written is on the disk: fsync, rename, append-only lines.
+
+A file is on disk when its data and the folder that names it have been synced; a rename within one folder
+is atomic. Everything here returns only then.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+Json = Mapping[str, Any]
+
+
+def sync_folder(path: Path) -> None:
+    """Put a folder's entries on the disk."""
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that does not exist yet, and put its name on the disk."""
+    path.mkdir()
+    sync_folder(path.parent)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a whole file: after a crash there is the old one or the new one, never a half."""
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def write_json(path: Path, data: Json) -> None:
+    """Write a mapping as a JSON file, atomically."""
+    write_atomically(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+
+
+class AppendOnlyLog:
+    """A file of JSON lines that only ever grows.
+
+    A line counts once :meth:`append` has returned. A crash can leave one torn line at the end; opening the
+    log for writing removes it (``torn_bytes`` says how much that was).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        try:
+            _, whole = read_lines(path)
+            self._size = whole
+            self.torn_bytes = os.fstat(self._handle).st_size - whole
+            if self.torn_bytes:
+                os.ftruncate(self._handle, whole)
+                os.fsync(self._handle)
+            sync_folder(path.parent)
+        except BaseException:
+            os.close(self._handle)
+            raise
+
+    def append(self, records: Iterable[Json]) -> None:
+        """Append records and wait until they are on the disk; all of them, or (raising) none."""
+        text = "".join(json.dumps(record, ensure_ascii=False) + "\n" for record in records)
+        data = text.encode()
+        try:
+            written = 0
+            while written < len(data):
+                written += os.write(self._handle, data[written:])
+            os.fsync(self._handle)
+        except OSError:
+            os.ftruncate(self._handle, self._size)
+            raise
+        self._size += len(data)
+
+    def close(self) -> None:
+        """Close the file; closing twice does nothing."""
+        if self._handle >= 0:
+            handle, self._handle = self._handle, -1
+            os.close(handle)
+
+
+def read_lines(path: Path) -> tuple[list[dict[str, Any]], int]:
+    """Return a log's records and how many of the file's bytes they fill.
+
+    Reading ends at the first line that is not whole: after a crash, that is the torn one at the end.
+    """
+    records: list[dict[str, Any]] = []
+    whole = 0
+    with path.open("rb") as file:
+        for line in file:
+            if not line.endswith(b"\n"):
+                break
+            try:
+                record = json.loads(line)
+            except ValueError:
+                break
+            if not isinstance(record, dict):
+                break
+            records.append(record)
+            whole += len(line)
+    return records, whole

@@ -1,0 +1,78 @@
+"""The log's lines about frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any
+
+from drivers.frame import FrameMetadata
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """A frame that is on the disk.
+
+    Attributes
+    ----------
+    index : int
+        Place in the image array: index of the plan's step, or number of the recording's frame.
+    n_bytes, crc32 : int
+        Size and CRC-32 of its chunk's file.
+    average : int
+        Number of exposures whose mean it is.
+    metadata : FrameMetadata
+    """
+
+    index: int
+    n_bytes: int
+    crc32: int
+    average: int
+    metadata: FrameMetadata
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the log line."""
+        metadata = asdict(self.metadata)
+        metadata["utc"] = self.metadata.utc.isoformat()
+        metadata["stage_position"] = dict(self.metadata.stage_position)
+        return {
+            "kind": "frame",
+            "index": self.index,
+            "n_bytes": self.n_bytes,
+            "crc32": f"{self.crc32:08x}",
+            "average": self.average,
+            "metadata": metadata,
+        }
+
+    @classmethod
+    def from_json(cls, line: Mapping[str, Any]) -> FrameRecord:
+        """Return what :meth:`to_json` wrote."""
+        metadata = dict(line["metadata"])
+        metadata["utc"] = datetime.fromisoformat(metadata["utc"])
+        metadata["roi"] = tuple(metadata["roi"])
+        return cls(
+            index=int(line["index"]),
+            n_bytes=int(line["n_bytes"]),
+            crc32=int(line["crc32"], 16),
+            average=int(line["average"]),
+            metadata=FrameMetadata(**metadata),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Frames of a recording that are lost: ``count`` of them from ``first`` on, and why."""
+
+    first: int
+    count: int
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the log line."""
+        return {"kind": "gap", "first": self.first, "count": self.count, "reason": self.reason}
+
+    @classmethod
+    def from_json(cls, line: Mapping[str, Any]) -> Gap:
+        """Return what :meth:`to_json` wrote."""
+        return cls(int(line["first"]), int(line["count"]), str(line["reason"]))
