@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 _lock = threading.Lock()
+_inside = threading.local()
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
@@ -33,11 +34,22 @@ def set_threads(threads: int) -> None:
 
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="recon")
+    return ThreadPoolExecutor(threads, thread_name_prefix="recon", initializer=_mark_worker)
+
+
+def _mark_worker() -> None:
+    _inside.pool = True
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has the pool but not its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int = 1) -> None:
     """Call ``kernel(start, stop)`` on contiguous blocks that together cover ``range(length)``.
+
+    Called from inside a block, it does all of it on the thread it is on (waiting for the pool from within the
+    pool would never end).
 
     Parameters
     ----------
@@ -49,7 +61,7 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
         Smallest block worth a thread.
     """
     blocks = min(_threads, max(length // max(grain, 1), 1))
-    if blocks <= 1:
+    if blocks <= 1 or getattr(_inside, "pool", False):
         kernel(0, length)
         return
     edges = [length * i // blocks for i in range(blocks + 1)]

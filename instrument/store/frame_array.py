@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.atomic import sync_folder
-from instrument.store.durable import make_folder, write_json
+from instrument.store.durable import make_folder, sync_folder, write_json
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"

@@ -1,7 +1,19 @@
 """Solvers: an operator, data and a prior in; an object, a history and the reason to stop out."""
 
+from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome, Solver
 from recon.solvers.fista import Fista
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
+from recon.solvers.wiener import wiener
 
-__all__ = ["Fista", "IterationRecord", "Outcome", "Solver", "StopReason", "StoppingRules"]
+__all__ = [
+    "Admm",
+    "Fista",
+    "IterationRecord",
+    "Outcome",
+    "Penalties",
+    "Solver",
+    "StopReason",
+    "StoppingRules",
+    "wiener",
+]

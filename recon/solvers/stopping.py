@@ -16,6 +16,7 @@ class StopReason(enum.StrEnum):
     TIME = "the time budget is spent"
     ITERATIONS = "the number of iterations is reached"
     CANCELLED = "cancelled"
+    ONE_STEP = "solved in one step"
     NOT_FINITE = "the iterate is no longer finite; the starting point is returned"
 
 

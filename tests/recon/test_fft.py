@@ -106,6 +106,18 @@ def test_blocks_serve_several_callers_at_once(threads):
     assert (totals == 20).all()
 
 
+def test_blocks_within_blocks_end(threads):
+    threads(2)
+    hits = np.zeros((6, 10))
+
+    def outer(start, stop):
+        for row in range(start, stop):
+            in_blocks(lambda a, b, row=row: hits[row, a:b].__iadd__(1), 10)
+
+    in_blocks(outer, 6)
+    assert (hits == 1).all()
+
+
 def test_import_is_light():
     code = (
         "import sys, recon, recon.operators, recon.solvers, recon.priors, recon.metrics;"

@@ -1,0 +1,73 @@
+"""The methods that :func:`recon.reconstruct` offers by name.
+
+A method takes a :class:`Problem` and returns an :class:`~recon.solvers.Outcome`. New ones register with
+:func:`register`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from recon.operators.base import Array, LinearOperator
+from recon.priors.base import Prior
+from recon.solvers.admm import Admm
+from recon.solvers.base import Callback, Outcome
+from recon.solvers.fista import Fista
+from recon.solvers.stopping import StoppingRules
+from recon.solvers.wiener import wiener
+
+
+@dataclass(frozen=True)
+class Problem:
+    """``min_x 1/2 ||A x - b||^2 + prior(x)`` with a start, rules to stop and whom to tell.
+
+    Data is scaled so that its noise has deviation 1, the operator so that a PSF has unit energy.
+    """
+
+    operator: LinearOperator
+    data: Array
+    prior: Prior
+    initial: Array | None
+    rules: StoppingRules
+    callback: Callback | None
+    cancel: threading.Event | None
+
+
+Method = Callable[[Problem], Outcome]
+_methods: dict[str, Method] = {}
+
+
+def register(name: str, method: Method) -> None:
+    """Offer a method under a name."""
+    _methods[name] = method
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of the methods on offer."""
+    return tuple(_methods)
+
+
+def method_named(name: str) -> Method:
+    """Return a method by its name; raises KeyError for an unknown one."""
+    return _methods[name]
+
+
+def _admm(p: Problem) -> Outcome:
+    solver = Admm(p.operator, p.data, p.prior, initial=p.initial)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+
+
+def _fista(p: Problem) -> Outcome:
+    solver = Fista(p.operator, p.data, p.prior, initial=p.initial)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+
+
+def _wiener(p: Problem) -> Outcome:
+    return wiener(p.operator, p.data)
+
+
+register("admm", _admm)
+register("fista", _fista)
+register("wiener", _wiener)

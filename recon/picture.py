@@ -1,0 +1,189 @@
+"""One call from a measurement and a calibration to a picture, with defaults that need no tuning."""
+
+from __future__ import annotations
+
+import difflib
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.methods import Problem, method_named, method_names
+from recon.noise import NoiseModel
+from recon.preparation import Field, Prepared, prepare
+from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
+from recon.result import Reconstruction
+from recon.solvers.base import Solver
+from recon.solvers.stopping import IterationRecord, StoppingRules
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+
+PRIORS: dict[str, Callable[[float], Prior]] = {
+    "tv": lambda weight: TotalVariation(weight) + NonNegativity(),
+    "tv-isotropic": lambda weight: TotalVariation(weight, isotropic=True) + NonNegativity(),
+    "tv-haar": lambda weight: HaarTotalVariation(weight) + NonNegativity(),
+    "l1": lambda weight: L1(weight) + NonNegativity(),
+    "nonnegative": lambda _: NonNegativity(),
+    "none": lambda _: Zero(),
+}
+"""Priors by name, as functions of their weight."""
+
+NOISE_WEIGHT = 1.0
+"""Default weight of a prior in units of the noise (that a unit-energy PSF's adjoint passes on unchanged)."""
+
+LEAST_TAU = 1e-5
+"""Least default weight relative to ``max |A^H b|``: what errors of the model ask for when noise does not."""
+
+
+def reconstruct(
+    measurement: npt.ArrayLike,
+    calibration: Calibration | npt.ArrayLike,
+    *,
+    z_um: float | None = None,
+    method: str = "admm",
+    prior: str | Prior = "tv",
+    tau: float | None = None,
+    iterations: int | None = None,
+    time_s: float | None = None,
+    tolerance: float = 1e-3,
+    stop_at_noise: bool = False,
+    noise: NoiseModel | float | None = None,
+    background: npt.ArrayLike | None = None,
+    erasures: npt.ArrayLike | None = None,
+    initial: Reconstruction | None = None,
+    field: Field = "sensor",
+    callback: Progress | None = None,
+    cancel: threading.Event | None = None,
+) -> Reconstruction:
+    """Reconstruct the picture of one depth from a lensless camera's measurement.
+
+    Parameters
+    ----------
+    measurement : array, (height, width) or (height, width, n_channels)
+        Any real dtype, any exposure. Background already subtracted, or given as ``background``.
+    calibration : Calibration or array
+        PSFs, or one PSF image (height, width[, n_channels]) without background. One channel serves all.
+    z_um : float, optional
+        Depth of the scene; chooses the nearest calibrated PSF. Needed when there are several.
+    method : str
+        A name from :func:`recon.methods.method_names`: ``"admm"``, ``"fista"``, ``"wiener"``.
+    prior : str or Prior
+        A name from :data:`PRIORS` (all but ``"none"`` include non-negativity), or a prior for the scaled
+        problem of :func:`recon.preparation.prepare`. ``"wiener"`` has its own.
+    tau : float, optional
+        Weight of the prior relative to ``max |A^H b|``: the same number works at any exposure and size, and
+        for l1 a tau of 1 leaves nothing. Default: from the measurement's noise.
+    iterations, time_s, tolerance : optional
+        When to stop: count, wall seconds, relative change an iteration, whichever comes first. Without
+        ``iterations`` and ``time_s``: 300 iterations.
+    stop_at_noise : bool
+        Also stop as soon as the residual is down to the expected noise.
+    noise : NoiseModel or float, optional
+        The camera's noise, or its standard deviation in counts; default: estimated from the measurement.
+    background : array or number, optional
+        Subtracted from the measurement first.
+    erasures : array of bool, (height, width[, n_channels]), optional
+        True where a pixel tells nothing: dead, saturated, not read (Kuo 2020, Eq. 3.10, has the complement).
+    initial : Reconstruction, optional
+        Start from this one's ``state``.
+    field : "sensor" or "full"
+        Return the part opposite to the sensor, or everything that can reach it.
+    callback : callable, optional
+        ``callback(record, image)`` after each iteration; ``image()`` makes the present picture.
+    cancel : threading.Event, optional
+        Set it to stop after the iteration in progress.
+
+    Returns
+    -------
+    Reconstruction
+        ``history`` holds residuals in units of the noise' standard deviation, to compare with ``noise_norm``.
+
+    Raises
+    ------
+    InputError
+        When the input is unusable; the text says what was found, what was expected and what to do.
+    """
+    if method not in method_names():
+        raise InputError(_unknown("method", method, method_names()))
+    problem = prepare(
+        measurement, calibration, z_um=z_um, noise=noise, background=background, erasures=erasures
+    )
+    problem.grid(field, z_um)
+    peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
+    tau = max(NOISE_WEIGHT / peak if peak > 0 else 0.0, LEAST_TAU) if tau is None else float(tau)
+    if not tau >= 0:
+        raise InputError(f"tau must not be negative; got {tau}.")
+    name, penalty = _named(prior, tau * peak)
+    try:
+        rules = StoppingRules(
+            iterations=300 if iterations is None and time_s is None else iterations,
+            time_s=time_s,
+            tolerance=tolerance,
+            noise_norm=problem.noise_norm if stop_at_noise else None,
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+    def tell(solver: Solver, record: IterationRecord) -> None:
+        if callback is not None:
+            callback(record, lambda: problem.picture(solver.solution, field))
+
+    outcome = method_named(method)(
+        Problem(
+            operator=problem.operator,
+            data=problem.data,
+            prior=penalty,
+            initial=None if initial is None else _start(initial, problem),
+            rules=rules,
+            callback=None if callback is None else tell,
+            cancel=cancel,
+        )
+    )
+    return Reconstruction(
+        image=problem.picture(outcome.solution, field),
+        grid=problem.grid(field, z_um),
+        method=method,
+        prior=name,
+        tau=tau if isinstance(prior, str) else None,
+        noise_norm=problem.noise_norm,
+        history=outcome.history,
+        stop_reason=outcome.stop_reason,
+        seconds=outcome.seconds,
+        warnings=problem.warnings,
+        state=outcome.solution * problem.image_scale,
+        provenance={
+            "noise_deviation": [float(v) for v in problem.noise],
+            "psf_z_um": problem.psf_z_um,
+            "valid_share": float(problem.noise_norm**2 / problem.data.size),
+        },
+    )
+
+
+def _named(prior: str | Prior, weight: float) -> tuple[str, Prior]:
+    if isinstance(prior, Prior):
+        return "+".join(type(t).__name__ for t in prior.terms()), prior
+    if prior not in PRIORS:
+        raise InputError(_unknown("prior", prior, tuple(PRIORS)))
+    return prior, PRIORS[prior](weight)
+
+
+def _start(initial: Reconstruction, problem: Prepared) -> Array:
+    if initial.state is None or initial.state.shape != problem.camera.domain_shape:
+        found = "no state" if initial.state is None else f"a state of {initial.state.shape}"
+        raise InputError(
+            f"The reconstruction to start from has {found}; "
+            f"this measurement needs {problem.camera.domain_shape}."
+        )
+    start: Array = initial.state / problem.image_scale
+    return start
+
+
+def _unknown(what: str, name: str, known: tuple[str, ...]) -> str:
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"The {what} {name!r} is not known. Choose one of {', '.join(known)}.{hint}"

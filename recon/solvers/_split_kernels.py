@@ -1,0 +1,212 @@
+"""Compiled sweeps of :mod:`recon.solvers.admm` (imported lazily: numba).
+
+Arrays are ``(n_channels, height, width)``. Each channel is cut into strips of rows (``edges``) that do not
+depend on the number of threads, and sums are kept per row, so that results do not depend on it either.
+Scalars must come in the arrays' precision: a Python float would turn all arithmetic into float64.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+# Columns of ``sums``
+DATA, TV, L1, PRIMAL_V, PRIMAL_U, PRIMAL_W, DUAL_V, DUAL_U, DUAL_W, NORM_Y, NORM_U, NORM_W = range(12)
+N_SUMS = 12
+
+# Reordering sums is fine (it is the same for every strip); NaN and infinity must stay what they are.
+FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(inline="always")
+def _soft(t: Any, threshold: Any) -> Any:
+    return t - min(max(t, -threshold), threshold)
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def save_strip_neighbours(
+    y: Any, tx: Any, ty: Any, edges: Any, threshold: Any, relax: Any, isotropic: bool, below: Any, above: Any
+) -> None:
+    """Save what a strip needs of its neighbours before these are overwritten.
+
+    ``below[c, s]``: the row of ``y`` after strip ``s``. ``above[c, s]``: the reflected vertical difference
+    state of the row before it, as :func:`sweep` will make it.
+    """
+    n_channels, height, width = y.shape
+    spare = np.empty(width, y.dtype)
+    sums = np.zeros(N_SUMS)
+    for c in range(n_channels):
+        for s in range(edges.size - 1):
+            below[c, s] = y[c, edges[s + 1] % height]
+            before = (edges[s] - 1) % height
+            _update_differences(
+                y[c, before], y[c, edges[s]], tx[c, before].copy(), ty[c, before].copy(),
+                threshold, relax, isotropic, spare, above[c, s], sums,
+            )  # fmt: skip
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _update_differences(
+    y: Any, following: Any, tx: Any, ty: Any, threshold: Any, relax: Any, isotropic: bool,
+    rx: Any, ry: Any, sums: Any,
+) -> None:  # fmt: skip
+    """Update the difference states of one row; ``rx``, ``ry`` get the reflected states."""
+    width = y.size
+    zero = threshold - threshold
+    one = y.dtype.type(1)
+    tiny = y.dtype.type(1e-30)
+    tv, primal, dual, norm = zero, zero, zero, zero
+    for j in range(width):
+        dx = y[j + 1 if j + 1 < width else 0] - y[j]
+        dy = following[j] - y[j]
+        a, b = tx[j], ty[j]
+        if isotropic:
+            keep = max(one - threshold / max(np.sqrt(a * a + b * b), tiny), zero)
+            p, q = keep * a, keep * b
+        else:
+            p, q = _soft(a, threshold), _soft(b, threshold)
+        a += relax * (dx - p)
+        b += relax * (dy - q)
+        if isotropic:
+            keep = max(one - threshold / max(np.sqrt(a * a + b * b), tiny), zero)
+            p_new, q_new = keep * a, keep * b
+            tv += np.sqrt(dx * dx + dy * dy)
+        else:
+            p_new, q_new = _soft(a, threshold), _soft(b, threshold)
+            tv += abs(dx) + abs(dy)
+        tx[j], ty[j] = a, b
+        rx[j], ry[j] = p_new + p_new - a, q_new + q_new - b
+        primal += (dx - p_new) ** 2 + (dy - q_new) ** 2
+        dual += (p_new - p) ** 2 + (q_new - q) ** 2
+        norm += p_new * p_new + q_new * q_new
+    sums[TV] += tv
+    sums[PRIMAL_U] += primal
+    sums[DUAL_U] += dual
+    sums[NORM_U] += norm
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _update_data(
+    my: Any, t: Any, data: Any, weight: Any, left: int, on_sensor: bool, mu: Any, relax: Any, sums: Any
+) -> None:
+    """Update the data state of one row and put ``mu R(t)`` in the place of ``M y``.
+
+    On valid pixels of the sensor ``prox(t) = (b + mu t) / (1 + mu)``; elsewhere nothing is known and
+    ``prox(t) = t``.
+    """
+    zero = mu - mu
+    residual, primal, dual = zero, zero, zero
+    for j in range(my.size):
+        # Off the sensor: prox(t) = t, so t becomes the relaxed M y and R(t) = t.
+        step = relax * (my[j] - t[j])
+        dual += step * step
+        primal += (my[j] - t[j] - step) ** 2
+        new = t[j] + step
+        if not on_sensor or j < left or j >= left + data.size:
+            t[j] = new
+            my[j] = mu * new
+        else:
+            w, b = weight[j - left], data[j - left]
+            share = w / (w + mu)
+            p = t[j] + share * (b - t[j])
+            new = t[j] + relax * (my[j] - p)
+            p_new = new + share * (b - new)
+            residual += w * (my[j] - b) ** 2
+            t[j] = new
+            my[j] = mu * (p_new + p_new - new)
+    sums[DATA] += residual
+    sums[PRIMAL_V] += primal
+    sums[DUAL_V] += dual
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _update_separable(
+    y: Any, t: Any, threshold: Any, lower: Any, upper: Any, relax: Any, reflected: Any, sums: Any
+) -> None:
+    """Update the separable prior's state of one row."""
+    zero = relax - relax
+    primal, dual, norm, norm_y, l1 = zero, zero, zero, zero, zero
+    for j in range(y.size):
+        p = min(max(_soft(t[j], threshold), lower), upper)
+        new = t[j] + relax * (y[j] - p)
+        p_new = min(max(_soft(new, threshold), lower), upper)
+        t[j] = new
+        reflected[j] = p_new + p_new - new
+        primal += (y[j] - p_new) ** 2
+        dual += (p_new - p) ** 2
+        norm += p_new * p_new
+        norm_y += y[j] * y[j]
+        l1 += abs(p_new)
+    sums[L1] += l1
+    sums[PRIMAL_W] += primal
+    sums[DUAL_W] += dual
+    sums[NORM_W] += norm
+    sums[NORM_Y] += norm_y
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def sweep(
+    start: int, stop: int, edges: Any, below: Any, above: Any,
+    y: Any, my: Any, t_v: Any, tx: Any, ty: Any, t_w: Any,
+    data: Any, weight: Any, top: int, left: int,
+    mu_v: Any, mu_u: Any, mu_w: Any, threshold_u: Any, threshold_w: Any, lower: Any, upper: Any,
+    relax: Any, isotropic: bool, sums: Any,
+) -> None:  # fmt: skip
+    """Update all split states from ``y`` and ``M y``, and put the next right-hand sides in their place.
+
+    Does strips ``start`` to ``stop``, counted over all channels. Afterwards ``y`` holds
+    ``mu_u Psi^T R(t_u) + mu_w R(t_w)`` and ``my`` holds ``mu_v R(t_v)``, with ``R(t) = 2 prox(t) - t``.
+    """
+    _, height, width = y.shape
+    n_strips = edges.size - 1
+    rx = np.empty(width, y.dtype)
+    ry = np.empty(width, y.dtype)
+    rw = np.empty(width, y.dtype)
+    ry_above = np.empty(width, y.dtype)
+    for strip in range(start, stop):
+        c, s = strip // n_strips, strip % n_strips
+        ry_above[:] = above[c, s]
+        for i in range(edges[s], edges[s + 1]):
+            row = sums[c * height + i]
+            row[:] = 0
+            following = below[c, s] if i + 1 == edges[s + 1] else y[c, i + 1]
+            out = y[c, i]
+            _update_separable(out, t_w[c, i], threshold_w, lower, upper, relax, rw, row)
+            _update_differences(
+                out, following, tx[c, i], ty[c, i], threshold_u, relax, isotropic, rx, ry, row
+            )
+            out[0] = mu_w * rw[0] + mu_u * (rx[width - 1] - rx[0] + ry_above[0] - ry[0])
+            for j in range(1, width):
+                out[j] = mu_w * rw[j] + mu_u * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
+            ry_above[:] = ry
+            on_sensor = top <= i < top + data.shape[1]
+            k = i - top if on_sensor else 0
+            _update_data(my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v, relax, row)
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def solve_spectrum(
+    start: int, stop: int, Y: Any, MY: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
+    mu_v: Any, mu_u: Any, mu_w: Any,
+) -> None:  # fmt: skip
+    """Solve ``(mu_v |H|^2 + mu_u |Psi|^2 + mu_w) y = rhs`` for rows ``start`` to ``stop`` of all channels.
+
+    In: ``Y`` the spectrum of the prior's right-hand side, ``MY`` that of the data's, before the adjoint.
+    Out: the spectra of ``y`` and ``M y``.
+    """
+    _, height, width = Y.shape
+    shared = H.shape[0] == 1
+    for r in range(start, stop):
+        c, i = r // height, r % height
+        h, a, b = H[0 if shared else c, i], Y[c, i], MY[c, i]
+        row = mu_w + mu_u * laplace_rows[i]
+        for j in range(width):
+            hr, hi = h[j].real, h[j].imag
+            br, bi = b[j].real, b[j].imag
+            scale = mu_v * (hr * hr + hi * hi) + row + mu_u * laplace_columns[j]
+            yr = (a[j].real + hr * br + hi * bi) / scale
+            yi = (a[j].imag + hr * bi - hi * br) / scale
+            a[j] = complex(yr, yi)
+            b[j] = complex(hr * yr - hi * yi, hr * yi + hi * yr)

@@ -1,0 +1,113 @@
+"""One-shot deconvolution in Fourier space, for previews and starting points (Tikhonov / Wiener)."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from recon import fft
+from recon.operators.base import Array, LinearOperator
+from recon.solvers.base import Outcome
+from recon.solvers.stopping import StopReason
+from recon.solvers.structure import CroppedConvolution, as_cropped_convolution
+
+FLATNESS = 1e-3
+"""Share of plain Tikhonov in the penalty: keeps the lowest frequencies, which have no gradient, bounded."""
+
+
+def wiener(operator: LinearOperator, data: Array, regularisation: float | None = None) -> Outcome:
+    """Deconvolve in one step: ``conj(H) B / (|H|^2 + r mean|H|^2 (|Psi|^2 + flatness))``.
+
+    The penalty on differences is the Wiener filter for pictures whose spectrum falls as ``1 / f^2``. Beyond
+    the sensor the data is continued by its edge, faded to zero over the padding; erased pixels are filled
+    from their neighbourhood.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        A ``PadCropConvolution``, with or without ``Erasures``.
+    data : ndarray, ``operator.range_shape``
+    regularisation : float, optional
+        ``r`` above, relative to the PSF's mean power. Default: by generalised cross-validation for all
+        channels together.
+
+    Returns
+    -------
+    Outcome
+        With an empty history.
+    """
+    began = time.perf_counter()
+    structure = as_cropped_convolution(operator)
+    convolution = structure.convolution
+    B = fft.rfft(_continue_beyond_sensor(structure, np.asarray(data, operator.dtype)))
+    height, width = convolution.grid_shape
+    penalty = FLATNESS + _laplace(height)[:, None] + _laplace(width)[: width // 2 + 1]
+    power = convolution.power
+    penalty = (penalty * float(np.mean(power))).astype(power.dtype)
+    if regularisation is None:
+        regularisation = _cross_validated(power, penalty, B)
+    B *= np.conj(convolution.spectrum)
+    B /= power + power.dtype.type(regularisation) * penalty
+    solution = fft.irfft(B, width)
+    return Outcome(solution, (), StopReason.ONE_STEP, time.perf_counter() - began)
+
+
+def _cross_validated(power: Array, penalty: Array, B: Array) -> float:
+    """Return the regularisation that predicts left-out data best (Golub, Heath & Wahba 1979)."""
+    signal = (B.real**2 + B.imag**2).astype(np.float64)
+    candidates = np.logspace(-6, 2, 33)
+    scores = []
+    for r in candidates:
+        kept = 1 - power / (power + r * penalty)
+        scores.append(float(np.sum(kept**2 * signal)) / float(np.sum(np.broadcast_to(kept, B.shape))) ** 2)
+    return float(candidates[int(np.argmin(scores))])
+
+
+def _continue_beyond_sensor(structure: CroppedConvolution, data: Array) -> Array:
+    """Put the data on the grid: erased pixels filled, edges repeated and faded to zero at half the padding.
+
+    A hard edge would be deconvolved into stripes all over the picture.
+    """
+    convolution = structure.convolution
+    if not structure.weight.all():
+        data = _filled(data, structure.weight)
+    rows, row_fade = _nearest(convolution.grid_shape[0], convolution.corner[0], data.shape[1])
+    columns, column_fade = _nearest(convolution.grid_shape[1], convolution.corner[1], data.shape[2])
+    grid = data[:, rows[:, None], columns]
+    grid *= (row_fade[:, None] * column_fade).astype(data.dtype)
+    return grid
+
+
+def _nearest(grid: int, start: int, length: int) -> tuple[Array, Array]:
+    """For each grid position around the ring: nearest sensor position, and a cosine fade with distance."""
+    offset = (np.arange(grid) - start) % grid
+    beyond = np.maximum(offset - (length - 1), 0)
+    before = np.where(beyond > 0, grid - offset, 0)
+    index = np.where(beyond <= before, np.minimum(offset, length - 1), 0)
+    distance = np.minimum(beyond, before)
+    reach = max((grid - length) / 2, 1)
+    return index, 0.5 + 0.5 * np.cos(np.pi * np.minimum(distance / reach, 1))
+
+
+def _filled(data: Array, weight: Array) -> Array:
+    """Replace erased pixels by a weighted mean of valid ones, the nearer the heavier."""
+    from scipy.ndimage import gaussian_filter
+
+    filled = data * weight
+    known = weight.copy()
+    sigma = 1.0
+    while sigma < max(data.shape[1:]):
+        smooth = gaussian_filter(data * weight, (0, sigma, sigma))
+        share = gaussian_filter(weight, (0, sigma, sigma))
+        fresh = (known == 0) & (share > 1e-3)
+        filled[fresh] = smooth[fresh] / share[fresh]
+        known[fresh] = 1
+        if known.all():
+            break
+        sigma *= 2
+    return filled
+
+
+def _laplace(n: int) -> Array:
+    return 4 * np.sin(np.pi * np.arange(n) / n) ** 2

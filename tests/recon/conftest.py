@@ -1,0 +1,78 @@
+"""A small lensless camera to test against, made without any of recon's own models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
+
+FINE = 3
+"""The scene and the PSF are drawn on a grid this much finer than the sensor's."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A measurement with its PSF image and the true scene, all (height, width), on the sensor's grid."""
+
+    measurement: np.ndarray
+    psf: np.ndarray
+    truth: np.ndarray
+    noise: float
+
+
+def caustic(height: int, width: int, seed: int) -> np.ndarray:
+    """Rays through a smooth random height map, counted on a grid of ``height`` x ``width``."""
+    rng = np.random.default_rng(seed)
+    surface = gaussian_filter(rng.standard_normal((height, width)), height / 20, mode="wrap")
+    slope_y, slope_x = np.gradient(surface / surface.std())
+    rows, columns = np.mgrid[0:height:0.5, 0:width:0.5] + rng.random((2, 2 * height, 2 * width)) * 0.5
+    i, j = rows.astype(int), columns.astype(int)
+    inside = (abs(rows / height - 0.5) < 0.36) & (abs(columns / width - 0.5) < 0.36)
+    throw = (height / 20) ** 2 / 2
+    landed_y, landed_x = rows + throw * slope_y[i, j], columns + throw * slope_x[i, j]
+    image, _, _ = np.histogram2d(
+        landed_y[inside], landed_x[inside], bins=(height, width), range=((0, height), (0, width))
+    )
+    return gaussian_filter(image, 0.7)
+
+
+def blocks(height: int, width: int, seed: int) -> np.ndarray:
+    """Overlapping discs and rectangles of random size and brightness on black."""
+    rng = np.random.default_rng(seed)
+    scene = np.zeros((height, width))
+    y, x = np.mgrid[:height, :width]
+    for k in range(24):
+        cy, cx = rng.uniform(0.15, 0.85, 2) * (height, width)
+        a, b = rng.uniform(0.03, 0.2, 2) * height
+        shape = (
+            (abs(y - cy) < a) & (abs(x - cx) < b) if k % 2 else ((y - cy) / a) ** 2 + ((x - cx) / b) ** 2 < 1
+        )
+        scene[shape] = rng.random()
+    return scene
+
+
+def binned(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape
+    return image.reshape(height // FINE, FINE, width // FINE, FINE).mean(axis=(1, 3))
+
+
+@pytest.fixture(scope="session")
+def shoot() -> Callable[..., Shot]:
+    """Photograph a scene: convolved on the fine grid at full size, cropped, binned, noise added."""
+
+    def shoot(height: int = 65, width: int = 81, *, snr: float = 100.0, seed: int = 0) -> Shot:
+        # Odd sizes: the fine grid's centre pixel then lies in the middle of the sensor's centre pixel.
+        rng = np.random.default_rng(seed)
+        psf = caustic(height * FINE, width * FINE, seed)
+        scene = blocks(height * FINE, width * FINE, seed + 1)
+        image = binned(fftconvolve(scene, psf, mode="same"))
+        noise = image.mean() / snr
+        return Shot(
+            image + noise * rng.standard_normal(image.shape), binned(psf), binned(scene) * FINE**2, noise
+        )
+
+    return shoot

@@ -1,0 +1,136 @@
+"""The fast ADMM against FISTA with exact proxes, a solver that shares none of its code."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import fft
+from recon.operators import Erasures, PadCropConvolution
+from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
+from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
+
+PRIORS = {
+    "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
+    "isotropic tv": TotalVariation(0.05, isotropic=True, tolerance=1e-8) + NonNegativity(),
+    "free tv": TotalVariation(0.05, tolerance=1e-8),
+    "tv and l1": TotalVariation(0.05, tolerance=1e-8) + L1(0.02) + NonNegativity(),
+    "l1": L1(0.05) + NonNegativity(),
+    "box": TotalVariation(0.01, tolerance=1e-8) + Box(0, 0.8),
+}
+
+
+def problem(n_channels=1, erased=False, dtype=np.float64):
+    rng = np.random.default_rng(0)
+    psfs = rng.random((n_channels, 7, 8)) * (rng.random((n_channels, 7, 8)) > 0.7)
+    psfs[:, 3, 4] += 2
+    camera = PadCropConvolution(psfs, (9, 10), dtype=dtype)
+    scene = np.zeros(camera.domain_shape, dtype)
+    scene[:, 5:9, 6:11] = 1
+    operator = camera
+    if erased:
+        operator = Erasures(rng.random((n_channels, 9, 10)) > 0.4, camera.range_shape, dtype) @ camera
+    noise = 0.02 * rng.standard_normal(camera.range_shape)
+    return operator, (operator.forward(scene) + noise).astype(dtype)
+
+
+def objective(operator, data, prior, x):
+    return 0.5 * float(np.sum((operator.forward(x) - data) ** 2)) + prior.value(x)
+
+
+def masked(operator, data):
+    return data * operator.outer.valid if hasattr(operator, "outer") else data
+
+
+@pytest.mark.parametrize(("n_channels", "erased"), [(1, False), (1, True), (2, False)])
+@pytest.mark.parametrize("name", PRIORS)
+def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
+    operator, data = problem(n_channels, erased)
+    data = masked(operator, data)
+    prior = PRIORS[name]
+    slow = Fista(operator, data, prior).run(StoppingRules(iterations=1000, tolerance=1e-7))
+    fast = Admm(operator, data, prior).run(StoppingRules(iterations=2000, tolerance=1e-9))
+    expected = objective(operator, data, prior, slow.solution)
+    assert objective(operator, data, prior, fast.solution) == pytest.approx(expected, rel=1e-4)
+
+
+def test_penalties_and_relaxation_change_the_way_not_the_goal():
+    operator, data = problem()
+    prior = PRIORS["tv"]
+    ends = [
+        Admm(operator, data, prior, penalties=p, relax=r).run(StoppingRules(iterations=5000, tolerance=1e-11))
+        for p, r in ((Penalties(), 1.0), (Penalties(0.3, 5, 2), 1.8))
+    ]
+    values = [objective(operator, data, prior, e.solution) for e in ends]
+    assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
+def test_float32_follows_float64():
+    prior = PRIORS["tv"]
+    rules = StoppingRules(iterations=500, tolerance=0)
+    single, double = (Admm(*problem(dtype=d), prior).run(rules).solution for d in (np.float32, np.float64))
+    assert single.dtype == np.float32
+    assert np.linalg.norm(single - double) < 1e-4 * np.linalg.norm(double)
+
+
+def test_does_not_depend_on_threads():
+    before = fft.get_threads()
+    solutions = []
+    try:
+        for threads in (1, 3):
+            fft.set_threads(threads)
+            solver = Admm(*problem(2, dtype=np.float32), PRIORS["isotropic tv"])
+            solutions.append(solver.run(StoppingRules(iterations=30, tolerance=0)))
+    finally:
+        fft.set_threads(before)
+    assert np.array_equal(solutions[0].solution, solutions[1].solution)
+    assert solutions[0].history[-1].objective == solutions[1].history[-1].objective
+
+
+def test_records_its_state_truthfully():
+    operator, data = problem()
+    prior = PRIORS["tv"]
+    out = Admm(operator, data, prior).run(StoppingRules(iterations=3000, tolerance=1e-10))
+    x = out.solution
+    assert out.history[-1].data_residual == pytest.approx(
+        np.linalg.norm(operator.forward(x) - data), rel=1e-4
+    )
+    assert out.history[-1].objective == pytest.approx(objective(operator, data, prior, x), rel=1e-4)
+
+
+def test_resumes_from_a_checkpoint_exactly():
+    operator, data = problem()
+    whole = Admm(operator, data, PRIORS["tv"]).run(StoppingRules(iterations=30, tolerance=0))
+    first = Admm(operator, data, PRIORS["tv"])
+    first.run(StoppingRules(iterations=17, tolerance=0))
+    second = Admm(operator, data, PRIORS["tv"])
+    second.restore(first.checkpoint())
+    assert np.array_equal(second.run(StoppingRules(iterations=30, tolerance=0)).solution, whole.solution)
+
+
+def test_starts_from_a_given_object():
+    operator, data = problem()
+    rules = StoppingRules(iterations=3000, tolerance=1e-10)
+    cold = Admm(operator, data, PRIORS["tv"]).run(rules)
+    warm = Admm(operator, data, PRIORS["tv"], initial=cold.solution).run(
+        StoppingRules(iterations=20, tolerance=0)
+    )
+    zero = Admm(operator, data, PRIORS["tv"]).run(StoppingRules(iterations=20, tolerance=0))
+    distance = [np.linalg.norm(o.solution - cold.solution) for o in (warm, zero)]
+    assert distance[0] < 0.5 * distance[1]
+
+
+def test_refuses_what_it_has_no_fast_way_for():
+    operator, data = problem()
+    with pytest.raises(TypeError, match="HaarTotalVariation"):
+        Admm(operator, data, HaarTotalVariation(0.1))
+    other = Erasures(np.ones((3, 3), bool), (1, 3, 3), np.float64)
+    with pytest.raises(TypeError, match="Fista takes any operator"):
+        Admm(other, np.zeros((1, 3, 3)), Zero())
+
+
+def test_zero_data_gives_zero():
+    operator, data = problem()
+    out = Admm(operator, 0 * data, PRIORS["tv"]).run()
+    assert out.stop_reason is StopReason.CONVERGED
+    assert not out.solution.any()

@@ -1,0 +1,159 @@
+"""Every prox against numerical minimisation; differences against their adjoint and Fourier symbol."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from recon.priors import (
+    L1,
+    Box,
+    Differences,
+    HaarTotalVariation,
+    NonNegativity,
+    Prior,
+    Separable,
+    TotalVariation,
+    Zero,
+)
+
+SEPARABLE = [
+    Zero(),
+    L1(0.7),
+    NonNegativity(),
+    Box(-0.2, 0.5),
+    L1(0.7) + NonNegativity(),
+    L1(0.3) + Box(0.1, 0.9),
+]
+
+
+@pytest.mark.parametrize("prior", SEPARABLE, ids=lambda p: f"{p.weight}-{p.lower}-{p.upper}")
+def test_separable_prox_minimises(prior):
+    step = 0.6
+    for x in np.linspace(-2, 2, 41):
+        low, high = max(prior.lower, -3), min(prior.upper, 3)
+        best = minimize_scalar(
+            lambda p, x=x: step * prior.weight * abs(p) + 0.5 * (p - x) ** 2,
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-10},
+        ).x
+        assert prior.prox(np.array([x]), step)[0] == pytest.approx(best, abs=2e-5)
+
+
+def test_value_is_infinite_outside_the_box():
+    assert NonNegativity().value(np.array([1.0, -1e-9])) == np.inf
+    assert (L1(2.0) + NonNegativity()).value(np.array([1.0, 3.0])) == 8
+    assert Box(0, 1).value(np.array([0.0, 1.0])) == 0
+
+
+def perturbation_test(prior: Prior, x: np.ndarray, step: float, slack: float) -> None:
+    """No small move from the prox, in any of many directions, may lower the objective."""
+    rng = np.random.default_rng(0)
+    p = prior.prox(x, step)
+
+    def objective(q: np.ndarray) -> float:
+        return step * prior.value(q) + 0.5 * float(np.sum((q - x) ** 2))
+
+    best = objective(p)
+    assert np.isfinite(best)
+    for scale in (1e-3, 1e-2, 1e-1):
+        for _ in range(100):
+            direction = rng.standard_normal(x.shape) * (rng.random(x.shape) < rng.random())
+            assert objective(p + scale * direction) >= best - slack
+    for q in (x, 0 * x, x + 0 * x.mean(), np.maximum(x, 0)):
+        assert objective(q) >= best - slack
+
+
+@pytest.mark.parametrize("separable", [Zero(), NonNegativity(), L1(0.2) + NonNegativity()])
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("wrap", [(True, True), (False, True)])
+def test_total_variation_prox_minimises(isotropic, wrap, separable):
+    x = np.random.default_rng(1).standard_normal((2, 6, 7))
+    prior = TotalVariation(0.4, isotropic=isotropic, axis_weights=(0.5, 1.0), wrap=wrap, tolerance=1e-12)
+    perturbation_test((prior + separable), x, 0.8, 1e-9)
+
+
+def test_total_variation_of_three_axes():
+    x = np.random.default_rng(1).standard_normal((3, 5, 4))
+    prior = TotalVariation(
+        0.3, axis_weights=(0.2, 1, 1), wrap=(False, True, True), tolerance=1e-12, max_inner=2000
+    )
+    perturbation_test(prior + NonNegativity(), x, 1.0, 1e-9)
+
+
+def test_one_dimensional_total_variation_equals_an_exact_solution():
+    """Of two levels, TV denoising moves each by strength * 2 / length (two edges on a ring)."""
+    x = np.zeros((1, 20))
+    x[0, 5:15] = 1
+    p = TotalVariation(0.5, axis_weights=(1.0,), tolerance=1e-14, max_inner=5000).prox(x, 1.0)
+    assert p[0, 10] == pytest.approx(1 - 2 * 0.5 / 10, abs=1e-5)
+    assert p[0, 0] == pytest.approx(2 * 0.5 / 10, abs=1e-5)
+
+
+def test_isotropic_and_anisotropic_values():
+    x = np.zeros((1, 4, 4))
+    x[0, 2, 2] = 1
+    assert TotalVariation(3.0).value(x) == pytest.approx(12)
+    assert TotalVariation(3.0, isotropic=True).value(x) == pytest.approx(3 * (2 + np.sqrt(2)))
+    assert HaarTotalVariation(3.0).value(x) == pytest.approx(12)
+
+
+def test_total_variation_with_nothing_to_do():
+    x = np.random.default_rng(0).standard_normal((1, 4, 4)).astype(np.float32)
+    assert np.array_equal(TotalVariation(0.0).prox(x, 1.0), x)
+    assert (TotalVariation(0.0) + NonNegativity()).prox(x, 1.0).min() == 0
+    assert TotalVariation(1.0).prox(x, 0.1).dtype == np.float32
+
+
+def test_haar_prox_is_the_text_s_recipe():
+    """Eqs. A.1 and A.2 written out, per axis, averaged."""
+    x = np.random.default_rng(2).standard_normal((1, 6, 8))
+    weight, step = 0.1, 0.7
+    threshold = 2 * 2 * weight * step
+    results = []
+    for axis in (-2, -1):
+        ahead = np.roll(x, -1, axis)
+        diff, total = (ahead - x) / 2, (ahead + x) / 2
+        diff = np.sign(diff) * np.maximum(np.abs(diff) - threshold, 0)
+        results.append((total - diff) / 2 + np.roll((total + diff) / 2, 1, axis))
+    assert HaarTotalVariation(weight).prox(x, step) == pytest.approx(np.mean(results, axis=0))
+
+
+def test_haar_prox_is_close_to_the_exact_one_for_small_weights():
+    x = np.random.default_rng(3).standard_normal((1, 16, 16))
+    exact = TotalVariation(1.0, tolerance=1e-14, max_inner=3000).prox(x, 1e-3)
+    assert np.linalg.norm(HaarTotalVariation(1.0).prox(x, 1e-3) - exact) < 0.1 * np.linalg.norm(exact - x)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("wrap", [(True, True), (False, True), (False, False)])
+@pytest.mark.parametrize("shape", [(2, 5, 6), (1, 1, 4), (1, 1, 1)])
+def test_differences_adjoint(shape, wrap, dtype):
+    psi = Differences(shape, (0.5, 2.0), wrap, dtype)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal(psi.domain_shape).astype(dtype)
+    y = rng.standard_normal(psi.range_shape).astype(dtype)
+    forward = psi.forward(x)
+    assert np.vdot(forward, y) == pytest.approx(
+        np.vdot(x, psi.adjoint(y)), abs=1e-4 if dtype == np.float32 else 1e-12
+    )
+    assert np.linalg.norm(forward) <= psi.norm_bound * np.linalg.norm(x)
+
+
+def test_sums_that_are_not_known_are_refused():
+    with pytest.raises(TypeError, match="TotalVariation, TotalVariation"):
+        TotalVariation(1.0) + TotalVariation(1.0)
+    total = NonNegativity() + L1(0.5) + L1(0.25)
+    assert isinstance(total, Separable)
+    assert (total.weight, total.lower) == (0.75, 0.0)
+    tv, separable = (TotalVariation(1.0) + NonNegativity()).terms()
+    assert isinstance(tv, TotalVariation)
+    assert separable.lower == 0
+    for weight in (-1.0, float("nan")):
+        for prior in (L1, TotalVariation, HaarTotalVariation):
+            with pytest.raises(ValueError, match="must not be negative"):
+                prior(weight)
+    with pytest.raises(ValueError, match="above its upper"):
+        Box(1, 0)

@@ -1,0 +1,213 @@
+"""The one call: pictures against the truth, independence of exposure, refusals in words."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
+from recon.metrics import psnr
+from recon.solvers import StopReason
+
+
+@pytest.fixture(scope="module")
+def shot(shoot):
+    return shoot()
+
+
+@pytest.mark.parametrize(
+    ("method", "prior", "least_db"),
+    [
+        ("admm", "tv", 26),
+        ("admm", "tv-isotropic", 26),
+        ("fista", "tv-haar", 22),
+        ("admm", "l1", 12),
+        ("wiener", "tv", 8),
+    ],
+)
+def test_finds_the_scene(shot, method, prior, least_db):
+    result = reconstruct(shot.measurement, shot.psf, method=method, prior=prior)
+    assert result.image.shape == shot.truth.shape
+    assert result.image.dtype == np.float32
+    found = psnr(result.image, shot.truth)
+    print(method, prior, f"{found:.1f} dB, {len(result.history)} iterations: {result.stop_reason}")
+    assert found > least_db
+
+
+def test_default_is_independent_of_exposure_and_psf_brightness(shot):
+    plain = reconstruct(shot.measurement, shot.psf, iterations=40)
+    for exposure in (1e-3, 1e5):
+        for brightness in (1e-4, 1e4):
+            other = reconstruct(exposure * shot.measurement, brightness * shot.psf, iterations=40)
+            assert other.image * brightness / exposure == pytest.approx(plain.image, rel=1e-3, abs=1e-3)
+            assert other.tau == pytest.approx(plain.tau, rel=1e-3)
+
+
+@pytest.mark.parametrize("snr", [5, 20, 1000])
+def test_default_holds_over_noise(shoot, snr):
+    shot = shoot(snr=snr)
+    default = psnr(reconstruct(shot.measurement, shot.psf).image, shot.truth)
+    tuned = max(
+        psnr(reconstruct(shot.measurement, shot.psf, tau=10.0**e).image, shot.truth)
+        for e in np.arange(-4, -1, 0.5)
+    )
+    print(f"snr {snr}: default {default:.2f} dB, tuned {tuned:.2f} dB")
+    assert default > tuned - 1.0
+
+
+def test_colour_channels_are_solved_each_with_its_psf(shot, shoot):
+    other = shoot(seed=7)
+    measurement = np.stack([shot.measurement, 3 * other.measurement], axis=-1)
+    both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), iterations=60, tolerance=0)
+    assert both.image.shape == (*shot.truth.shape, 2)
+    alone = reconstruct(shot.measurement, shot.psf, iterations=60, tolerance=0, tau=None)
+    assert both.image[..., 0] == pytest.approx(alone.image, abs=0.01 * float(alone.image.max()))
+    assert psnr(both.image[..., 1] / 3, other.truth) > 24
+    shared = reconstruct(measurement[..., :1], shot.psf, iterations=60, tolerance=0)
+    assert shared.image.shape == (*shot.truth.shape, 1)
+    assert shared.image[..., 0] == pytest.approx(alone.image)
+
+
+def test_erased_pixels_are_not_looked_at(shot):
+    valid = np.random.default_rng(0).random(shot.measurement.shape) > 0.4
+    spoilt = np.where(valid, shot.measurement, 1e6)
+    result = reconstruct(spoilt, shot.psf, erasures=~valid)
+    zeroed = reconstruct(np.where(valid, shot.measurement, 0), shot.psf, erasures=~valid)
+    assert np.array_equal(result.image, zeroed.image)
+    assert psnr(result.image, shot.truth) > 22
+    assert result.noise_norm == pytest.approx(np.sqrt(valid.sum()))
+
+
+def test_background_is_subtracted(shot):
+    plain = reconstruct(shot.measurement, shot.psf, iterations=10)
+    dark = np.full_like(shot.measurement, 500.0)
+    for background in (dark, 500, 500.0):
+        other = reconstruct(shot.measurement + 500, shot.psf, iterations=10, background=background)
+        assert other.image == pytest.approx(plain.image, rel=1e-3, abs=1e-3)
+
+
+def test_integers_and_floats_are_one(shot):
+    counts = np.round(shot.measurement).astype(np.uint16)
+    a, b = (reconstruct(m, shot.psf, iterations=10) for m in (counts, counts.astype(float)))
+    assert np.array_equal(a.image, b.image)
+
+
+def test_stops_by_rule_and_says_which(shot):
+    assert reconstruct(shot.measurement, shot.psf, iterations=7).stop_reason is StopReason.ITERATIONS
+    assert reconstruct(shot.measurement, shot.psf, time_s=0.05, tolerance=0).stop_reason is StopReason.TIME
+    noisy = reconstruct(shot.measurement, shot.psf, noise=20 * shot.noise, stop_at_noise=True)
+    assert noisy.stop_reason is StopReason.NOISE_LEVEL
+    assert noisy.history[-1].data_residual <= noisy.noise_norm
+    cancel = threading.Event()
+    pictures = []
+
+    def watch(record, image):
+        pictures.append(image())
+        if record.iteration == 4:
+            cancel.set()
+
+    stopped = reconstruct(shot.measurement, shot.psf, callback=watch, cancel=cancel)
+    assert stopped.stop_reason is StopReason.CANCELLED
+    assert len(pictures) == len(stopped.history) == 4
+    assert np.array_equal(pictures[-1], stopped.image)
+
+
+def test_noise_is_estimated_and_taken_from_a_model(shot):
+    measured = reconstruct(shot.measurement, shot.psf, iterations=1).provenance["noise_deviation"][0]
+    assert measured == pytest.approx(shot.noise, rel=0.5)
+    model = NoiseModel(read_noise=3.0, counts_per_electron=0.5)
+    told = reconstruct(shot.measurement, shot.psf, iterations=1, noise=model).provenance["noise_deviation"][0]
+    assert told == pytest.approx(np.sqrt(9 + 0.5 * shot.measurement.mean()), rel=1e-3)
+
+
+def test_continues_from_an_earlier_result(shot):
+    done = reconstruct(shot.measurement, shot.psf)
+    warm = reconstruct(shot.measurement, shot.psf, initial=done, iterations=5)
+    cold = reconstruct(shot.measurement, shot.psf, iterations=5)
+    assert psnr(warm.image, shot.truth) > psnr(cold.image, shot.truth) + 3
+
+
+def test_grid_tells_where_pixels_lie(shot):
+    geometry = Geometry(pixel_pitch_um=10.0, diffuser_distance_mm=5.0)
+    calibration = Calibration(
+        psfs=np.stack([shot.psf, shot.psf[::-1]]).astype(np.float32)[:, None],
+        source_positions_um=np.array([[0, 0, 20_000.0], [0, 0, 40_000.0]]),
+        geometry=geometry,
+    )
+    result = reconstruct(shot.measurement, calibration, z_um=21_000.0, iterations=2)
+    assert result.grid.object_pitch_um == pytest.approx(10 * 21 / 5)
+    assert result.grid.centre == (32, 40)
+    assert result.provenance["psf_z_um"] == 20_000
+    full = reconstruct(shot.measurement, calibration, z_um=21_000.0, iterations=2, field="full")
+    assert full.image.shape == (129, 161)
+    row, column = (f - s for f, s in zip(full.grid.centre, result.grid.centre, strict=True))
+    assert np.array_equal(full.image[row : row + 65, column : column + 81], result.image)
+
+
+GOOD = np.ones((12, 14)) + np.eye(12, 14)
+BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
+
+
+@pytest.mark.parametrize(
+    ("measurement", "psf", "options", "message"),
+    [
+        (GOOD, 0 * GOOD, {}, "zero everywhere: the point source was not seen"),
+        (GOOD, 0 * GOOD + 3, {}, "constant .3 everywhere."),
+        (GOOD, BAD, {}, r"PSF holds 1 values that are not finite numbers, the first at .0, 2, 2."),
+        (BAD, GOOD, {}, r"measurement holds 1 values that are not finite"),
+        (GOOD, GOOD - 2, {}, "sums to a negative number"),
+        (GOOD[1:], GOOD, {}, "PSF has 12 x 14 pixels and the measurement 11 x 14"),
+        (np.ones((12, 14, 2)), np.dstack([GOOD] * 3), {}, "PSF has 3 channels and the measurement 2"),
+        (GOOD[0], GOOD, {}, r"must be .height, width. or .height, width, n_channels.; it is .14,."),
+        (GOOD[:0], GOOD, {}, "is empty"),
+        (GOOD * 1j, GOOD, {}, "must hold real numbers, not complex128"),
+        (GOOD, GOOD, {"erasures": np.ones((12, 14))}, "leave no pixel"),
+        (GOOD, GOOD, {"erasures": np.ones((3, 3))}, "erasures has 3 x 3 pixels"),
+        (GOOD, GOOD, {"background": np.ones((3, 3))}, "background has 3 x 3 pixels"),
+        (GOOD, GOOD, {"method": "adm"}, "'adm' is not known. .* Did you mean 'admm'"),
+        (GOOD, GOOD, {"prior": "tb"}, "'tb' is not known"),
+        (GOOD, GOOD, {"tau": -1.0}, "tau must not be negative"),
+        (GOOD, GOOD, {"noise": -1.0}, "must not be negative"),
+        (GOOD, GOOD, {"field": "half"}, 'must be "sensor" or "full"'),
+        (np.ones((1, 1)), np.ones((1, 1)), {}, "constant"),
+    ],
+)
+def test_unusable_input_is_refused_in_words(measurement, psf, options, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(measurement, psf, **options)
+
+
+def test_depth_must_be_said_when_there_are_several():
+    psfs = np.stack([GOOD, GOOD]).astype(np.float32)[:, None]
+    calibration = Calibration(psfs, np.array([[0, 0, 1e4], [0, 0, 2e4]]))
+    with pytest.raises(InputError, match=r"2 PSFs .z_um: 10000, 20000.: say which depth"):
+        reconstruct(GOOD, calibration)
+    with pytest.raises(InputError, match="above 0"):
+        reconstruct(GOOD, calibration, z_um=0)
+    unknown = Calibration(psfs, np.full((2, 3), np.nan))
+    with pytest.raises(InputError, match=r"depths .* not known"):
+        reconstruct(GOOD, unknown, z_um=1e4)
+
+
+def test_saturated_images_are_warned_of(shot):
+    psf = np.minimum(shot.psf, np.percentile(shot.psf, 99))
+    measurement = np.minimum(shot.measurement, np.percentile(shot.measurement, 95))
+    text = " ".join(reconstruct(measurement, psf, iterations=1).warnings)
+    assert "The PSF looks saturated: 1.0" in text
+    assert "The measurement's channel 0 looks saturated: 5.0" in text
+    assert reconstruct(shot.measurement, shot.psf, iterations=1).warnings == ()
+
+
+def test_tiny_measurements_work():
+    for shape in ((2, 2), (1, 5), (3, 2)):
+        psf = np.zeros(shape)
+        psf[-1, -1] = 1
+        result = reconstruct(np.ones(shape), psf, iterations=5)
+        assert result.image.shape == shape
+        assert np.isfinite(result.image).all()
+
+
+def test_a_dark_measurement_gives_a_dark_picture():
+    assert not reconstruct(np.zeros((12, 14)), GOOD).image.any()
