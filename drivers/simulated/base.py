@@ -1,0 +1,59 @@
+"""What all simulated devices share: opening, closing, identity, faults."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from drivers.device import Device, DeviceIdentity, SharedPart
+from drivers.errors import DeviceNotOpenError
+from drivers.simulated.world import SimulatedWorld
+
+FIRMWARE = "1"
+
+
+class SimulatedDevice(Device):
+    """Mix-in for the simulated drivers; the interface's class comes second in the bases."""
+
+    Shared = SimulatedWorld
+    kind: ClassVar[str]
+    model: ClassVar[str]
+    world: SimulatedWorld
+    _is_open = False
+
+    def _connect(self, shared: SharedPart | None) -> None:
+        if not isinstance(shared, SimulatedWorld):
+            raise TypeError(f"{self.name} needs the bench's SimulatedWorld, not {type(shared).__name__}.")
+        self.world = shared
+
+    @property
+    def name(self) -> str:
+        """The device as error messages name it."""
+        return f"{self.kind} (simulated)"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the device is connected."""
+        return self._is_open
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Who the device says it is."""
+        self._require()
+        return DeviceIdentity(
+            kind=self.kind,
+            driver="simulated",
+            vendor="diffuserbench",
+            model=self._model(),
+            serial_number=f"SIM-{self.world.options.seed}",
+            firmware=FIRMWARE,
+            simulated=True,
+        )
+
+    def _model(self) -> str:
+        return self.model
+
+    def _require(self) -> None:
+        """Raise unless the device is open and plugged in."""
+        if not self._is_open:
+            raise DeviceNotOpenError(self.name)
+        self.world.check_plugged(self.kind, self.name)

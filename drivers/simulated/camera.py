@@ -1,0 +1,476 @@
+"""The simulated camera: looks at the simulated world through a sensor with all its noise."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from drivers.camera import Camera, Roi, TriggerMode
+from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.frame import Frame, FrameMetadata
+from drivers.simulated.base import SimulatedDevice
+from recon.optics.sensor import FixedPattern, Readout, expose
+
+ROI_STEP = 4
+BINNINGS = (1, 2, 4)
+GAIN_LIMITS = (1.0, 16.0)
+
+
+class CameraOptions(DriverOptions):
+    """Options of the simulated camera in ``bench.toml``."""
+
+    color: bool = Field(
+        False, description="A Bayer (RGGB) mosaic over the pixels instead of a monochrome sensor."
+    )
+    crosstalk: float = Field(
+        0.05,
+        ge=0,
+        le=0.3,
+        description="Fraction of a band that each of the other colours' filters lets through.",
+    )
+
+
+class SimulatedCamera(SimulatedDevice, Camera):
+    """A camera whose frames are exposures of what the simulated world throws onto its sensor.
+
+    A frame is exposed wholly after it was asked for: it sees the world as it is half way through its
+    exposure. Every frame has its own noise, drawn from the world's seed and the frame's number.
+    """
+
+    kind = "camera"
+    Options = CameraOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, CameraOptions):
+            raise TypeError(f"The simulated camera takes CameraOptions, not {type(options).__name__}.")
+        self._connect(shared)
+        self.options = options
+        self._spec = self.world.sensor
+        self._lock = threading.RLock()
+        self._arrived = threading.Condition(self._lock)
+        self._abort = threading.Event()
+        self._producer: threading.Thread | None = None
+        self._ring: deque[Frame] = deque()
+        self._reset()
+
+    def _reset(self) -> None:
+        low, high = self._spec.exposure_limits_ms
+        self._exposure_ms = min(max(10.0, low), high)
+        self._gain = 1.0
+        self._roi = Roi(0, 0, *self._spec.shape)
+        self._binning = 1
+        self._pixel_format = self.pixel_formats[0]
+        self._black_fraction = self._spec.black_level
+        self._trigger_mode: TriggerMode = "free_run"
+        self._triggers = 0
+        self._next_id = 0
+        self._lost = 0
+        self._failure: DeviceError | None = None
+        self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
+        self._pattern: tuple[Any, FixedPattern] | None = None
+
+    # Device ---
+    def _model(self) -> str:
+        return self._spec.name + (" Color" if self.options.color else "")
+
+    def open(self) -> None:
+        """Connect, with the camera's own default settings."""
+        self.world.check_plugged(self.kind, self.name)
+        if not self._is_open:
+            self._reset()
+            self._abort.clear()
+            self._is_open = True
+
+    def close(self) -> None:
+        """End any sequence and disconnect."""
+        if self._is_open:
+            self._end()
+            self._is_open = False
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read all settings."""
+        self._require()
+        return {
+            "exposure_ms": self._exposure_ms,
+            "gain": self._gain,
+            "black_level": self.black_level,
+            "pixel_format": self._pixel_format,
+            "significant_bits": self.significant_bits,
+            "roi": self._roi.as_tuple(),
+            "binning": self._binning,
+            "trigger_mode": self._trigger_mode,
+            "sensor_shape": self._spec.shape,
+            "pixel_pitch_um": self._spec.pitch_um,
+        }
+
+    # What the sensor is ---
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the whole sensor in pixels."""
+        return self._spec.shape
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Pitch of the unbinned pixels."""
+        return self._spec.pitch_um
+
+    @property
+    def pixel_formats(self) -> tuple[str, ...]:
+        """Formats by their GenICam names, the native one first."""
+        stem = "BayerRG" if self.options.color else "Mono"
+        return tuple(f"{stem}{bits}" for bits in (16, 12, 8) if bits <= self._spec.bits)
+
+    # Settings ---
+    @property
+    def exposure_ms(self) -> float:
+        """Exposure time."""
+        return self._exposure_ms
+
+    @property
+    def exposure_limits_ms(self) -> tuple[float, float]:
+        """Shortest and longest exposure."""
+        return self._spec.exposure_limits_ms
+
+    def set_exposure_ms(self, exposure_ms: float) -> float:
+        """Set the exposure; it counts whole microseconds."""
+        self._require()
+        low, high = self._spec.exposure_limits_ms
+        if not low <= exposure_ms <= high:
+            raise LimitError(
+                self.name, f"cannot expose {exposure_ms:g} ms.", f"Its exposure is {low:g} to {high:g} ms."
+            )
+        with self._lock:
+            self._exposure_ms = round(exposure_ms * 1e3) / 1e3
+        return self._exposure_ms
+
+    @property
+    def gain(self) -> float:
+        """Electronic gain factor."""
+        return self._gain
+
+    @property
+    def gain_limits(self) -> tuple[float, float]:
+        """Smallest and largest gain factor."""
+        return GAIN_LIMITS
+
+    def set_gain(self, gain: float) -> float:
+        """Set the gain factor; it has steps of 0.01."""
+        self._require()
+        low, high = GAIN_LIMITS
+        if not low <= gain <= high:
+            raise LimitError(self.name, f"has no gain {gain:g}.", f"Its gain is {low:g} to {high:g}.")
+        with self._lock:
+            self._gain = round(gain, 2)
+        return self._gain
+
+    @property
+    def black_level(self) -> float:
+        """Offset in counts of the present pixel format."""
+        return self._black_fraction * self._full_scale
+
+    def set_black_level(self, black_level: float) -> float:
+        """Set the offset, up to an eighth of full scale."""
+        self._require()
+        self._require_idle("black level")
+        highest = self._full_scale / 8
+        if not 0 <= black_level <= highest:
+            raise LimitError(
+                self.name, f"has no black level {black_level:g}.", f"It is 0 to {highest:g} counts."
+            )
+        self._black_fraction = black_level / self._full_scale
+        return self.black_level
+
+    @property
+    def roi(self) -> Roi:
+        """Region of interest in sensor pixels."""
+        return self._roi
+
+    def set_roi(self, roi: Roi | None) -> Roi:
+        """Set the region of interest; its borders fall on multiples of 4 pixels inside the one asked for."""
+        self._require()
+        self._require_idle("region of interest")
+        height, width = self._spec.shape
+        if roi is None:
+            self._roi = Roi(0, 0, height, width)
+            return self._roi
+        top, left = (-(-start // ROI_STEP) * ROI_STEP for start in (roi.top, roi.left))
+        bottom, right = (
+            end if end == side else end // ROI_STEP * ROI_STEP
+            for end, side in ((roi.top + roi.height, height), (roi.left + roi.width, width))
+        )
+        outside = roi.top < 0 or roi.left < 0 or roi.top + roi.height > height or roi.left + roi.width > width
+        if outside or bottom - top < ROI_STEP or right - left < ROI_STEP:
+            raise LimitError(
+                self.name,
+                f"cannot read the region (top, left, height, width) = {roi.as_tuple()}.",
+                f"The sensor has {height} x {width} pixels, the smallest region {ROI_STEP} x {ROI_STEP}.",
+            )
+        self._roi = Roi(top, left, bottom - top, right - left)
+        return self._roi
+
+    @property
+    def binning(self) -> int:
+        """Sensor pixels summed along each axis."""
+        return self._binning
+
+    @property
+    def binnings(self) -> tuple[int, ...]:
+        """Binning factors on offer (a colour mosaic cannot be summed)."""
+        return (1,) if self.options.color else BINNINGS
+
+    def set_binning(self, binning: int) -> int:
+        """Set the binning."""
+        self._require()
+        self._require_idle("binning")
+        if binning not in self.binnings:
+            raise LimitError(self.name, f"has no binning {binning}.", f"It offers {self.binnings}.")
+        self._binning = binning
+        return binning
+
+    @property
+    def pixel_format(self) -> str:
+        """Pixel format by its GenICam name."""
+        return self._pixel_format
+
+    def set_pixel_format(self, pixel_format: str) -> str:
+        """Set the pixel format."""
+        self._require()
+        self._require_idle("pixel format")
+        if pixel_format not in self.pixel_formats:
+            raise LimitError(
+                self.name,
+                f"has no pixel format {pixel_format!r}.",
+                f"It offers {', '.join(self.pixel_formats)}.",
+            )
+        self._pixel_format = pixel_format
+        return pixel_format
+
+    @property
+    def significant_bits(self) -> int:
+        """Bits that carry signal."""
+        return int(self._pixel_format.removeprefix("Mono").removeprefix("BayerRG"))
+
+    @property
+    def _full_scale(self) -> int:
+        return (1 << self.significant_bits) - 1
+
+    @property
+    def trigger_mode(self) -> TriggerMode:
+        """What starts an exposure."""
+        return self._trigger_mode
+
+    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
+        """Choose what starts an exposure; nothing is wired to the hardware trigger."""
+        self._require()
+        self._require_idle("trigger mode")
+        if mode not in ("free_run", "software"):
+            raise LimitError(self.name, f"has no trigger mode {mode!r}.", "It offers free_run, software.")
+        self._trigger_mode = mode
+        return mode
+
+    # Taking images ---
+    def snap(self) -> Frame:
+        """Take one frame whose exposure begins now, and wait for it."""
+        self._require()
+        self._require_idle("frame")
+        self._abort.clear()
+        return self._take()
+
+    def start_sequence(self, n_buffers: int = 8) -> None:
+        """Start continuous acquisition into a ring of frames."""
+        self._require()
+        self._require_idle("second sequence")
+        if n_buffers < 1:
+            raise LimitError(self.name, f"cannot stream into {n_buffers} buffers.", "Ask for one or more.")
+        with self._lock:
+            self._ring = deque(maxlen=n_buffers)
+            self._triggers = 0
+            self._lost = 0
+            self._failure = None
+            self._abort.clear()
+            self._producer = threading.Thread(target=self._produce, name="simulated camera", daemon=True)
+            self._producer.start()
+
+    def next_frame(self, timeout_s: float) -> Frame:
+        """Return the oldest frame of the running sequence not yet fetched."""
+        self._require()
+        deadline = time.monotonic() + timeout_s
+        with self._arrived:
+            while not self._ring:
+                if self._failure is not None:
+                    raise self._failure
+                if self._producer is None:
+                    raise StoppedError(self.name, "no sequence runs.", "Start one first.")
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    raise DeviceTimeoutError(
+                        self.name,
+                        f"no frame within {timeout_s:g} s.",
+                        f"Exposure is {self._exposure_ms:g} ms, trigger mode {self._trigger_mode}.",
+                    )
+                self._arrived.wait(left)
+            frame = self._ring.popleft()
+            lost, self._lost = self._lost, 0
+        return Frame(frame.image, replace(frame.metadata, dropped_before=lost))
+
+    def trigger(self) -> None:
+        """Send one software trigger."""
+        self._require()
+        with self._arrived:
+            if self._producer is None or self._trigger_mode != "software":
+                raise DeviceError(
+                    self.name,
+                    "takes no software trigger now.",
+                    "Set trigger mode 'software' and start a sequence.",
+                )
+            self._triggers += 1
+            self._arrived.notify_all()
+
+    def stop_sequence(self) -> None:
+        """End the running sequence or a pending snap at once."""
+        self._end()
+
+    @property
+    def is_streaming(self) -> bool:
+        """Whether a sequence runs."""
+        return self._producer is not None
+
+    def _end(self) -> None:
+        self._abort.set()
+        with self._arrived:
+            producer, self._producer = self._producer, None
+            self._arrived.notify_all()
+        if producer is not None and producer is not threading.current_thread():
+            producer.join()
+
+    def _require_idle(self, what: str) -> None:
+        if self._producer is not None:
+            raise DeviceError(self.name, f"streams: no new {what} now.", "Stop the sequence first.")
+
+    # Producing frames ---
+    def _produce(self) -> None:
+        due = time.monotonic()
+        try:
+            while not self._abort.is_set():
+                if self._trigger_mode == "software" and not self._await_trigger():
+                    return
+                frame = self._take()
+                with self._arrived:
+                    if len(self._ring) == self._ring.maxlen:
+                        self._ring.popleft()
+                        self._lost += 1
+                    self._ring.append(frame)
+                    self._arrived.notify_all()
+                period = max(1 / self._spec.frames_per_s, self._exposure_ms * 1e-3)
+                due = max(due + period * self.world.clock.time_scale, time.monotonic())
+                self._abort.wait(due - time.monotonic())
+        except StoppedError:
+            return
+        except DeviceError as error:
+            with self._arrived:
+                self._failure = error
+                self._producer = None
+                self._arrived.notify_all()
+
+    def _await_trigger(self) -> bool:
+        with self._arrived:
+            while self._triggers == 0:
+                if self._abort.is_set():
+                    return False
+                self._arrived.wait(0.1)
+            self._triggers -= 1
+        return True
+
+    def _take(self) -> Frame:
+        """Expose, read out, and wrap one frame."""
+        with self._lock:
+            exposure_ms, gain = self._exposure_ms, self._gain
+            frame_id, self._next_id = self._next_id, self._next_id + 1
+        half = exposure_ms * 1e-3 / 2
+        if not self.world.clock.wait(half, self._abort):
+            raise StoppedError(self.name, "the exposure was stopped.")
+        self._require()
+        light = self._electrons_per_s()
+        if not self.world.clock.wait(half, self._abort):
+            raise StoppedError(self.name, "the exposure was stopped.")
+        area = self._binning**2
+        readout = Readout(
+            electrons_per_count=self._spec.full_well_e / self._full_scale,
+            gain=gain,
+            black_level=self.black_level,
+            full_scale=self._full_scale,
+            full_well_e=self._spec.full_well_e * area,
+            read_noise_e=self._spec.read_noise_e * self._binning,
+            noise_scale=self.world.options.noise,
+        )
+        seed = (self.world.options.seed << 40) + (frame_id << 16)
+        counts = expose(light, self._pixels(), exposure_ms * 1e-3, readout, seed)
+        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] = counts
+        if self.significant_bits <= 8:
+            image = counts.astype(np.uint8)
+        now = time.monotonic_ns()
+        return Frame(
+            image,
+            FrameMetadata(
+                frame_id=frame_id,
+                device_time_ns=now,
+                host_time_ns=now,
+                utc=datetime.now(UTC),
+                exposure_ms=exposure_ms,
+                gain=gain,
+                pixel_format=self._pixel_format,
+                significant_bits=self.significant_bits,
+                black_level=self.black_level,
+                roi=self._roi.as_tuple(),
+                binning=self._binning,
+                saturated_fraction=float(np.count_nonzero(counts == self._full_scale) / counts.size),
+            ),
+        )
+
+    def _region(self) -> tuple[slice, slice]:
+        """Return the binned pixels that the region of interest covers."""
+        roi, factor = self._roi, self._binning
+        top, left = roi.top // factor, roi.left // factor
+        height, width = self.image_shape
+        return slice(top, top + height), slice(left, left + width)
+
+    def _electrons_per_s(self) -> npt.NDArray[np.float32]:
+        """Photons absorbed a second by each pixel of the region, through the colour filters."""
+        key = (self.world.light_key(), self._roi, self._binning)
+        if self._light is not None and self._light[0] == key:
+            return self._light[1]
+        rows, columns = self._region()
+        bands = self.world.photons_per_s(self._binning)
+        total = np.zeros(self.image_shape, np.float32)
+        for band, light in enumerate(bands):
+            if light is None:
+                continue
+            absorbed = light[rows, columns] * np.float32(self._spec.quantum_efficiency[band])
+            total += absorbed * self._mosaic(band) if self.options.color else absorbed
+        self._light = (key, total)
+        return total
+
+    def _mosaic(self, band: int) -> npt.NDArray[np.float32]:
+        """Transmission of the RGGB filters for one band; regions begin on an even row and column."""
+        through = np.full((2, 2), self.options.crosstalk, np.float32)
+        for row, column in {0: ((0, 0),), 1: ((0, 1), (1, 0)), 2: ((1, 1),)}[band]:
+            through[row, column] = 1
+        height, width = self.image_shape
+        return np.tile(through, (-(-height // 2), -(-width // 2)))[:height, :width]
+
+    def _pixels(self) -> FixedPattern:
+        key = (self._roi, self._binning)
+        if self._pattern is None or self._pattern[0] != key:
+            pattern = self.world.fixed_pattern().binned(self._binning).cropped(*self._region())
+            self._pattern = (key, pattern)
+        return self._pattern[1]

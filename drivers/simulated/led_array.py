@@ -1,0 +1,128 @@
+"""The simulated LED array."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import LimitError
+from drivers.led_array import OFF, LedArray, LedPattern
+from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.world import BANDS
+
+
+class LedArrayOptions(DriverOptions):
+    """Options of the simulated LED array in ``bench.toml``."""
+
+    leds: Annotated[int, Field(ge=1, le=10_000)] = 257
+    led_pitch_mm: Annotated[float, Field(gt=0)] = 4.0
+    distance_mm: Annotated[float, Field(gt=0, description="From the array to its centre of view.")] = 60.0
+
+
+class SimulatedLedArray(SimulatedDevice, LedArray):
+    """A round, flat array of RGB LEDs on a square grid, the one with index 0 in its middle.
+
+    It lights the pinhole that serves as point source from behind, each LED by the cosine fourth of the angle
+    under which the pinhole sees it, so that the middle one counts most.
+    """
+
+    kind = "led_array"
+    model = "round LED array"
+    Options = LedArrayOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, LedArrayOptions):
+            raise TypeError(f"The simulated LED array takes LedArrayOptions, not {type(options).__name__}.")
+        self._connect(shared)
+        self.options = options
+        self._positions_mm = _round_array(options.leds, options.led_pitch_mm)
+        self._pattern = OFF
+
+    def open(self) -> None:
+        """Connect; every LED is off."""
+        self.world.check_plugged(self.kind, self.name)
+        self._is_open = True
+        self._show(OFF)
+
+    def close(self) -> None:
+        """Turn every LED off and disconnect."""
+        if self._is_open:
+            self._show(OFF)
+            self._is_open = False
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read the pattern and the array's build."""
+        self._require()
+        return {
+            "pattern": self._pattern.description,
+            "leds": self.options.leds,
+            "wavelengths_nm": self.wavelengths_nm,
+            "distance_mm": self.options.distance_mm,
+        }
+
+    @property
+    def led_positions_mm(self) -> npt.NDArray[np.float64]:
+        """``(n_leds, 3)`` positions, millimetres."""
+        return self._positions_mm.copy()
+
+    @property
+    def led_na(self) -> npt.NDArray[np.float64]:
+        """``(n_leds, 2)`` sines of the illumination angle in x and y."""
+        across = self._positions_mm[:, :2]
+        distance = np.sqrt((across**2).sum(axis=1) + self.options.distance_mm**2)
+        return np.asarray(across / distance[:, None])
+
+    @property
+    def wavelengths_nm(self) -> tuple[float, float, float]:
+        """Centre wavelengths of red, green and blue."""
+        red, green, blue = BANDS
+        return red.center_nm, green.center_nm, blue.center_nm
+
+    @property
+    def pattern(self) -> LedPattern:
+        """The pattern shown now."""
+        return self._pattern
+
+    def set_pattern(self, pattern: LedPattern) -> LedPattern:
+        """Show a pattern."""
+        self._require()
+        for index, rgb in pattern.levels:
+            if not 0 <= index < self.options.leds:
+                raise LimitError(
+                    self.name, f"has no LED {index}.", f"It has LEDs 0 to {self.options.leds - 1}."
+                )
+            if len(rgb) != 3 or not all(0 <= level <= 255 for level in rgb):
+                raise LimitError(
+                    self.name, f"cannot show level {rgb} on LED {index}.", "Levels are 0 to 255."
+                )
+        self._show(pattern)
+        return self._pattern
+
+    def off(self) -> None:
+        """Turn every LED off."""
+        self._require()
+        self._show(OFF)
+
+    def _show(self, pattern: LedPattern) -> None:
+        across_mm = np.hypot(self._positions_mm[:, 0], self._positions_mm[:, 1])
+        weights = (1 + (across_mm / self.options.distance_mm) ** 2) ** -2
+        levels = dict(pattern.levels)
+        red, green, blue = (
+            float(sum(weights[index] * rgb[band] / 255 for index, rgb in levels.items())) for band in range(3)
+        )
+        self._pattern = pattern
+        self.world.set_emission((red, green, blue))
+
+
+def _round_array(count: int, pitch_mm: float) -> npt.NDArray[np.float64]:
+    """Return the ``count`` places of a square grid nearest to its middle, from the middle outwards."""
+    reach = int(np.ceil(np.sqrt(count)))
+    axis = np.arange(-reach, reach + 1)
+    y, x = (side.ravel() for side in np.meshgrid(axis, axis, indexing="ij"))
+    order = np.lexsort((np.arctan2(y, x), x**2 + y**2))[:count]
+    return np.stack([x[order] * pitch_mm, y[order] * pitch_mm, np.zeros(count)], axis=1)

@@ -1,0 +1,62 @@
+"""The table ``[simulated]`` of ``bench.toml``: how the simulated bench is built."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from drivers.device import DriverOptions
+from drivers.simulated.presets import DiffuserKind
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class WorldOptions(DriverOptions):
+    """Options of the simulated world; what is left out comes from the preset."""
+
+    preset: Literal["pco", "pointgrey", "microscope", "tiny"] = Field(
+        "pco", description="Optics and sensor; 'tiny' is for tests and trials."
+    )
+    seed: int = Field(0, ge=0, description="The same seed gives the same diffuser, sensor and noise.")
+    time_scale: float = Field(
+        1.0,
+        ge=0,
+        description="Real seconds per simulated second of motion, exposure, settling; 0: no waiting.",
+    )
+    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
+    fixed_pattern: bool = Field(True, description="Whether pixels differ (response, offset, hot, dead).")
+
+    diffuser: DiffuserKind | None = None
+    diffuser_seed: int | None = Field(None, ge=0)
+    feature_size_um: Positive = 140.0
+    mean_slope_deg: Annotated[float, Field(gt=0, lt=20)] = 0.7
+    lenslet_um: Positive | None = None
+    focal_length_um: Positive | None = None
+    diffuser_distance_mm: Positive | None = None
+    aperture_mm: tuple[Positive, Positive] | None = Field(None, description="(height, width)")
+
+    fall_off: Literal["preset", "none", "gaussian", "table"] = "preset"
+    fall_off_sigma_deg: Positive = 13.0
+    fall_off_table: tuple[tuple[float, float], ...] = Field(
+        (), description="Pairs of angle in degrees, ascending from 0, and response."
+    )
+
+    source_diameter_um: NotNegative | None = None
+    source_brightness: Positive = Field(
+        1.0, description="Brightness of the point source relative to the preset's."
+    )
+    spectral_samples: Annotated[int, Field(ge=1, le=9)] = 3
+
+    @model_validator(mode="after")
+    def _table_fits(self) -> Self:
+        if self.fall_off == "table":
+            angles = [angle for angle, _ in self.fall_off_table]
+            if len(angles) < 2 or angles[0] != 0 or sorted(set(angles)) != angles:
+                raise ValueError("fall_off_table needs two or more pairs whose angles ascend from 0 degrees")
+            if any(response < 0 for _, response in self.fall_off_table):
+                raise ValueError("fall_off_table holds a negative response")
+        elif self.fall_off_table:
+            raise ValueError('fall_off_table is used with fall_off = "table" only')
+        return self

@@ -1,0 +1,111 @@
+"""The simulated spatial light modulator."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import LimitError
+from drivers.simulated.base import SimulatedDevice
+from drivers.slm import Slm
+
+Side = Annotated[int, Field(ge=1, le=8192)]
+
+
+class SlmOptions(DriverOptions):
+    """Options of the simulated SLM in ``bench.toml``."""
+
+    shape: tuple[Side, Side] = Field((1080, 1920), description="(height, width) in pixels")
+    pixel_pitch_um: Annotated[float, Field(gt=0)] = 8.0
+    settle_ms: Annotated[float, Field(ge=0)] = 30.0
+    phase_at_full_level_rad: Annotated[float, Field(gt=0)] = 2 * np.pi * 255 / 256
+    lut_gamma: Annotated[
+        float, Field(gt=0, description="Phase follows (level / 255)^gamma; 1: linear, as it should be.")
+    ] = 1.0
+
+
+class SimulatedSlm(SimulatedDevice, Slm):
+    """A phase SLM whose grey levels turn into phase by a look-up table that may be off."""
+
+    kind = "slm"
+    model = "phase SLM"
+    Options = SlmOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, SlmOptions):
+            raise TypeError(f"The simulated SLM takes SlmOptions, not {type(options).__name__}.")
+        self._connect(shared)
+        self.options = options
+        self._closing = threading.Event()
+        self._displayed = np.zeros(options.shape, np.uint8)
+
+    def open(self) -> None:
+        """Connect; the SLM is blank."""
+        self.world.check_plugged(self.kind, self.name)
+        if not self._is_open:
+            self._is_open = True
+            self._closing.clear()
+            self._displayed = np.zeros(self.options.shape, np.uint8)
+
+    def close(self) -> None:
+        """Blank and disconnect."""
+        if self._is_open:
+            self._closing.set()
+            self._displayed = np.zeros(self.options.shape, np.uint8)
+            self._is_open = False
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read shape, pitch, and timing."""
+        self._require()
+        return {
+            "shape": self.options.shape,
+            "pixel_pitch_um": self.options.pixel_pitch_um,
+            "settle_ms": self.options.settle_ms,
+            "blank": not self._displayed.any(),
+        }
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(height, width)`` in pixels."""
+        return self.options.shape
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Pixel pitch, micrometres."""
+        return self.options.pixel_pitch_um
+
+    @property
+    def settle_ms(self) -> float:
+        """Time from a confirmed image to settled optics."""
+        return self.options.settle_ms
+
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Show grey levels and wait until the optics have settled."""
+        self._require()
+        if levels.shape != self.options.shape or levels.dtype != np.uint8:
+            raise LimitError(
+                self.name,
+                f"cannot show {levels.dtype} {levels.shape}.",
+                f"It takes uint8 {self.options.shape}.",
+            )
+        self._displayed = levels.copy()
+        self.world.clock.wait(self.options.settle_ms * 1e-3, self._closing)
+
+    @property
+    def displayed(self) -> npt.NDArray[np.uint8]:
+        """The grey levels shown now, read only."""
+        view = self._displayed.view()
+        view.flags.writeable = False
+        return view
+
+    @property
+    def phase_rad(self) -> npt.NDArray[np.float32]:
+        """The phase that light truly gains at each pixel now; what no real SLM would tell."""
+        table = self.options.phase_at_full_level_rad * (np.arange(256) / 255) ** self.options.lut_gamma
+        return table.astype(np.float32)[self._displayed]

@@ -1,0 +1,281 @@
+"""The simulated motion stage; the point source rides on it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
+from drivers.simulated.presets import Preset
+from drivers.stage import Stage, StageAxis
+
+AXES = ("x_um", "y_um", "z_um", "roll_mrad", "pitch_mrad", "yaw_mrad")
+POLL_S = 0.002
+REFERENCE_S = 1.0
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class AxisOptions(BaseModel):
+    """One axis, in the unit its name ends in; what is left out comes from the preset."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    lower_limit: float | None = None
+    upper_limit: float | None = None
+    home: float | None = None
+    speed_per_s: Positive | None = None
+    acceleration_per_s2: Positive | None = None
+    resolution: Positive | None = None
+    backlash: NotNegative | None = None
+    repeatability: NotNegative | None = None
+
+
+class StageOptions(DriverOptions):
+    """Options of the simulated stage in ``bench.toml``."""
+
+    axis_names: tuple[str, ...] = ("x_um", "y_um", "z_um")
+    axes: dict[str, AxisOptions] = Field(default_factory=dict)
+    mount_offset_um: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="True source position minus stage reading, x, y, z."
+    )
+
+    @model_validator(mode="after")
+    def _axes_are_known(self) -> Self:
+        if not self.axis_names or len(set(self.axis_names)) != len(self.axis_names):
+            raise ValueError("axis_names holds one to six different names")
+        for name in self.axis_names:
+            if name not in AXES:
+                raise ValueError(f"unknown axis {name!r}; choose from {', '.join(AXES)}")
+        for name in self.axes:
+            if name not in self.axis_names:
+                raise ValueError(f"axes.{name} is not among axis_names {self.axis_names}")
+        return self
+
+
+class SimulatedStage(SimulatedDevice, Stage):
+    """A stage of one to six axes that takes its time, has play, and carries the point source.
+
+    Axes that are missing leave the source on the optical axis, at the preset's distance; rotations do not
+    move it. Before homing, moves are refused.
+    """
+
+    kind = "stage"
+    model = "stepper stage"
+    Options = StageOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, StageOptions):
+            raise TypeError(f"The simulated stage takes StageOptions, not {type(options).__name__}.")
+        self._connect(shared)
+        self.options = options
+        specs = tuple(
+            _axis_spec(name, options.axes.get(name, AxisOptions()), self.world.preset)
+            for name in options.axis_names
+        )
+        self.carriage = Carriage(specs, self.world.clock, self.world.options.seed + 2)
+        self._axes = tuple(
+            StageAxis(s.name, s.lower_limit, s.upper_limit, s.speed_per_s, s.resolution) for s in specs
+        )
+        self._stop = threading.Event()
+        self._lock = threading.RLock()
+        self._homed = False
+        self._commanded = self.carriage.reported()
+        self.world.carry_source(self.source_position_um)
+
+    def source_position_um(self) -> tuple[float, float, float]:
+        """Where the point source truly is."""
+        true = self.carriage.true()
+        resting = {"x_um": 0.0, "y_um": 0.0, "z_um": 1e3 * self.world.preset.source_distance_mm}
+        x, y, z = (
+            true.get(name, resting[name]) + offset
+            for name, offset in zip(AXES[:3], self.options.mount_offset_um, strict=True)
+        )
+        return x, y, z
+
+    # Device ---
+    def open(self) -> None:
+        """Connect; nothing moves, and nothing may move before homing."""
+        self.world.check_plugged(self.kind, self.name)
+        self._is_open = True
+
+    def close(self) -> None:
+        """Stop any motion and disconnect."""
+        if self._is_open:
+            self._halt()
+            self._is_open = False
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read position, limits and speeds."""
+        self._require()
+        settings: dict[str, Setting] = {"homed": self._homed}
+        for name, value in self.position().items():
+            settings[f"position_{name}"] = value
+        for axis in self._axes:
+            settings[f"limits_{axis.name}"] = (axis.lower_limit, axis.upper_limit)
+            settings[f"speed_{axis.name}_per_s"] = axis.speed_per_s
+        return settings
+
+    # Stage ---
+    @property
+    def axes(self) -> tuple[StageAxis, ...]:
+        """The stage's axes."""
+        return self._axes
+
+    def position(self) -> dict[str, float]:
+        """Where the stage says it is."""
+        self._require()
+        return self.carriage.reported()
+
+    def commanded_position(self) -> dict[str, float]:
+        """Return the last target asked for."""
+        self._require()
+        return dict(self._commanded)
+
+    @property
+    def is_homed(self) -> bool:
+        """Whether positions refer to a known reference."""
+        return self._homed
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether any axis moves."""
+        self._require()
+        return self.carriage.is_moving
+
+    def home(self) -> None:
+        """Run every axis to its reference mark, and slowly onto it."""
+        self._require()
+        with self._lock:
+            self._homed = False
+            self._begin({spec.name: spec.home for spec in self.carriage.axes.values()})
+        self.wait()
+        if not self.world.clock.wait(REFERENCE_S, self._stop):
+            raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
+        with self._lock:
+            self.carriage.find_reference()
+            self._commanded = self.carriage.reported()
+            self._homed = True
+
+    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
+        """Move the named axes to absolute positions."""
+        self._require()
+        self._check(target)
+        with self._lock:
+            self._begin(target)
+        if wait:
+            self.wait()
+        return self.position()
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Block until a running move has ended."""
+        self._require()
+        waited = 0.0
+        while not self._stop.is_set() and self.carriage.is_moving:
+            jammed = self.carriage.jammed_axes()
+            if jammed:
+                self.carriage.halt()
+                self._homed = False
+                raise DeviceTimeoutError(
+                    self.name, f"axis {', '.join(jammed)} does not move.", "Free it and home again."
+                )
+            if timeout_s is not None and waited >= timeout_s:
+                raise DeviceTimeoutError(
+                    self.name, f"still moves after {timeout_s:g} s.", "Wait longer or stop."
+                )
+            self._stop.wait(POLL_S)
+            waited += POLL_S
+            self._require()
+        if self._stop.is_set():
+            raise StoppedError(self.name, "the move was stopped.", "Check the position before going on.")
+        tripped = self.carriage.tripped_switches()
+        if tripped:
+            self.carriage.halt()
+            self._homed = False
+            raise DeviceError(
+                self.name, f"axis {', '.join(tripped)} ran into its limit switch.", "Home again."
+            )
+
+    def stop(self) -> None:
+        """Stop every axis at once."""
+        self._require()
+        self._halt()
+
+    def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
+        """Seconds for a move, with acceleration; axes move together, so the slowest counts."""
+        specs = self.carriage.axes
+        return max(
+            (
+                trapezoid_duration_s(
+                    target[name] - start[name], specs[name].speed_per_s, specs[name].acceleration_per_s2
+                )
+                for name in target
+                if name in start and name in specs
+            ),
+            default=0.0,
+        )
+
+    def _begin(self, target: Mapping[str, float]) -> None:
+        self._stop.clear()
+        self._commanded = self._commanded | dict(target)
+        self.carriage.start(target)
+
+    def _halt(self) -> None:
+        with self._lock:
+            if self.carriage.is_moving:
+                self._stop.set()
+            self.carriage.halt()
+            self._commanded = self.carriage.reported()
+
+    def _check(self, target: Mapping[str, float]) -> None:
+        if not self._homed:
+            raise LimitError(self.name, "is not homed: its positions mean nothing yet.", "Home it first.")
+        limits = self.limits
+        wrong = []
+        for name, position in target.items():
+            if name not in limits:
+                wrong.append(f"it has no axis {name} (it has {', '.join(limits)})")
+            elif not math.isfinite(position):
+                wrong.append(f"{name} = {position} is no position")
+            elif not limits[name][0] <= position <= limits[name][1]:
+                low, high = limits[name]
+                wrong.append(f"{name} = {position:g} lies outside {low:g} to {high:g}")
+        if wrong:
+            raise LimitError(self.name, f"refuses the move: {'; '.join(wrong)}.", "Nothing moved.")
+
+
+def _axis_spec(name: str, options: AxisOptions, preset: Preset) -> AxisSpec:
+    """Fill in what the options leave out: a stepper stage that suits the preset's size."""
+    half_x, half_y, farthest = (1e3 * side for side in preset.travel_mm)
+    if name == "z_um":
+        low, high, home = 1e3 * preset.nearest_z_mm, farthest, 1e3 * preset.source_distance_mm
+    elif name.endswith("_um"):
+        reach = half_x if name == "x_um" else half_y
+        low, high, home = -reach, reach, 0.0
+    else:
+        low, high, home = -50.0, 50.0, 0.0
+    travel = high - low
+    linear = name.endswith("_um")
+
+    def given(value: float | None, otherwise: float) -> float:
+        return otherwise if value is None else value
+
+    return AxisSpec(
+        name=name,
+        lower_limit=given(options.lower_limit, low),
+        upper_limit=given(options.upper_limit, high),
+        home=given(options.home, home),
+        speed_per_s=given(options.speed_per_s, travel / 5),
+        acceleration_per_s2=given(options.acceleration_per_s2, travel / 2),
+        resolution=given(options.resolution, 0.1 if linear else 0.01),
+        backlash=given(options.backlash, min(3.0, travel * 2e-5) if linear else 0.05),
+        repeatability=given(options.repeatability, min(0.5, travel * 4e-6) if linear else 0.01),
+        hard_margin=travel * 0.01,
+    )

@@ -1,0 +1,74 @@
+"""Angular response of a sensor's pixels, ``f(theta)`` of Kuo 2020, Eq. 5.1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.optics.grid import PixelGrid
+
+FallOff = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.float64]]
+"""Maps the tangents of the angle of incidence along y and x to a response relative to normal incidence."""
+
+
+def no_fall_off(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Respond alike at all angles."""
+    return np.ones(np.broadcast_shapes(tan_y.shape, tan_x.shape))
+
+
+def gaussian_fall_off(sigma_y_deg: float, sigma_x_deg: float | None = None) -> FallOff:
+    """Gaussian response; two widths for sensors whose circuitry shades rows and columns differently.
+
+    The angles along y and x are those whose tangents are the components of the direction's tangent scaled to
+    its full angle, so that with equal widths the response depends on the angle from the normal alone.
+    """
+    widths = np.deg2rad([sigma_y_deg, sigma_y_deg if sigma_x_deg is None else sigma_x_deg])
+
+    def response(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        radius = np.hypot(tan_y, tan_x)
+        # theta / tan(theta), 1 on the axis
+        shrink = np.arctan(radius) / np.maximum(radius, 1e-12)
+        shrink = np.where(radius < 1e-9, 1.0, shrink)
+        return np.asarray(
+            np.exp(-0.5 * ((shrink * tan_y / widths[0]) ** 2 + (shrink * tan_x / widths[1]) ** 2))
+        )
+
+    return response
+
+
+def table_fall_off(angles_deg: npt.ArrayLike, responses: npt.ArrayLike) -> FallOff:
+    """Response from a measured table, linear between its entries and constant beyond them.
+
+    Raises
+    ------
+    ValueError
+        When the angles do not ascend from 0 or a response is negative.
+    """
+    angles = np.deg2rad(np.asarray(angles_deg, np.float64))
+    values = np.asarray(responses, np.float64)
+    if angles.ndim != 1 or angles.shape != values.shape or len(angles) < 2:
+        raise ValueError("A fall-off table needs two or more angles and as many responses.")
+    if angles[0] != 0 or np.any(np.diff(angles) <= 0) or np.any(values < 0):
+        raise ValueError("A fall-off table's angles ascend from 0 degrees, its responses are not negative.")
+
+    def response(tan_y: npt.NDArray[np.float64], tan_x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.interp(np.arctan(np.hypot(tan_y, tan_x)), angles, values)
+
+    return response
+
+
+def response_on(
+    grid: PixelGrid, source_um: tuple[float, float, float], distance_um: float, fall_off: FallOff
+) -> npt.NDArray[np.float32]:
+    """Response of every pixel to light from a source: ``f(atan(|u - x| / (d + z)))`` (Kuo 2020, Eq. 5.1).
+
+    Returns
+    -------
+    ndarray, float32, ``grid.shape``
+    """
+    x, y, z = source_um
+    tan_y = (grid.y_um[:, None] - y) / (z + distance_um)
+    tan_x = (grid.x_um - x) / (z + distance_um)
+    return fall_off(tan_y, tan_x).astype(np.float32)

@@ -1,0 +1,129 @@
+"""Grids of square pixels at continuous places, and area-true resampling between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PixelGrid:
+    """A rectangular grid of square pixels.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        ``(height, width)`` in pixels.
+    pitch_um : float
+        Pixel pitch.
+    center_um : tuple of float
+        ``(x, y)`` of the grid's geometric centre: the middle of the centre pixel where a side is odd, the
+        border between the two middle pixels where it is even.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    center_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1 or not self.pitch_um > 0:
+            raise ValueError(
+                f"A pixel grid needs pixels of positive pitch, not {self.shape}, {self.pitch_um} um."
+            )
+
+    @property
+    def x_um(self) -> FloatArray:
+        """Centres of the columns, ``(width,)``."""
+        return np.asarray(
+            self.center_um[0] + (np.arange(self.shape[1]) - (self.shape[1] - 1) / 2) * self.pitch_um
+        )
+
+    @property
+    def y_um(self) -> FloatArray:
+        """Centres of the rows, ``(height,)``."""
+        return np.asarray(
+            self.center_um[1] + (np.arange(self.shape[0]) - (self.shape[0] - 1) / 2) * self.pitch_um
+        )
+
+    @property
+    def x_edges_um(self) -> FloatArray:
+        """Edges of the columns, ``(width + 1,)``."""
+        return np.asarray(
+            self.center_um[0] + (np.arange(self.shape[1] + 1) - self.shape[1] / 2) * self.pitch_um
+        )
+
+    @property
+    def y_edges_um(self) -> FloatArray:
+        """Edges of the rows, ``(height + 1,)``."""
+        return np.asarray(
+            self.center_um[1] + (np.arange(self.shape[0] + 1) - self.shape[0] / 2) * self.pitch_um
+        )
+
+    def refined(self, factor: int) -> PixelGrid:
+        """Return the grid with every pixel cut into ``factor`` x ``factor``."""
+        height, width = self.shape
+        return PixelGrid((height * factor, width * factor), self.pitch_um / factor, self.center_um)
+
+
+def overlap_matrix(
+    source_edges: FloatArray, target_edges: FloatArray, dtype: npt.DTypeLike = np.float32
+) -> sparse.csr_array:
+    """Fraction of every source cell that falls into every target cell, along one axis.
+
+    Parameters
+    ----------
+    source_edges, target_edges : ndarray, float64, (n + 1,), (m + 1,)
+        Cell borders, both ascending or both descending.
+
+    Returns
+    -------
+    csr_array, (m, n)
+        ``overlap_matrix(...) @ v`` moves the content ``v`` of the source cells (energy, not density) into the
+        target cells; columns of source cells that lie wholly inside the target sum to 1.
+    """
+    if source_edges[0] > source_edges[-1]:
+        source_edges, target_edges = -source_edges, -target_edges
+    n = len(source_edges) - 1
+    m = len(target_edges) - 1
+    # Every piece between two successive borders of either grid belongs to one cell of each.
+    borders = np.unique(np.concatenate([source_edges, target_edges]))
+    middles = (borders[1:] + borders[:-1]) / 2
+    lengths = np.diff(borders)
+    i = np.searchsorted(source_edges, middles) - 1
+    j = np.searchsorted(target_edges, middles) - 1
+    inside = (i >= 0) & (i < n) & (j >= 0) & (j < m)
+    i, j, lengths = i[inside], j[inside], lengths[inside]
+    fractions = lengths / np.diff(source_edges)[i]
+    return sparse.csr_array((fractions.astype(dtype), (j, i)), shape=(m, n))
+
+
+def resample_energy(
+    energy: npt.NDArray[np.float32],
+    y_edges: FloatArray,
+    x_edges: FloatArray,
+    target_y_edges: FloatArray,
+    target_x_edges: FloatArray,
+) -> npt.NDArray[np.float32]:
+    """Move the content of one rectangular grid's cells into another's by overlapping area.
+
+    Parameters
+    ----------
+    energy : ndarray, float32, (h, w)
+        Content of the source cells, spread evenly over each.
+    y_edges, x_edges, target_y_edges, target_x_edges : ndarray, float64
+        Cell borders of both grids in common coordinates.
+
+    Returns
+    -------
+    ndarray, float32, (H, W)
+        What falls outside the target is lost; inside, the sum is kept.
+    """
+    rows = overlap_matrix(y_edges, target_y_edges)
+    columns = overlap_matrix(x_edges, target_x_edges)
+    down = rows @ energy
+    return np.ascontiguousarray((columns @ down.T).T)

@@ -1,0 +1,227 @@
+"""An image sensor: photons in, counts out, with every noise source of its photon-transfer curve.
+
+For a pixel that receives ``P`` photons a second during ``t`` seconds (EMVA 1288's linear model):
+
+* charge: Poisson of ``QE P t (1 + PRNU) + dark t``, limited by the full well;
+* read-out: plus Gaussian read noise and the pixel's fixed offset, times gain, divided by the conversion gain
+  (full well over full scale), plus the black level, rounded and clipped to the bit depth.
+
+Binning sums the charge of ``b x b`` pixels that are each read with their own noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.optics.jit import compiled
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSpec:
+    """What a data sheet says about a sensor.
+
+    ``quantum_efficiency`` is for the red, green and blue bands. The fractions of hot and dead pixels count
+    pixels; ``prnu`` is the relative spread of the pixels' response, ``dsnu_e`` the spread of their offsets in
+    electrons, ``dark_spread`` the relative (log-normal) spread of their dark currents.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    pitch_um: float
+    quantum_efficiency: tuple[float, float, float]
+    full_well_e: float
+    read_noise_e: float
+    dark_current_e_per_s: float
+    prnu: float
+    dsnu_e: float
+    bits: int
+    dark_spread: float = 0.3
+    hot_fraction: float = 1e-4
+    hot_current_e_per_s: float = 1000.0
+    dead_fraction: float = 2e-5
+    black_level: float = 0.0015
+    """As a fraction of full scale."""
+    exposure_limits_ms: tuple[float, float] = (0.05, 20_000.0)
+    frames_per_s: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPattern:
+    """One sensor's pixels as they came out of the fab (all ``(h, w)`` float32)."""
+
+    response: npt.NDArray[np.float32]
+    """Relative response; 0 for dead pixels. Binned: the mean of the pixels summed."""
+    dark_e_per_s: npt.NDArray[np.float32]
+    offset_e: npt.NDArray[np.float32]
+
+    def binned(self, factor: int) -> FixedPattern:
+        """Sum ``factor x factor`` pixels; a rest at the lower and right border is left out."""
+        if factor == 1:
+            return self
+        area = np.float32(factor * factor)
+        return FixedPattern(
+            bin_sum(self.response, factor) / area,
+            bin_sum(self.dark_e_per_s, factor),
+            bin_sum(self.offset_e, factor),
+        )
+
+    def cropped(self, rows: slice, columns: slice) -> FixedPattern:
+        """Cut a region out."""
+        return FixedPattern(
+            np.ascontiguousarray(self.response[rows, columns]),
+            np.ascontiguousarray(self.dark_e_per_s[rows, columns]),
+            np.ascontiguousarray(self.offset_e[rows, columns]),
+        )
+
+
+def fixed_pattern(spec: SensorSpec, seed: int) -> FixedPattern:
+    """Draw the pixels of a sensor; the same seed gives the same sensor."""
+    rng = np.random.default_rng(seed)
+    shape = spec.shape
+    response = 1 + np.float32(spec.prnu) * rng.standard_normal(shape, np.float32)
+    response[rng.random(shape, np.float32) < spec.dead_fraction] = 0
+    spread = spec.dark_spread
+    dark = np.exp(np.float32(spread) * rng.standard_normal(shape, np.float32) - np.float32(spread**2 / 2))
+    dark *= np.float32(spec.dark_current_e_per_s)
+    hot = rng.random(shape, np.float32) < spec.hot_fraction
+    dark[hot] += rng.exponential(spec.hot_current_e_per_s, int(hot.sum())).astype(np.float32)
+    # Half of the offset's variance is common to a column: its amplifier.
+    share = np.float32(spec.dsnu_e / np.sqrt(2))
+    offset = share * rng.standard_normal(shape, np.float32)
+    offset += share * rng.standard_normal(shape[1], np.float32)
+    return FixedPattern(np.maximum(response, 0), dark, offset)
+
+
+def bin_sum(image: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:
+    """Sum ``factor x factor`` pixels; a rest at the lower and right border is left out."""
+    height, width = (side // factor for side in image.shape)
+    tiles = image[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return np.asarray(tiles.sum(axis=(1, 3)), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Readout:
+    """How the charge becomes counts.
+
+    ``electrons_per_count`` is the conversion at gain 1, ``noise_scale`` multiplies all temporal noise
+    (1: physical, 0: none).
+    """
+
+    electrons_per_count: float
+    gain: float
+    black_level: float
+    full_scale: int
+    full_well_e: float
+    read_noise_e: float
+    noise_scale: float = 1.0
+
+
+def expose(
+    electrons_per_s: npt.NDArray[np.float32],
+    pattern: FixedPattern,
+    exposure_s: float,
+    readout: Readout,
+    seed: int,
+    out: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Take one exposure.
+
+    Parameters
+    ----------
+    electrons_per_s : ndarray, float32, (h, w)
+        Photons absorbed a second by a pixel of average response.
+    pattern : FixedPattern
+        Of the same shape.
+    exposure_s : float
+    readout : Readout
+    seed : int
+        Draws of the temporal noise; another seed, another frame.
+    out : ndarray, uint16, optional
+        Where to put the counts.
+    """
+    counts = np.empty(electrons_per_s.shape, np.uint16) if out is None else out
+    _expose(
+        electrons_per_s,
+        pattern.response,
+        pattern.dark_e_per_s,
+        pattern.offset_e,
+        exposure_s,
+        readout.gain / readout.electrons_per_count,
+        readout.black_level,
+        readout.full_scale,
+        readout.full_well_e,
+        readout.read_noise_e,
+        readout.noise_scale,
+        np.uint64(seed & 0xFFFF_FFFF_FFFF_FFFF),
+        counts,
+    )
+    return counts
+
+
+@compiled
+def _expose(
+    electrons_per_s: npt.NDArray[np.float32],
+    response: npt.NDArray[np.float32],
+    dark_e_per_s: npt.NDArray[np.float32],
+    offset_e: npt.NDArray[np.float32],
+    exposure_s: float,
+    counts_per_electron: float,
+    black_level: float,
+    full_scale: int,
+    full_well_e: float,
+    read_noise_e: float,
+    noise_scale: float,
+    seed: np.uint64,
+    counts: npt.NDArray[np.uint16],
+) -> None:
+    height, width = counts.shape
+    to_unit = 1.0 / 9007199254740992.0
+    for i in range(height):
+        # One stream of SplitMix64 a row, so that a row's noise does not depend on what came before it.
+        state = (seed + np.uint64(i)) * np.uint64(0xD1342543DE82EF95) + np.uint64(0x9E3779B97F4A7C15)
+        state ^= state >> np.uint64(29)
+        for j in range(width):
+            mean = (electrons_per_s[i, j] * response[i, j] + dark_e_per_s[i, j]) * exposure_s
+            state += np.uint64(0x9E3779B97F4A7C15)
+            word = state
+            word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            word ^= word >> np.uint64(31)
+            first = (float(word >> np.uint64(11)) + 0.5) * to_unit
+            state += np.uint64(0x9E3779B97F4A7C15)
+            word = state
+            word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            word ^= word >> np.uint64(31)
+            second = (float(word >> np.uint64(11)) + 0.5) * to_unit
+            radius = np.sqrt(-2.0 * np.log(first))
+            read = radius * np.sin(2 * np.pi * second)
+            if noise_scale != 1.0:
+                shot = radius * np.cos(2 * np.pi * second)
+                charge = mean + noise_scale * np.sqrt(mean) * shot
+            elif mean > 30.0:
+                # Poisson by a Cornish-Fisher expansion: right mean, variance and skewness.
+                shot = radius * np.cos(2 * np.pi * second)
+                charge = np.floor(mean + np.sqrt(mean) * shot + (shot * shot - 1.0) / 6.0 + 0.5)
+            else:
+                # Poisson by inversion with a uniform draw of its own.
+                state += np.uint64(0x9E3779B97F4A7C15)
+                word = state
+                word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+                word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+                word ^= word >> np.uint64(31)
+                uniform = (float(word >> np.uint64(11)) + 0.5) * to_unit
+                term = np.exp(-mean)
+                total = term
+                charge = 0.0
+                while uniform > total and charge < 200.0:
+                    charge += 1.0
+                    term *= mean / charge
+                    total += term
+            charge = min(max(charge, 0.0), full_well_e)
+            value = (charge + offset_e[i, j] + noise_scale * read_noise_e * read) * counts_per_electron
+            value = np.floor(value + black_level + 0.5)
+            counts[i, j] = np.uint16(min(max(value, 0.0), float(full_scale)))

@@ -1,0 +1,380 @@
+r"""Caustics by scalar wave optics, for a point source anywhere in front of the diffuser.
+
+The diffuser is a thin element. A spherical wave from the source meets it at the angle :math:`\theta(u)` and
+gains the phase
+
+.. math:: k\,h(u)\,\bigl(\sqrt{n^2 - \sin^2\theta} - \sqrt{n_a^2 - \sin^2\theta}\bigr),
+
+the path difference along the refracted and the unrefracted ray. Propagation to the sensor is expanded to
+second order about the straight ray through each point. With the source's own curvature taken out (Fresnel
+scaling theorem) what remains is a convolution with a quadratic phase over the distance
+:math:`\rho = z d / (z + d)`, stretched by :math:`1/\cos\theta` across and :math:`1/\cos^3\theta` along the
+direction of incidence, followed by the exact projection :math:`s = (1 + d/z)\,u - (d/z)\,x`. Because
+:math:`\theta` differs over the aperture when the source is close, the aperture is worked on in tiles small
+enough that the stretch hardly varies within one. docs/decisions/0003-propagation.md compares the choices.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from recon.optics.diffuser import Diffuser
+from recon.optics.grid import FloatArray, PixelGrid, resample_energy
+from recon.optics.jit import compiled
+from recon.optics.spectrum import Band
+
+Emission = Literal["lambertian", "isotropic"]
+Source = tuple[float, float, float]
+
+# Largest relative error of the stretched distance within one tile. The displacement of light by the relief
+# (some tens of micrometres) is wrong by at most this fraction: well below a pixel.
+TILE_TOLERANCE = 0.04
+MOST_TILES = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Caustic:
+    """Light on the sensor, on the grid of straight rays through the diffuser.
+
+    Attributes
+    ----------
+    energy : ndarray, float32, (h, w)
+        Light in each cell for a source of unit intensity along the axis (steradians).
+    y_edges_um, x_edges_um : ndarray, float64
+        Borders of the cells on the sensor.
+    """
+
+    energy: npt.NDArray[np.float32]
+    y_edges_um: FloatArray
+    x_edges_um: FloatArray
+
+    def on(self, grid: PixelGrid) -> npt.NDArray[np.float32]:
+        """Integrate over the pixels of a sensor grid; ``grid.shape``, float32."""
+        return resample_energy(
+            self.energy, self.y_edges_um, self.x_edges_um, grid.y_edges_um, grid.x_edges_um
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    """A part of the plane of straight rays: samples ``rows`` x ``columns``, seen under one direction."""
+
+    rows: range
+    columns: range
+    tan_squared: float
+    cos: float
+    direction: tuple[float, float]
+    """Unit vector ``(y, x)`` of the plane of incidence."""
+
+
+class WavePropagator:
+    """Point spread functions of one diffuser at one distance from the sensor.
+
+    Parameters
+    ----------
+    diffuser : Diffuser
+    distance_um : float
+        From the diffuser's relief to the sensor.
+    spectral_samples : int
+        Wavelengths averaged over a source's bandwidth.
+    workers : int
+        Threads for the transforms.
+    """
+
+    def __init__(
+        self, diffuser: Diffuser, distance_um: float, *, spectral_samples: int = 3, workers: int = 2
+    ) -> None:
+        if not distance_um > 0:
+            raise ValueError(f"The sensor lies behind the diffuser: distance_um > 0, not {distance_um}.")
+        self.diffuser = diffuser
+        self.distance_um = distance_um
+        self.spectral_samples = spectral_samples
+        self.workers = workers
+        dy, dx = diffuser.slopes()
+        self._steepest = float(np.quantile(np.hypot(dy, dx), 0.9995))
+
+    def psf(
+        self,
+        source_um: Source,
+        grid: PixelGrid,
+        band: Band,
+        *,
+        diameter_um: float = 0.0,
+        emission: Emission = "lambertian",
+    ) -> npt.NDArray[np.float32]:
+        """Light of a point source (or small disc) on the pixels of a sensor grid.
+
+        Parameters
+        ----------
+        source_um : tuple of float
+            ``(x, y, z)`` with ``z > 0``, any continuous position.
+        grid : PixelGrid
+            The sensor's pixels.
+        band : Band
+            The source's spectrum.
+        diameter_um : float
+            Diameter of a uniformly bright disc parallel to the sensor (0: a point).
+        emission : {"lambertian", "isotropic"}
+            A pinhole or screen that faces the sensor, or a fluorescent bead.
+
+        Returns
+        -------
+        ndarray, float32, ``grid.shape``
+            Solid angle in steradians that feeds each pixel (times the cosine of emission for a Lambertian
+            source): multiplied by the source's intensity along the axis, the light on the pixel. The angular
+            response of the pixels is not included (:mod:`recon.optics.fall_off`).
+        """
+        return self.caustic(source_um, grid, band, diameter_um=diameter_um, emission=emission).on(grid)
+
+    def caustic(
+        self,
+        source_um: Source,
+        grid: PixelGrid,
+        band: Band,
+        *,
+        diameter_um: float = 0.0,
+        emission: Emission = "lambertian",
+    ) -> Caustic:
+        """As :meth:`psf`, before integration over pixels; covers at least what falls on the grid."""
+        x, y, z = source_um
+        if not z > 0:
+            raise ValueError(f"A source lies in front of the diffuser: z_um > 0, not {z}.")
+        pitch = self.diffuser.pitch_um
+        magnification = self.distance_um / z
+        scale = 1 + magnification
+        rho = self.distance_um / scale
+        blur = diameter_um * magnification / scale / pitch
+        n_rows, n_columns = self.diffuser.heights_um.shape
+        margin = self._margin(source_um, band)
+        reach = margin + int(np.ceil(blur))
+        rows = _needed(grid.y_edges_um, n_rows, y, magnification, pitch, reach)
+        columns = _needed(grid.x_edges_um, n_columns, x, magnification, pitch, reach)
+        energy = np.zeros((len(rows), len(columns)), np.float32)
+        for tile in self._tiles(rows, columns, source_um):
+            part = energy[_within(tile.rows, rows), _within(tile.columns, columns)]
+            for wavelength_nm, weight in band.samples(self.spectral_samples):
+                self._add_tile(part, tile, source_um, margin, rho, wavelength_nm, weight, emission)
+        if blur > 0.5:
+            energy = np.asarray(cv2.filter2D(energy, -1, disc_kernel(blur), borderType=cv2.BORDER_CONSTANT))
+        y_edges = (np.arange(rows.start, rows.stop + 1) - n_rows / 2) * pitch * scale - magnification * y
+        x_edges = (np.arange(columns.start, columns.stop + 1) - n_columns / 2) * pitch * scale
+        return Caustic(energy.astype(np.float32, copy=False), y_edges, x_edges - magnification * x)
+
+    def _margin(self, source_um: Source, band: Band) -> int:
+        """Return by how many samples light may leave its straight ray at the worst angle."""
+        x, y, z = source_um
+        half_height, half_width = (side / 2 for side in self.diffuser.aperture_um)
+        tangent = np.hypot(abs(x) + half_width, abs(y) + half_height) / z
+        cos = 1 / np.sqrt(1 + tangent**2)
+        sin_squared = 1 - cos**2
+        contrast = np.sqrt(self.diffuser.glass.at(band.center_nm) ** 2 - sin_squared) - np.sqrt(
+            self.diffuser.ambient.at(band.center_nm) ** 2 - sin_squared
+        )
+        stretched = self.distance_um / (1 + self.distance_um / z) / cos**3
+        refracted = self._steepest * contrast * stretched
+        diffracted = 4 * np.sqrt(band.center_nm * 1e-3 * stretched)
+        return int(np.ceil((refracted + diffracted) / self.diffuser.pitch_um))
+
+    def _tiles(self, rows: range, columns: range, source_um: Source) -> list[_Tile]:
+        """Cut the plane of straight rays until the direction of incidence hardly varies within a tile."""
+        if not len(rows) or not len(columns):
+            return []
+        x, y, z = source_um
+        n_rows, n_columns = self.diffuser.heights_um.shape
+        pitch = self.diffuser.pitch_um
+
+        def tangent_squared(row: float, column: float) -> float:
+            dy = y - (row - (n_rows - 1) / 2) * pitch
+            dx = x - (column - (n_columns - 1) / 2) * pitch
+            return float(dy**2 + dx**2) / z**2
+
+        along_y, along_x = 1, 1
+        while True:
+            tiles, worst = [], 0.0
+            for tile_rows in _split(rows, along_y):
+                for tile_columns in _split(columns, along_x):
+                    row = (tile_rows.start + tile_rows.stop - 1) / 2
+                    column = (tile_columns.start + tile_columns.stop - 1) / 2
+                    here = tangent_squared(row, column)
+                    for corner_row in (tile_rows.start, tile_rows.stop):
+                        for corner_column in (tile_columns.start, tile_columns.stop):
+                            there = tangent_squared(corner_row, corner_column)
+                            worst = max(worst, abs(((1 + there) / (1 + here)) ** 1.5 - 1))
+                    dy = y - (row - (n_rows - 1) / 2) * pitch
+                    dx = x - (column - (n_columns - 1) / 2) * pitch
+                    length = float(np.hypot(dy, dx)) or 1.0
+                    tiles.append(
+                        _Tile(tile_rows, tile_columns, here, (1 + here) ** -0.5, (dy / length, dx / length))
+                    )
+            if worst <= TILE_TOLERANCE or len(tiles) >= MOST_TILES:
+                return tiles
+            if len(rows) / along_y > len(columns) / along_x:
+                along_y += 1
+            else:
+                along_x += 1
+
+    def _add_tile(
+        self,
+        energy: npt.NDArray[np.float32],
+        tile: _Tile,
+        source_um: Source,
+        margin: int,
+        rho_um: float,
+        wavelength_nm: float,
+        weight: float,
+        emission: Emission,
+    ) -> None:
+        diffuser = self.diffuser
+        pitch = diffuser.pitch_um
+        n_rows, n_columns = diffuser.heights_um.shape
+        row_window = _window(tile.rows, margin, n_rows, pitch, diffuser.aperture_um[0])
+        column_window = _window(tile.columns, margin, n_columns, pitch, diffuser.aperture_um[1])
+        if not row_window.any() or not column_window.any():
+            return
+        shape = (fft.next_fast_len(len(row_window)), fft.next_fast_len(len(column_window)))
+        field = np.zeros(shape, np.complex64)
+        first_row, first_column = tile.rows.start - margin, tile.columns.start - margin
+        wavelength_um = wavelength_nm * 1e-3
+        _modulate(
+            field,
+            diffuser.heights_um,
+            row_window,
+            column_window,
+            first_row,
+            first_column,
+            pitch,
+            source_um[0],
+            source_um[1],
+            source_um[2],
+            2 * np.pi / wavelength_um,
+            diffuser.glass.at(wavelength_nm) ** 2,
+            diffuser.ambient.at(wavelength_nm) ** 2,
+            emission == "lambertian",
+        )
+        spectrum = fft.fft2(field, overwrite_x=True, workers=self.workers)
+        _propagate(
+            spectrum,
+            fft.fftfreq(shape[0], pitch),
+            fft.fftfreq(shape[1], pitch),
+            np.pi * wavelength_um * rho_um / tile.cos,
+            tile.tan_squared,
+            tile.direction[0],
+            tile.direction[1],
+        )
+        field = fft.ifft2(spectrum, overwrite_x=True, workers=self.workers)
+        inner = field[margin : margin + len(tile.rows), margin : margin + len(tile.columns)]
+        energy += np.float32(weight) * (inner.real**2 + inner.imag**2)
+
+
+def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:
+    """Uniform disc of a diameter in samples, area-sampled; sums to 1."""
+    half = int(np.ceil(diameter / 2))
+    fine = 8
+    axis = (np.arange((2 * half + 1) * fine) - ((2 * half + 1) * fine - 1) / 2) / fine
+    disc = (np.hypot(axis[:, None], axis) <= diameter / 2).astype(np.float32)
+    side = 2 * half + 1
+    kernel = disc.reshape(side, fine, side, fine).sum(axis=(1, 3))
+    return np.asarray(kernel / kernel.sum(), np.float32)
+
+
+def _needed(
+    sensor_edges: FloatArray, samples: int, position: float, magnification: float, pitch: float, reach: int
+) -> range:
+    """Return the samples of the plane of straight rays that can receive light and land on the sensor."""
+    low, high = (sensor_edges[[0, -1]] + magnification * position) / (1 + magnification) / pitch + samples / 2
+    start = max(-reach, int(np.floor(low)) - 1)
+    return range(start, max(start, min(samples + reach, int(np.ceil(high)) + 1)))
+
+
+def _within(part: range, whole: range) -> slice:
+    return slice(part.start - whole.start, part.stop - whole.start)
+
+
+def _split(span: range, parts: int) -> list[range]:
+    borders = np.linspace(span.start, span.stop, parts + 1).round().astype(int).tolist()
+    return [range(low, high) for low, high in itertools.pairwise(borders) if high > low]
+
+
+def _window(
+    span: range, margin: int, samples: int, pitch: float, aperture_um: float
+) -> npt.NDArray[np.float32]:
+    """Amplitude along one axis for the samples ``span`` widened by ``margin``: aperture and soft cut."""
+    index = np.arange(span.start - margin, span.stop + margin)
+    low = (index - samples / 2) * pitch
+    covered = np.minimum(low + pitch, aperture_um / 2) - np.maximum(low, -aperture_um / 2)
+    amplitude = np.sqrt(np.clip(covered / pitch, 0, 1))
+    # Where a tile is cut out of the aperture, fade out instead of adding an edge that is not there.
+    fade = max(margin // 2, 1)
+    ramp = np.sin(np.pi / 2 * (np.arange(fade) + 0.5) / fade)
+    amplitude[:fade] *= ramp
+    amplitude[-fade:] *= ramp[::-1]
+    return np.asarray(amplitude, np.float32)
+
+
+@compiled
+def _modulate(
+    field: npt.NDArray[np.complex64],
+    heights: npt.NDArray[np.float32],
+    row_window: npt.NDArray[np.float32],
+    column_window: npt.NDArray[np.float32],
+    first_row: int,
+    first_column: int,
+    pitch: float,
+    x: float,
+    y: float,
+    z: float,
+    wavenumber: float,
+    glass_squared: float,
+    ambient_squared: float,
+    lambertian: bool,
+) -> None:
+    """Write the light behind the diffuser, its spherical curvature removed, into ``field``."""
+    n_rows, n_columns = heights.shape
+    for i in range(row_window.size):
+        row = first_row + i
+        if row < 0 or row >= n_rows or row_window[i] == 0:
+            continue
+        dy = y - (row - (n_rows - 1) / 2) * pitch
+        for j in range(column_window.size):
+            column = first_column + j
+            if column < 0 or column >= n_columns or column_window[j] == 0:
+                continue
+            dx = x - (column - (n_columns - 1) / 2) * pitch
+            square = dx * dx + dy * dy
+            distance_squared = square + z * z
+            sin_squared = square / distance_squared
+            contrast = np.sqrt(glass_squared - sin_squared) - np.sqrt(ambient_squared - sin_squared)
+            cos = z / np.sqrt(distance_squared)
+            solid_angle = pitch * pitch * cos / distance_squared
+            if lambertian:
+                solid_angle *= cos
+            phase = wavenumber * contrast * heights[row, column]
+            amplitude = np.sqrt(solid_angle) * row_window[i] * column_window[j]
+            field[i, j] = complex(amplitude * np.cos(phase), amplitude * np.sin(phase))
+
+
+@compiled
+def _propagate(
+    spectrum: npt.NDArray[np.complex64],
+    row_frequencies: FloatArray,
+    column_frequencies: FloatArray,
+    strength: float,
+    tan_squared: float,
+    direction_y: float,
+    direction_x: float,
+) -> None:
+    """Multiply by the transfer function of the stretched distance, in place."""
+    for i in range(row_frequencies.size):
+        fy = row_frequencies[i]
+        for j in range(column_frequencies.size):
+            fx = column_frequencies[j]
+            along = fy * direction_y + fx * direction_x
+            phase = -strength * (fy * fy + fx * fx + tan_squared * along * along)
+            spectrum[i, j] *= complex(np.cos(phase), np.sin(phase))
