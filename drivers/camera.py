@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from drivers.device import Device
-from drivers.frame import Frame
+from drivers.errors import DeviceError
+from drivers.frame import Frame, FrameMetadata
+from drivers.stream import FrameStream
 
 TriggerMode = Literal["free_run", "software", "hardware"]
 
@@ -164,9 +169,33 @@ class Camera(Device):
         When the ring overflowed, the frames lost are counted in the returned frame's ``dropped_before``.
         """
 
+    def next_frame_into(
+        self, buffer: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], timeout_s: float
+    ) -> FrameMetadata:
+        """Copy the oldest frame not yet fetched into a buffer that fits it; errors as ``next_frame``.
+
+        Drivers whose frames lie in buffers of the device's override this to copy from there, once.
+        """
+        frame = self.next_frame(timeout_s)
+        if frame.image.shape != buffer.shape or frame.image.dtype != buffer.dtype:
+            raise DeviceError(
+                self.name,
+                f"sent a frame {frame.image.dtype} {frame.image.shape}; "
+                f"{buffer.dtype} {buffer.shape} was expected.",
+            )
+        np.copyto(buffer, frame.image)
+        return frame.metadata
+
+    def stream(self, n_buffers: int = 16) -> FrameStream:
+        """Return a stream of frames, to be started: every frame, the newest, or a callback."""
+        return FrameStream(self, n_buffers)
+
     @abstractmethod
     def trigger(self) -> None:
         """Send one software trigger to a sequence that runs in trigger mode ``"software"``."""
+
+    frames_in_flight: ClassVar[int] = 2
+    """Frames that can be between the sensor and the host while the next one is exposed, at most."""
 
     @abstractmethod
     def stop_sequence(self) -> None:

@@ -1,0 +1,251 @@
+"""A stream accounts for every frame, never changes one that is held, and never returns a stale one."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.frame import Frame
+from drivers.ring import BufferPool
+from drivers.stream import FrameStream
+from tests.mocks.free_running import FreeRunningCamera
+
+
+def number_of(frame: Frame) -> int:
+    return int(frame.image[0, 0]) % 1000
+
+
+def finite(n: int, **options: object) -> FreeRunningCamera:
+    camera = FreeRunningCamera(**options)  # type: ignore[arg-type]
+    camera.n_frames = n
+    camera.deep_ring = n
+    return camera
+
+
+def positions(frames: list[Frame]) -> list[int]:
+    """Place of each frame among all that the camera exposed, from dropped counts alone."""
+    return list(np.cumsum([1 + frame.metadata.dropped_before for frame in frames]) - 1)
+
+
+def test_a_reader_that_keeps_up_gets_every_frame_once() -> None:
+    camera = finite(60)
+    stream = FrameStream(camera, 32)
+    reader = stream.reader()
+    with stream:
+        frames = [number_of(frame) for frame in iter(lambda: reader.next_frame(1.0), None)]
+        status = reader.status
+    assert frames == list(range(60))
+    assert (status.acquired, status.delivered, status.overwritten, status.waiting) == (60, 60, 0, 0)
+    assert not camera.is_streaming
+
+
+@pytest.mark.parametrize("drop", [set(), {0}, {3, 4, 5, 20}, set(range(10, 40))])
+def test_a_slow_reader_knows_exactly_what_it_missed(drop: set[int]) -> None:
+    camera = finite(60)
+    camera.drop = drop
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        frames = []
+        while (frame := reader.next_frame(0.5)) is not None:
+            time.sleep(0.011)
+            frames.append(Frame(frame.image.copy(), frame.metadata))
+            status = reader.status
+            assert status.acquired == status.delivered + status.overwritten + status.waiting
+        status = reader.status
+    assert positions(frames) == [number_of(frame) for frame in frames]
+    assert status.overwritten > 0
+    assert status.acquired + status.dropped_by_device == 60
+    assert status.dropped_by_device == len(drop)
+    assert status.delivered == len(frames)
+
+
+def test_readers_keep_their_own_account() -> None:
+    camera = finite(40)
+    stream = FrameStream(camera, 16)
+    slow, fast = stream.reader(), stream.reader()
+    with stream:
+        seen = 0
+        while fast.next_frame(0.5) is not None:
+            seen += 1
+        assert fast.status.delivered == seen == 40
+        assert slow.status.delivered == 0
+        assert slow.status.overwritten + slow.status.waiting == 40
+        first = slow.next_frame()
+        assert first is not None
+        assert first.metadata.dropped_before == slow.status.overwritten == number_of(first)
+
+
+def test_a_frame_that_is_held_never_changes_and_starves_only_the_stream() -> None:
+    camera = finite(40)
+    held: list[Frame] = []
+    stream = FrameStream(camera, 4)
+    reader = stream.reader()
+    with stream:
+        while (frame := reader.next_frame(0.5)) is not None:
+            held.append(frame)
+        status = reader.status
+    numbers = [number_of(frame) for frame in held]
+    assert len(held) == len(set(numbers)) < 40
+    assert all(np.all(frame.image == frame.image[0, 0]) for frame in held)
+    assert positions(held) == numbers
+    assert status.acquired == 40
+    assert status.overwritten == 40 - len(held)
+
+
+def test_part_of_a_frame_keeps_its_buffer() -> None:
+    pool = BufferPool(1, (4, 4), np.uint16)
+    image = pool.take()
+    assert image is not None
+    part = image[1:][:, 1:].T
+    del image
+    assert pool.take() is None
+    del part
+    assert pool.n_free == 1
+    again = pool.take()
+    assert again is not None
+    again[:] = 7
+
+
+def test_memory_is_that_of_the_ring_however_long_it_runs() -> None:
+    camera = finite(100, period_s=0.001)
+    addresses = set()
+    with FrameStream(camera, 5) as stream:
+        reader = stream.reader()
+        while (frame := reader.next_frame(0.5)) is not None:
+            addresses.add(frame.image.ctypes.data)
+    assert len(addresses) <= 7
+
+
+def test_frames_are_read_only() -> None:
+    with FrameStream(FreeRunningCamera()) as stream:
+        frame = stream.reader().next_frame(5)
+        assert frame is not None
+        with pytest.raises(ValueError, match="read-only"):
+            frame.image[0, 0] = 1
+
+
+def test_the_newest_frame_is_there_at_once_and_newer_ones_can_be_waited_for() -> None:
+    with FrameStream(FreeRunningCamera()) as stream:
+        first = stream.wait_newer(None, 5)
+        assert first is not None
+        second = stream.wait_newer(first, 5)
+        assert second is not None
+        assert number_of(second) > number_of(first)
+        newest = stream.newest()
+        assert newest is not None
+        assert number_of(newest) >= number_of(second)
+        assert stream.wait_newer(newest, 0.0) in (None, stream.newest())
+
+
+def test_iterating_starts_the_camera_and_leaving_the_loop_stops_it() -> None:
+    camera = FreeRunningCamera()
+    for count, frame in enumerate(camera.stream()):
+        assert frame.image.shape == camera.image_shape
+        if count == 5:
+            break
+    deadline = time.monotonic() + 5
+    while camera.is_streaming and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert not camera.is_streaming
+
+
+def test_a_slow_callback_holds_nobody_up() -> None:
+    camera = finite(60)
+    release, entered = threading.Event(), threading.Event()
+
+    def slow(_: Frame) -> None:
+        entered.set()
+        assert release.wait(10)
+
+    seen: list[int] = []
+    stream = FrameStream(camera, 32)
+    reader = stream.reader()
+    with stream:
+        stuck = stream.subscribe(slow)
+        stream.subscribe(lambda frame: seen.append(number_of(frame)), newest_only=True)
+        assert entered.wait(5)
+        count = 0
+        while reader.next_frame(0.5) is not None:
+            count += 1
+        assert count == 60
+        assert stuck.status.delivered == 1
+        release.set()
+    assert seen == sorted(seen)
+    assert seen[-1] == 59
+
+
+def test_what_a_callback_raises_is_raised_on_leaving() -> None:
+    def fails(_: Frame) -> None:
+        raise RuntimeError("broken callback")
+
+    stream = FrameStream(FreeRunningCamera()).start()
+    subscription = stream.subscribe(fails)
+    subscription.join()
+    with pytest.raises(RuntimeError, match="broken callback"):
+        stream.close()
+    assert not stream.camera.is_streaming
+
+
+def test_a_camera_that_fails_gives_its_frames_first_and_then_its_error() -> None:
+    camera = FreeRunningCamera()
+    camera.fail_at = 12
+    numbers = []
+    stream = FrameStream(camera, 32)
+    reader = stream.reader()
+    with stream, pytest.raises(DeviceError, match="unplugged"):
+        numbers.extend(number_of(frame) for frame in iter(lambda: reader.next_frame(5), None))
+    assert numbers == list(range(12))
+
+
+def test_a_camera_that_falls_silent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.stream._SILENCE_S", 0.05)
+    camera = finite(3)
+    with FrameStream(camera) as stream:
+        reader = stream.reader()
+        with pytest.raises(DeviceTimeoutError):
+            list(iter(lambda: reader.next_frame(5), None))
+
+
+def test_stopping_the_camera_from_elsewhere_ends_the_stream_without_error() -> None:
+    camera = FreeRunningCamera()
+    with FrameStream(camera) as stream:
+        reader = stream.reader()
+        assert reader.next_frame(5) is not None
+        camera.stop_sequence()
+        while reader.next_frame(5) is not None:
+            pass
+        assert not stream.is_running
+        with pytest.raises(StoppedError):
+            stream.fresh()
+
+
+@pytest.mark.parametrize("device_clock", [True, False])
+@pytest.mark.parametrize("in_flight", [0, 1, 2])
+def test_a_frame_asked_for_after_a_change_was_exposed_wholly_after_it(
+    device_clock: bool, in_flight: int
+) -> None:
+    camera = FreeRunningCamera(device_clock=device_clock, in_flight=in_flight)
+    with FrameStream(camera, 4) as stream:
+        for lit in (False, True) * 6:
+            camera.light(lit)
+            frame = stream.fresh()
+            assert (int(frame.image[0, 0]) >= 1000) == lit
+
+
+def test_the_newest_frame_alone_would_be_stale() -> None:
+    """The test above can fail: without waiting, a free-running camera does show the light as it was."""
+    camera = FreeRunningCamera(in_flight=2)
+    stale = 0
+    with FrameStream(camera, 4) as stream:
+        for lit in (False, True) * 6:
+            camera.light(lit)
+            frame = stream.wait_newer(stream.newest(), 5)
+            assert frame is not None
+            stale += (int(frame.image[0, 0]) >= 1000) != lit
+            time.sleep(0.02)
+    assert stale > 0

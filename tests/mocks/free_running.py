@@ -1,0 +1,126 @@
+"""A camera that exposes all the time, frame after frame, whether or not somebody looks."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.frame import Frame, FrameMetadata
+from tests.mocks.devices import MockCamera, MockOptions, MockWorld
+
+
+class FreeRunningCamera(MockCamera):
+    """Frame ``i`` is full of ``1000 + i``, or of ``i`` if it was dark at any time of its exposure.
+
+    ``drop`` is the set of frames that the device loses; ``in_flight`` the number of frames on their way to
+    the host while the next is exposed; ``deep_ring`` a size of the driver's ring that nobody asked for, so
+    that only the stream's own ring overflows.
+    """
+
+    def __init__(self, period_s: float = 0.002, *, device_clock: bool = True, in_flight: int = 0) -> None:
+        super().__init__(MockOptions(), MockWorld(MockWorld.Options()))
+        self._open = True
+        self.exposure_ms = period_s * 1e3
+        self.device_clock = device_clock
+        self.drop: set[int] = set()
+        self.n_frames: int | None = None
+        self.fail_at: int | None = None
+        self.deep_ring: int | None = None
+        self._in_flight = in_flight
+        self._lit = True
+        self._dark_during = False
+        self._ring: deque[Frame] = deque()
+        self._arrived = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._running = False
+        self._failure: DeviceError | None = None
+        self._lost = 0
+
+    def light(self, on: bool) -> None:
+        with self._arrived:
+            self._lit = on
+            self._dark_during = self._dark_during or not on
+
+    def start_sequence(self, n_buffers: int = 8) -> None:
+        self._ring = deque(maxlen=self.deep_ring or n_buffers)
+        self._running = True
+        self._thread = threading.Thread(target=self._expose, daemon=True)
+        self._thread.start()
+
+    @property
+    def is_streaming(self) -> bool:  # type: ignore[override]
+        return self._running
+
+    def next_frame(self, timeout_s: float) -> Frame:
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._ring or not self._running or self._failure, timeout_s)
+            if self._ring:
+                frame = self._ring.popleft()
+                return Frame(frame.image, replace(frame.metadata, host_time_ns=time.monotonic_ns()))
+            if self._failure is not None:
+                raise self._failure
+            if not self._running:
+                raise StoppedError(self.name, "stopped.")
+            raise DeviceTimeoutError(self.name, "no frame.")
+
+    def stop_sequence(self) -> None:
+        with self._arrived:
+            self._running = False
+            self._arrived.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _expose(self) -> None:
+        pipeline: deque[Frame] = deque()
+        number = 0
+        while self._running and number != self.n_frames:
+            if number == self.fail_at:
+                with self._arrived:
+                    self._failure = DeviceError(self.name, "was unplugged.")
+                    self._arrived.notify_all()
+                return
+            with self._arrived:
+                self._dark_during = not self._lit
+            time.sleep(self.exposure_ms / 1e3)
+            with self._arrived:
+                lit = not self._dark_during
+                now = time.monotonic_ns()
+            template = self.snap_metadata(number)
+            metadata = replace(template, device_time_ns=now - 10**15 if self.device_clock else None)
+            value = number + (1000 if lit else 0)
+            pipeline.append(Frame(np.full(self.image_shape, value, np.uint16), metadata))
+            number += 1
+            if len(pipeline) > self._in_flight:
+                self._deliver(pipeline.popleft())
+        while pipeline and self._running:
+            self._deliver(pipeline.popleft())
+
+    def _deliver(self, frame: Frame) -> None:
+        with self._arrived:
+            if frame.metadata.frame_id in self.drop:
+                self._lost += 1
+                return
+            frame, self._lost = _with_lost(frame, self._lost), 0
+            if len(self._ring) == self._ring.maxlen:
+                oldest = self._ring.popleft()
+                lost = 1 + oldest.metadata.dropped_before
+                if self._ring:
+                    self._ring[0] = _with_lost(self._ring[0], lost)
+                else:
+                    frame = _with_lost(frame, lost)
+            self._ring.append(frame)
+            self._arrived.notify_all()
+
+    def snap_metadata(self, number: int) -> FrameMetadata:
+        return replace(super().snap().metadata, frame_id=number, dropped_before=0)
+
+
+def _with_lost(frame: Frame, lost: int) -> Frame:
+    dropped = frame.metadata.dropped_before + lost
+    return Frame(frame.image, replace(frame.metadata, dropped_before=dropped))
