@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench import Bench
+from instrument.camera_settings import camera_settings
 from instrument.plan import BenchAbilities, Plan, check
 from instrument.runner import Progress, Runner
 from instrument.store import BenchRecord, Run, RunWriter
@@ -75,6 +76,7 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         gain_limits=camera.gain_limits,
         stage_axes=stage.axes if stage is not None else (),
         stage_position=stage.position() if stage is not None else {},
+        stage_homed=stage is None or stage.is_homed,
         stage_target=(lambda source: bench.stage_target(*source)) if stage is not None else None,
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
@@ -93,6 +95,8 @@ def record_of(bench: Bench) -> BenchRecord:
         devices={kind: str(device.identity) for kind, device in bench.devices.items()},
         simulated=bool(bench.simulated_kinds),
         pixel_pitch_um=bench.camera.pixel_pitch_um * bench.camera.binning,
+        camera=camera_settings(bench.camera),
+        stage=bench.stage.position() if bench.stage is not None and bench.stage.is_homed else {},
     )
 
 

@@ -203,8 +203,10 @@ class Bench:
         )
 
     # Photographs -------------------------------------------------------------------------------
-    def snap(self, average: int = 1) -> Snapshot:
+    def snap(self, average: int = 1, *, on_frame: Callable[[int], None] | None = None) -> Snapshot:
         """Take one photograph, the mean of ``average`` frames, all exposed after this call.
+
+        ``on_frame`` is called with the number of frames taken so far, after each.
 
         Raises
         ------
@@ -213,22 +215,22 @@ class Bench:
         """
         if average < 1:
             raise BenchError(f"A photograph is the mean of 1 or more frames, not {average}.")
-        frame = self.camera.snap()
-        metadata = frame.metadata
-        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32] = frame.image
-        if average > 1:
-            total = frame.image.astype(np.float64)
-            for _ in range(average - 1):
-                frame = self.camera.snap()
-                total += frame.image
-                metadata = replace(
-                    frame.metadata,
-                    dropped_before=metadata.dropped_before + frame.metadata.dropped_before,
-                    saturated_fraction=max(metadata.saturated_fraction, frame.metadata.saturated_fraction),
-                )
-            image = (total / average).astype(np.float32)
-            image.flags.writeable = False
-        return Snapshot(image, self.with_surroundings(metadata), average)
+        total = np.zeros((), np.float64)
+        dropped, saturated = 0, 0.0
+        for taken in range(1, average + 1):
+            frame = self.camera.snap()
+            dropped += frame.metadata.dropped_before
+            saturated = max(saturated, frame.metadata.saturated_fraction)
+            if average > 1:
+                total = np.add(total, frame.image)
+            if on_frame is not None:
+                on_frame(taken)
+        metadata = replace(frame.metadata, dropped_before=dropped, saturated_fraction=saturated)
+        if average == 1:
+            return Snapshot(frame.image, self.with_surroundings(metadata), average)
+        mean = np.asarray(total / average, np.float32)
+        mean.flags.writeable = False
+        return Snapshot(mean, self.with_surroundings(metadata), average)
 
     def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
         """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""

@@ -101,6 +101,9 @@ class Runner:
         The run; the runner finishes and closes it.
     todo : sequence of int, optional
         Indices of the steps to do, in order; None means all.
+    start : Step, optional
+        The bench's state before the first step, for a run that is continued: what the plan leaves as it is
+        then is as it was.
     on_progress : callable, optional
         Called with the status after every step and change of state, in the thread that executes.
     """
@@ -112,11 +115,13 @@ class Runner:
         writer: RunWriter,
         *,
         todo: Sequence[int] | None = None,
+        start: Step | None = None,
         on_progress: Progress | None = None,
     ) -> None:
         self._bench = bench
         self._plan = plan
         self._writer = writer
+        self._start = start
         self._todo = frozenset(range(len(plan)) if todo is None else todo)
         self._on_progress = on_progress
         self._settings = StepSettings(bench)
@@ -191,7 +196,7 @@ class Runner:
         self._started_s = time.monotonic()
         self._report(state=RunState.RUNNING)
         try:
-            self._writer.note("started", steps=len(self._todo))
+            self._writer.start(steps=len(self._todo))
             self._do_steps()
         except _EndedEarlyError as early:
             run = self._end(early.reason)
@@ -212,12 +217,12 @@ class Runner:
 
     def _do_steps(self) -> None:
         part, part_started_s = -1, 0.0
-        for step in self._plan.steps():
+        for step in self._plan.whole_steps(self._start):
             if step.index not in self._todo:
                 continue
             self._between_steps()
             if step.part != part:
-                part, part_started_s = step.part, time.monotonic()
+                part, part_started_s = step.part, time.monotonic() - step.start_after_s
             self._wait_until(part_started_s + step.start_after_s)
             self._report(step=step)
             snapshot = self._take(step)

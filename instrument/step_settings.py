@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from drivers.led_array import LedPattern
@@ -20,19 +20,21 @@ class StepSettings:
         self._light: Light | None = None
         self._scene_lit: bool | None = None
         self._slm_image: Path | None = None
+        self._exposure_ms: float | None = None
+        self._gain: float | None = None
         self._source_um: SourcePosition | None = None
+        self._stage: Mapping[str, float] = {}
 
     def actions(self, step: Step) -> list[Callable[[], object]]:
         """Return what to do, in order: camera, motion, SLM, light."""
-        camera = self._bench.camera
         actions: list[Callable[[], object]] = []
-        if (exposure_ms := step.exposure_ms) is not None and camera.exposure_ms != exposure_ms:
-            actions.append(lambda: camera.set_exposure_ms(exposure_ms))
-        if (gain := step.gain) is not None and camera.gain != gain:
-            actions.append(lambda: camera.set_gain(gain))
+        if (exposure_ms := step.exposure_ms) is not None and exposure_ms != self._exposure_ms:
+            actions.append(lambda: self._set_exposure(exposure_ms))
+        if (gain := step.gain) is not None and gain != self._gain:
+            actions.append(lambda: self._set_gain(gain))
         if (source_um := step.source_um) is not None and source_um != self._source_um:
             actions.append(lambda: self._place_source(source_um))
-        if step.stage:
+        if step.stage and step.stage != self._stage:
             actions.append(lambda: self._move_stage(step))
         if (slm_image := step.slm_image) is not None and slm_image != self._slm_image:
             actions.append(lambda: self._display(slm_image))
@@ -48,16 +50,25 @@ class StepSettings:
             self._bench.source_off()
             self._light = None
 
+    def _set_exposure(self, exposure_ms: float) -> None:
+        self._bench.camera.set_exposure_ms(exposure_ms)
+        self._exposure_ms = exposure_ms
+
+    def _set_gain(self, gain: float) -> None:
+        self._bench.camera.set_gain(gain)
+        self._gain = gain
+
     def _place_source(self, source_um: SourcePosition) -> None:
-        self._source_um = None
+        self._source_um, self._stage = None, {}
         self._bench.place_source(*source_um)
         self._source_um = source_um
 
     def _move_stage(self, step: Step) -> None:
         if self._bench.stage is None:
             raise BenchError(f"{step} wants a stage, and this bench has none.")
-        self._source_um = None
+        self._source_um, self._stage = None, {}
         self._bench.stage.move_to(step.stage)
+        self._stage = step.stage
 
     def _display(self, path: Path) -> None:
         slm = self._bench.slm

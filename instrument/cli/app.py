@@ -1,11 +1,17 @@
-"""What all commands' options and help texts share."""
+"""What all commands share: options, help texts, opening a bench, asking the operator."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from instrument.bench import Bench
+    from instrument.config import BenchConfig
 
 BenchOption = Annotated[
     Path | None,
@@ -34,3 +40,38 @@ def command_app(help_text: str = "") -> typer.Typer:
 def examples(*lines: str) -> str:
     """Return the examples that end a command's help, one a line, as typer's ``epilog``."""
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def load_and_say(bench: Path | None) -> BenchConfig:
+    """Read the bench configuration; say on stderr when it is the built-in one."""
+    from instrument.config_file import DEFAULT_NAME, load_config
+
+    config = load_config(bench)
+    if config.path is None:
+        typer.echo(
+            f"No {DEFAULT_NAME} in this folder: the built-in SIMULATED bench is used (diffuserbench new).",
+            err=True,
+        )
+    return config
+
+
+def open_and_say(bench: Path | None) -> Bench:
+    """Open the bench, ready to ask the operator in a terminal; say on stderr what it is."""
+    from instrument.bench import open_bench
+
+    opened = open_bench(load_and_say(bench), ask=operator())
+    typer.echo(f"Bench: {opened.label}", err=True)
+    return opened
+
+
+def operator() -> Callable[[str], None] | None:
+    """Return what asks the person at the terminal to do something by hand; None where nobody can answer."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return None
+
+    def ask(request: str) -> None:
+        typer.echo(f"{request} Then press Enter (Ctrl-C to stop): ", err=True, nl=False)
+        if not sys.stdin.readline():
+            raise KeyboardInterrupt  # end of input: nobody is there any more
+
+    return ask

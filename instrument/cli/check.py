@@ -16,8 +16,7 @@ from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench import Bench
-from instrument.cli.app import BenchOption, command_app, examples
-from instrument.config_file import DEFAULT_NAME, load_config
+from instrument.cli.app import BenchOption, command_app, examples, load_and_say
 from instrument.safety import StepsFailedError
 
 app = command_app()
@@ -30,9 +29,7 @@ def check(bench: BenchOption = None) -> None:
     Ends with the light off. Nothing moves. Exit status 1 when a device fails; all failures are reported.
     """
     console = Console()
-    config = load_config(bench)
-    if config.path is None:
-        console.print(f"No {DEFAULT_NAME} in this folder: the built-in simulated bench is used.")
+    config = load_and_say(bench)
     opened = Bench(config)
     failures: list[str] = []
     try:

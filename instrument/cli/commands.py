@@ -23,4 +23,5 @@ RECONSTRUCTION = "Reconstruction"
 COMMANDS: Mapping[str, Command] = {
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
     "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
+    "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,8 @@ class BenchAbilities:
         Empty without a stage.
     stage_position : mapping
         Where the stage is now.
+    stage_homed : bool
+        Whether the stage's positions refer to a known reference.
     stage_target : callable, optional
         The stage position that puts the point source at ``(x, y, z)`` micrometres; None without a source
         that can be placed.
@@ -58,6 +60,7 @@ class BenchAbilities:
     gain_limits: tuple[float, float]
     stage_axes: tuple[StageAxis, ...] = ()
     stage_position: Mapping[str, float] | None = None
+    stage_homed: bool = True
     stage_target: Callable[[SourcePosition], Mapping[str, float]] | None = None
     can_switch_source: bool = True
     can_switch_scene: bool = True
@@ -94,16 +97,23 @@ def stored_dtype(plan: Plan, camera_dtype: np.dtype[np.uint8] | np.dtype[np.uint
     return np.dtype(np.float32) if plan.averages else np.dtype(camera_dtype)
 
 
-def estimate(plan: Plan, abilities: BenchAbilities) -> PlanEstimate:
-    """Return what a plan will cost on a bench."""
+def estimate(
+    plan: Plan,
+    abilities: BenchAbilities,
+    *,
+    todo: Collection[int] | None = None,
+    start: Step | None = None,
+) -> PlanEstimate:
+    """Return what a plan, or the steps of it that are ``todo``, will cost on a bench."""
+    steps = _steps(plan, todo, start)
     frame_bytes = math.prod(abilities.frame_shape) * stored_dtype(plan, abilities.frame_dtype).itemsize
     speeds = {axis.name: axis.speed_per_s for axis in abilities.stage_axes}
     position = dict(abilities.stage_position or {})
     seconds, part_start, part, moves = 0.0, 0.0, -1, 0
     slm_image, exposure_ms = None, abilities.exposure_ms
-    for step in plan.steps():
+    for step in steps:
         if step.part != part:
-            part, part_start = step.part, seconds
+            part, part_start = step.part, seconds - step.start_after_s
         seconds = max(seconds, part_start + step.start_after_s)
         target = abilities.target(step)
         if any(position.get(axis) != value for axis, value in target.items()):
@@ -115,10 +125,10 @@ def estimate(plan: Plan, abilities: BenchAbilities) -> PlanEstimate:
             seconds += abilities.slm_settle_ms / 1e3
         exposure_ms = step.exposure_ms if step.exposure_ms is not None else exposure_ms
         seconds += step.average * exposure_ms / 1e3
-    n = len(plan)
+    n = len(steps)
     return PlanEstimate(
         frames=n,
-        exposures=plan.exposures,
+        exposures=sum(step.average for step in steps),
         moves=moves,
         image_bytes=n * frame_bytes,
         total_bytes=n * (frame_bytes + BYTES_A_FRAME_BESIDE_THE_IMAGE),
@@ -126,8 +136,30 @@ def estimate(plan: Plan, abilities: BenchAbilities) -> PlanEstimate:
     )
 
 
-def check(plan: Plan, abilities: BenchAbilities) -> None:
+def _steps(plan: Plan, todo: Collection[int] | None, start: Step | None) -> list[Step]:
+    if todo is None:
+        return list(plan.steps())
+    wanted = frozenset(todo)
+    return [step for step in plan.whole_steps(start) if step.index in wanted]
+
+
+def check(
+    plan: Plan,
+    abilities: BenchAbilities,
+    *,
+    todo: Collection[int] | None = None,
+    start: Step | None = None,
+) -> None:
     """Refuse a plan that the bench cannot carry out.
+
+    Parameters
+    ----------
+    plan : Plan
+    abilities : BenchAbilities
+    todo : collection of int, optional
+        Indices of the steps that will be done; None means all.
+    start : Step, optional
+        The bench's state before the first step, for what the plan leaves as it is.
 
     Raises
     ------
@@ -135,16 +167,17 @@ def check(plan: Plan, abilities: BenchAbilities) -> None:
         Naming every reason with the steps it concerns.
     """
     found: dict[str, list[int]] = {}
-    for step in plan.steps():
+    steps = _steps(plan, todo, start)
+    for step in steps:
         for problem in _step_problems(step, abilities):
             found.setdefault(problem, []).append(step.index)
     problems = [f"{_ranges(steps)}: {problem}" for problem, steps in found.items()]
-    for path in sorted({step.slm_image for step in plan.steps() if step.slm_image is not None}):
+    for path in sorted({step.slm_image for step in steps if step.slm_image is not None}):
         problems.extend(_slm_image_problems(path, abilities))
-    need = estimate(plan, abilities).total_bytes
+    need = estimate(plan, abilities, todo=todo, start=start).total_bytes
     if abilities.free_bytes is not None and need + SPARE_BYTES > abilities.free_bytes:
         problems.append(
-            f"{len(plan)} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to spare, but only "
+            f"{len(steps)} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to spare, but only "
             f"{abilities.free_bytes / 1e9:.2f} GB are free on the disk. Free some, or choose another folder."
         )
     if problems:
@@ -180,6 +213,8 @@ def _position_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
         yield "a source position, but the bench has no stage that places its source."
         return
     axes = {axis.name: axis for axis in abilities.stage_axes}
+    if not abilities.stage_homed and abilities.target(step):
+        yield "a position, but the stage is not homed. Home it first."
     for name, value in abilities.target(step).items():
         if name not in axes:
             yield f"stage axis {name!r} does not exist; the stage has {', '.join(axes) or 'none'}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -192,6 +192,18 @@ class Step(PlanData):
     start_after_s: float = 0.0
     """Seconds after the part's first step before which this one must not begin."""
 
+    def after(self, before: Step | None) -> Step:
+        """Return this step with what it leaves as it is filled in from the step before."""
+        if before is None:
+            return self
+        filled: dict[str, Any] = {}
+        if self.source_um is None and not self.stage:
+            filled["source_um"], filled["stage"] = before.source_um, before.stage
+        for name in ("slm_image", "exposure_ms", "gain"):
+            if getattr(self, name) is None:
+                filled[name] = getattr(before, name)
+        return self.model_copy(update=filled)
+
     def __str__(self) -> str:
         words = [f"step {self.index} ({self.label})", f"light {self.light}"]
         if self.source_um is not None:
@@ -224,6 +236,16 @@ class Plan(PlanData):
             yield from part.steps(first, number)
             first += len(part)
 
+    def whole_steps(self, start: Step | None = None) -> Iterator[Step]:
+        """Yield every step with what it leaves as it is filled in from the steps before it.
+
+        ``start`` stands for the bench's state before the first step.
+        """
+        before = start
+        for step in self.steps():
+            before = step.after(before)
+            yield before
+
     @property
     def exposures(self) -> int:
         """Number of exposures, averaged frames counted singly."""
@@ -233,6 +255,18 @@ class Plan(PlanData):
     def averages(self) -> bool:
         """Whether any stored frame is an average, so that frames are stored as float32."""
         return any(part.average > 1 for part in self.parts)
+
+    @property
+    def slm_images(self) -> tuple[Path, ...]:
+        """The SLM images that the plan names, each once."""
+        return tuple(dict.fromkeys(path for part in self.parts for path in part.slm_images))
+
+    def with_slm_images(self, place: Callable[[Path], Path]) -> Plan:
+        """Return the plan with every SLM image at the path that ``place`` gives for it."""
+        parts = (
+            part.model_copy(update={"slm_images": tuple(map(place, part.slm_images))}) for part in self.parts
+        )
+        return self.model_copy(update={"parts": tuple(parts)})
 
     def to_json(self) -> str:
         """Return the plan as JSON; :meth:`from_json` gives it back equal."""

@@ -1,11 +1,12 @@
 """The run store: one folder a run, readable by others' tools, safe against crashes and power cuts."""
 
 from instrument.store.frame_record import FrameRecord, Gap
-from instrument.store.run import FinishReason, Run, RunCondition, RunError
+from instrument.store.run import DamagedFrame, FinishReason, Run, RunCondition, RunError
 from instrument.store.writer import BenchRecord, FrameToStore, RunWriter
 
 __all__ = [
     "BenchRecord",
+    "DamagedFrame",
     "FinishReason",
     "FrameRecord",
     "FrameToStore",

@@ -1,7 +1,7 @@
 """Writing so that what was written is on the disk: fsync, rename, append-only lines.
 
-A file is on disk when its data and the folder that names it have been synced; a rename within one folder
-is atomic. Everything here returns only then.
+A file is on disk when its data and the folder that names it have been synced. Everything here returns only
+then. Whole files are :mod:`instrument.atomic`'s work.
 """
 
 from __future__ import annotations
@@ -12,16 +12,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from instrument.atomic import sync_folder, write_bytes
+
 Json = Mapping[str, Any]
-
-
-def sync_folder(path: Path) -> None:
-    """Put a folder's entries on the disk."""
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def make_folder(path: Path) -> None:
@@ -30,24 +23,9 @@ def make_folder(path: Path) -> None:
     sync_folder(path.parent)
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a whole file: after a crash there is the old one or the new one, never a half."""
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
-
-
 def write_json(path: Path, data: Json) -> None:
     """Write a mapping as a JSON file, atomically."""
-    write_atomically(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_bytes(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
 class AppendOnlyLog:

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.store.durable import make_folder, sync_folder, write_json
+from instrument.atomic import sync_folder
+from instrument.store.durable import make_folder, write_json
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"

@@ -32,6 +32,7 @@ FORMAT = 1
 """Version of the run folder's format."""
 PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
 BENCH_TOML, LOG, FRAMES, LOCK = "bench.toml", "log.jsonl", "frames.ome.zarr", "lock"
+SLM_IMAGES = "slm"
 
 
 class FinishReason(StrEnum):
@@ -90,6 +91,8 @@ class Run:
         The log's other lines: started, paused, resumed, finished ...
     state : mapping
         The contents of ``state.json``.
+    torn_bytes : int
+        Length of the half line that a crash left at the end of the log.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,7 +102,9 @@ class Run:
             raise RunError(
                 path / STATE, f"format {self.state.get('format')!r}; this version reads format {FORMAT}."
             )
-        lines, self._log_bytes = read_lines(path / LOG)
+        size = (path / LOG).stat().st_size
+        lines, whole = read_lines(path / LOG)
+        self.torn_bytes = max(0, size - whole)
         self.records: dict[int, FrameRecord] = {}
         gaps: list[Gap] = []
         events: list[Mapping[str, Any]] = []
@@ -167,7 +172,9 @@ class Run:
     def plan(self) -> Plan | None:
         """The plan; None for a recording."""
         path = self.path / PLAN
-        return Plan.from_json(path.read_text()) if path.exists() else None
+        if not path.exists():
+            return None
+        return Plan.from_json(path.read_text()).with_slm_images(lambda image: self.path / image)
 
     @cached_property
     def provenance(self) -> dict[str, Any]:
@@ -178,6 +185,15 @@ class Run:
     def bench(self) -> dict[str, Any]:
         """The bench's configuration as used, defaults included."""
         return self._json(BENCH)
+
+    @property
+    def start(self) -> Step:
+        """The bench's state before the first step, as far as a plan may leave it as it is."""
+        camera, stage = self.provenance["camera"], self.provenance["stage"]
+        exposure_ms, gain = camera["exposure_ms"], camera["gain"]
+        return Step(
+            index=-1, part=-1, repeat=0, label="start", stage=stage, exposure_ms=exposure_ms, gain=gain
+        )
 
     # Frames --------------------------------------------------------------------------------------
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import os
 import re
 import shutil
@@ -18,8 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
+from instrument.atomic import sync_folder, write_bytes
 from instrument.plan import Plan
-from instrument.store.durable import AppendOnlyLog, sync_folder, write_atomically, write_json
+from instrument.store.durable import AppendOnlyLog, make_folder, write_json
 from instrument.store.frame_array import FrameArray
 from instrument.store.frame_record import FrameRecord, Gap
 from instrument.store.provenance import provenance
@@ -32,6 +34,7 @@ from instrument.store.run import (
     LOG,
     PLAN,
     PROVENANCE,
+    SLM_IMAGES,
     STATE,
     FinishReason,
     Run,
@@ -53,7 +56,8 @@ class FrameToStore:
 class BenchRecord:
     """What a run keeps about its bench.
 
-    ``config`` is everything as used, ``toml`` the text of the file; ``devices`` who each device says it is.
+    ``config`` is everything as used, ``toml`` the text of the file; ``devices`` who each device says it is;
+    ``camera`` the camera's settings and ``stage`` the stage's position when the run was made.
     """
 
     config: Mapping[str, Any]
@@ -61,6 +65,8 @@ class BenchRecord:
     devices: Mapping[str, str]
     simulated: bool
     pixel_pitch_um: float
+    camera: Mapping[str, Any]
+    stage: Mapping[str, float]
 
 
 class RunWriter:
@@ -113,14 +119,16 @@ class RunWriter:
             draft.mkdir()
             try:
                 if plan is not None:
-                    write_atomically(draft / PLAN, plan.to_json().encode())
+                    write_bytes(draft / PLAN, _with_copies(plan, draft).to_json().encode())
                 write_json(draft / BENCH, bench.config)
-                write_atomically(draft / BENCH_TOML, bench.toml.encode())
+                write_bytes(draft / BENCH_TOML, bench.toml.encode())
                 origin = {
                     **provenance(),
                     "simulated": bench.simulated,
                     "devices": dict(bench.devices),
                     "pixel_pitch_um": bench.pixel_pitch_um,
+                    "camera": dict(bench.camera),
+                    "stage": dict(bench.stage),
                     "calibrations": list(calibrations),
                 }
                 write_json(draft / PROVENANCE, origin)
@@ -133,8 +141,8 @@ class RunWriter:
                     "pid": os.getpid(),
                 }
                 write_json(draft / STATE, state)
-                write_atomically(draft / LOG, b"")
-                write_atomically(draft / LOCK, b"")
+                write_bytes(draft / LOG, b"")
+                write_bytes(draft / LOCK, b"")
                 lock = _lock(draft)
                 draft.rename(path)
             except BaseException:
@@ -154,13 +162,20 @@ class RunWriter:
         RunError
             When it is no run, or some program writes to it now.
         """
-        run = Run.open(path)
+        path = Run.open(path).path
         try:
-            writer = cls(run.path, _lock(run.path))
-            writer._set_state(state="running", reason=None, error="", pid=os.getpid())
+            writer = cls(path, _lock(path))
+            for leftover in path.glob(".*"):  # of a write that a crash cut off
+                if leftover.is_file():
+                    leftover.unlink()
         except OSError as error:
-            raise RunError(run.path, f"cannot be continued: {error.strerror}.", _remedy(error)) from error
+            raise RunError(path, f"cannot be continued: {error.strerror}.", _remedy(error)) from error
         return writer
+
+    def start(self, **fields: Any) -> None:
+        """Note that frames are coming, now or again; ``fields`` go into the log."""
+        self.note("started", **fields)
+        self._set_state(state="running", reason=None, error="", pid=os.getpid())
 
     # Writing -------------------------------------------------------------------------------------
     def write(self, frames: Sequence[FrameToStore]) -> None:
@@ -252,6 +267,18 @@ class RunWriter:
     def _set_state(self, **changes: Any) -> None:
         self._state.update(changes)
         write_json(self.path / STATE, self._state)
+
+
+def _with_copies(plan: Plan, folder: Path) -> Plan:
+    """Copy a plan's SLM images into a folder, so that the run can be continued and understood later."""
+    if plan.slm_images:
+        make_folder(folder / SLM_IMAGES)
+    copies: dict[Path, Path] = {}
+    for path in plan.slm_images:
+        data = path.read_bytes()
+        copies[path] = Path(SLM_IMAGES) / f"{hashlib.sha256(data).hexdigest()[:16]}{path.suffix}"
+        write_bytes(folder / copies[path], data)
+    return plan.with_slm_images(copies.__getitem__)
 
 
 def _lock(path: Path) -> int:

@@ -24,7 +24,15 @@ from instrument.store import (
 )
 from instrument.store.durable import AppendOnlyLog, read_lines, write_json
 
-BENCH = BenchRecord({"bench": {"name": "b"}}, '[bench]\nname = "b"\n', {"camera": "mock"}, True, 6.5)
+BENCH = BenchRecord(
+    {"bench": {"name": "b"}},
+    '[bench]\nname = "b"\n',
+    {"camera": "mock"},
+    True,
+    6.5,
+    {"exposure_ms": 1.0, "gain": 1.0},
+    {},
+)
 
 
 def metadata(frame_id: int = 0) -> FrameMetadata:

@@ -1,0 +1,149 @@
+"""``diffuserbench snap``: take a photograph."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from instrument.atomic import check_writable
+from instrument.bench import Bench, Snapshot
+from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.progress import progress_bar
+from instrument.errors import FileError
+from instrument.images import check_suffix, side_car, write_image
+
+app = command_app()
+
+
+class Light(enum.StrEnum):
+    """What is lit while the photograph is taken."""
+
+    SCENE = "scene"
+    SOURCE = "source"
+    DARK = "dark"
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench snap --out photo.tif",
+        "diffuserbench snap --exposure-ms 50 --average 10 --out photo.npy",
+        "diffuserbench snap --dark --average 20 --out dark.tif",
+        "diffuserbench snap --source --out psf.tif",
+    )
+)
+def snap(
+    bench: BenchOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Where to write: .tif, .png or .npy. Default: photo-UTCTIME.tif here.",
+            show_default=False,
+        ),
+    ] = None,
+    average: Annotated[
+        int,
+        typer.Option("--average", "-n", min=1, metavar="N", help="Frames to average; the mean is float32."),
+    ] = 1,
+    exposure_ms: Annotated[
+        float | None,
+        typer.Option(
+            "--exposure-ms", metavar="MS", help="Exposure time, milliseconds, e.g. 12.5.", show_default=False
+        ),
+    ] = None,
+    gain: Annotated[
+        float | None,
+        typer.Option("--gain", metavar="FACTOR", help="Gain factor, 1 is the base gain.", show_default=False),
+    ] = None,
+    scene: Annotated[bool, typer.Option("--scene", help="The scene is lit (the default).")] = False,
+    source: Annotated[bool, typer.Option("--source", help="The point source is lit: a PSF.")] = False,
+    dark: Annotated[bool, typer.Option("--dark", help="Nothing is lit: a dark frame.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+) -> None:
+    """Take a photograph and write it with its metadata (exposure, gain, stage position, light ...).
+
+    The bench is opened for it and made safe again: light off, motion stopped.
+    """
+    light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark})
+    target = out or Path(f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif")
+    _check_target(target, average, force=force)
+    with open_and_say(bench) as opened:
+        if exposure_ms is not None:
+            opened.camera.set_exposure_ms(exposure_ms)
+        if gain is not None:
+            opened.camera.set_gain(gain)
+        _light(opened, light)
+        taken = _photograph(opened, average)
+        write_image(target, taken.image, _metadata(opened, taken, light))
+    _report(target, taken, light)
+
+
+def _one_light(flags: dict[Light, bool]) -> Light:
+    chosen = [name for name, is_set in flags.items() if is_set]
+    if len(chosen) > 1:
+        raise typer.BadParameter(f"choose one of --{', --'.join(chosen)}.")
+    return chosen[0] if chosen else Light.SCENE
+
+
+def _check_target(target: Path, average: int, *, force: bool) -> None:
+    check_suffix(target)
+    if average > 1 and target.suffix.lower() == ".png":
+        raise FileError(
+            target, "a mean of several frames is float32, which PNG cannot hold.", "Use .tif or .npy."
+        )
+    files = [target] if target.suffix.lower() in (".tif", ".tiff") else [target, side_car(target)]
+    for file in files:
+        check_writable(file)
+        if file.exists() and not force:
+            raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+
+
+def _light(bench: Bench, light: Light) -> None:
+    bench.source_on() if light is Light.SOURCE else bench.source_off()
+    bench.scene_on() if light is Light.SCENE else bench.scene_off()
+
+
+def _photograph(bench: Bench, average: int) -> Snapshot:
+    if average == 1:
+        return bench.snap()
+    with progress_bar() as bar:
+        task = bar.add_task("Frames", total=average, note="")
+        return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))
+
+
+def _metadata(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
+    return {
+        "bench": bench.label,
+        "camera": str(bench.camera.identity),
+        "light": light.value,
+        "average": taken.average,
+        "full_scale": taken.full_scale,
+        **asdict(taken.metadata),
+    }
+
+
+def _report(target: Path, taken: Snapshot, light: Light) -> None:
+    height, width = taken.image.shape[:2]
+    metadata = taken.metadata
+    frames = "1 frame" if taken.average == 1 else f"mean of {taken.average} frames"
+    typer.echo(
+        f"Wrote {target}: {height} x {width} {taken.image.dtype}, {light.value}, "
+        f"{metadata.exposure_ms:g} ms, gain {metadata.gain:g}, {frames}."
+    )
+    typer.echo(
+        f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
+        f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
+    )
+    if metadata.saturated_fraction > 0:
+        typer.echo(
+            f"Warning: {metadata.saturated_fraction:.3%} of the pixels are saturated; shorten --exposure-ms.",
+            err=True,
+        )

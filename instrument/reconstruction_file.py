@@ -1,0 +1,131 @@
+"""Writing a reconstruction: the numbers, a picture to look at, and how it came about."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.atomic import check_writable, write_text
+from instrument.errors import FileError
+from instrument.images import write_image
+from instrument.reconstruction_job import Job
+from recon.result import Reconstruction
+
+WHITE_PERCENTILE = 99.9
+"""The preview's white; brighter pixels are shown white too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure."""
+
+    image: Path
+    preview: Path
+    record: Path
+    figure: Path | None = None
+
+    @classmethod
+    def named(cls, out: Path, figure: Path | None = None) -> Outputs:
+        """Return the files that go with ``out``, whose suffix must be ``.tif``.
+
+        Raises
+        ------
+        FileError
+        """
+        if out.suffix.lower() not in (".tif", ".tiff"):
+            raise FileError(
+                out,
+                "a reconstruction is written as float32 TIFF: the name must end in .tif.",
+                "A preview .png and a .json with the settings are written beside it.",
+            )
+        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
+        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure)
+        if figure in outputs.files()[:3]:
+            raise FileError(out.with_suffix(".png"), "is the preview; give the figure another name.")
+        return outputs
+
+    def files(self) -> tuple[Path, ...]:
+        """Return every file that will be written."""
+        return tuple(p for p in (self.image, self.preview, self.record, self.figure) if p is not None)
+
+    def check(self, n_pixels: int, *, overwrite: bool = False) -> None:
+        """Refuse places that cannot be written, or are taken, before the work.
+
+        Raises
+        ------
+        FileError
+        """
+        for path in self.files():
+            check_writable(path, 8 * n_pixels + 1_000_000)
+            if path.exists() and not overwrite:
+                raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
+
+
+def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job) -> None:
+    """Write image, preview and record, each whole or not at all.
+
+    Raises
+    ------
+    FileError, OSError
+        When a file cannot be written (a full disk), naming it.
+    """
+    write_image(outputs.image, result.image)
+    pixels, white = preview(result.image)
+    write_image(outputs.preview, pixels)
+    record = reconstruction_record(result, job) | {
+        "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0}
+    }
+    write_text(outputs.record, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+def preview(image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float]:
+    """Return 8-bit pixels, linear from zero to the white level, and that level in the image's units."""
+    white = float(np.percentile(image, WHITE_PERCENTILE))
+    if white <= 0:
+        white = float(image.max()) if image.max() > 0 else 1.0
+    return np.clip(image * (255.0 / white) + 0.5, 0, 255).astype(np.uint8), white
+
+
+def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
+    """Return all that is known of a reconstruction but its pixels, JSON-compatible."""
+    record = {
+        "program": f"diffuserbench {version('diffuserbench')}",
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "inputs": job.provenance,
+        "method": result.method,
+        "prior": result.prior,
+        "tau": result.tau,
+        "noise_norm": result.noise_norm,
+        "stop_reason": None if result.stop_reason is None else str(result.stop_reason),
+        "iterations": len(result.history),
+        "seconds": result.seconds,
+        "warnings": [*job.warnings, *result.warnings],
+        "grid": asdict(result.grid),
+        "provenance": result.provenance,
+        "history": [asdict(entry) for entry in result.history],
+    }
+    plain: dict[str, Any] = _plain(record)
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """Return the value as JSON can hold it: None for what is not finite, no NumPy types."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

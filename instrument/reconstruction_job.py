@@ -1,0 +1,303 @@
+"""A reconstruction from files, before the work: what goes in, and what was chosen on the way, in words."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from instrument.calibration_file import is_calibration, load_calibration
+from instrument.errors import FileError
+from instrument.images import ImageFile, read_image
+from instrument.preparation import (
+    AUTO_PIXELS,
+    Crop,
+    Dark,
+    FloatImage,
+    auto_binning,
+    bin_image,
+    check_pair,
+    check_psf,
+    dark_from_corners,
+    dark_from_counts,
+    dark_from_file,
+    darkest_block,
+    reduce,
+    saturated_pixels,
+)
+from recon.types import Calibration
+
+DarkChoice = Literal["auto"] | float | Path
+Binning = int | None
+"""Pixels to average along each axis; None chooses automatically."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What :func:`recon.reconstruct` is called with, and how it came about.
+
+    Attributes
+    ----------
+    measurement : ndarray, float32, (height, width) or (height, width, 3)
+    calibration : Calibration
+        On the measurement's pixels.
+    notes : mapping of str to str
+        What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``.
+    warnings : tuple of str
+    provenance : mapping
+        Files with checksums and every setting, JSON-compatible.
+    """
+
+    measurement: FloatImage
+    calibration: Calibration
+    notes: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+
+def job_from_files(
+    psf_path: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+    allow_saturated: bool = False,
+    allow_mixed_depth: bool = False,
+) -> Job:
+    """Prepare a PSF and an image from anywhere.
+
+    Raises
+    ------
+    FileError, BenchError
+        When a file cannot be used, the two do not belong together, or the window or binning does not fit.
+    """
+    psf, image = read_image(psf_path), read_image(image_path)
+    warnings = check_psf(psf, allow_saturated=allow_saturated)
+    check_pair(psf, image, allow_mixed_depth=allow_mixed_depth)
+    level = _dark(dark, psf, image)
+    window = _window(crop, image)
+    factor = auto_binning(window) if binning is None else binning
+    measurement = reduce(image.pixels, level.image, crop, factor)
+    psf_pixels = np.maximum(reduce(psf.pixels, level.psf, crop, factor), 0)
+    if not psf_pixels.any():
+        raise FileError(
+            psf.path,
+            f"nothing of the PSF is left in the window after subtracting {level.reason}.",
+            "See --dark.",
+        )
+    return Job(
+        measurement,
+        _calibration_of(psf_pixels, psf),
+        {
+            "PSF": _describe(psf),
+            "Image": _describe(image),
+            "Dark": level.reason,
+            "Pixels": _describe_window(crop, binning, factor, measurement),
+        },
+        (*warnings, *_image_warnings(image)),
+        {
+            "psf": _source(psf),
+            "image": _source(image),
+            "dark": _dark_record(level),
+            "crop": _crop_record(crop, image),
+            "binning": factor,
+        },
+    )
+
+
+def job_from_calibration(
+    folder: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+) -> Job:
+    """Prepare an image for a calibration folder, or a run folder with one calibration inside.
+
+    An image with a whole multiple of the calibration's pixels is binned to them first; ``crop`` and
+    ``binning`` then act on the pixels of both. Errors as ``job_from_files``.
+    """
+    folder = find_calibration(folder)
+    calibration, image = load_calibration(folder), read_image(image_path)
+    shape = calibration.psfs.shape[-2:]
+    match = _matching_binning(image, shape, folder)
+    if calibration.psfs.shape[1] > 1 and not image.is_colour:
+        raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
+    pixels, level = _calibrated_dark(dark, image, calibration, match)
+    factor = 1 if binning is None else binning
+    measurement = reduce(pixels, level.image, crop, factor)
+    return Job(
+        measurement,
+        _reduced_calibration(calibration, crop, factor),
+        {
+            "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
+            "Image": _describe(image)
+            + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
+            "Dark": level.reason,
+            "Pixels": _describe_window(crop, factor, factor, measurement),
+        },
+        _image_warnings(image),
+        {
+            "calibration": str(folder.resolve()),
+            "image": _source(image),
+            "dark": _dark_record(level),
+            "image_binning": match,
+            "crop": None if crop is None else _slices_record(crop.slices((shape[0], shape[1]))),
+            "binning": factor,
+        },
+    )
+
+
+def find_calibration(folder: Path) -> Path:
+    """Return the calibration folder that ``folder`` is, or the one that it holds.
+
+    Raises
+    ------
+    FileError
+        When there is none, or more than one.
+    """
+    if not folder.is_dir():
+        found = "is no folder" if folder.exists() else "does not exist"
+        raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
+    if is_calibration(folder):
+        return folder
+    inside = sorted(path.parent for path in folder.glob("*/calibration.json"))
+    if len(inside) != 1:
+        found = (
+            f"{len(inside)} calibrations ({', '.join(p.name for p in inside)})"
+            if inside
+            else "no calibration"
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.")
+    return inside[0]
+
+
+# Pieces ------------------------------------------------------------------------------------------------
+def _dark(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
+    if choice == "auto":
+        return dark_from_corners(psf, image)
+    if isinstance(choice, Path):
+        return dark_from_file(read_image(choice), image)
+    return dark_from_counts(choice)
+
+
+def _calibrated_dark(
+    choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int
+) -> tuple[FloatImage, Dark]:
+    """Return the image on the calibration's pixels, and what to subtract there; the PSFs need nothing."""
+    pixels = bin_image(image.pixels, match)
+    if isinstance(choice, Path):
+        dark = dark_from_file(read_image(choice), image)
+        return pixels, replace(dark, image=bin_image(np.asarray(dark.image), match))
+    if choice != "auto":
+        return pixels, dark_from_counts(choice)
+    if calibration.background is not None:
+        background = np.moveaxis(calibration.background, 0, -1)
+        return pixels, Dark(
+            background[..., 0] if background.shape[-1] == 1 else background,
+            0.0,
+            f"the calibration's background (mean {float(background.mean()):.1f} counts)",
+        )
+    darkest = darkest_block(image.pixels)
+    return pixels, Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
+
+
+def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:
+    height, width = image.pixels.shape[:2]
+    factor = height // shape[0]
+    if factor < 1 or (height // factor, width // factor) != tuple(shape):
+        raise FileError(
+            image.path,
+            f"is {image.describe()}, but the PSFs of {folder} are {shape[0]} x {shape[1]}: "
+            "no whole binning brings one to the other.",
+            "Photograph with the region of interest and binning of the calibration.",
+        )
+    return int(factor)
+
+
+def _reduced_calibration(calibration: Calibration, crop: Crop | None, factor: int) -> Calibration:
+    if crop is None and factor == 1:
+        return calibration
+    psfs = np.stack(
+        [np.moveaxis(reduce(np.moveaxis(psf, 0, -1), 0.0, crop, factor), -1, 0) for psf in calibration.psfs]
+    )
+    pitch = calibration.geometry.pixel_pitch_um
+    geometry = replace(calibration.geometry, pixel_pitch_um=None if pitch is None else pitch * factor)
+    return replace(calibration, psfs=psfs, background=None, geometry=geometry)
+
+
+def _calibration_of(psf: FloatImage, file: ImageFile) -> Calibration:
+    channels = np.moveaxis(psf, -1, 0) if psf.ndim == 3 else psf[None]
+    return Calibration(
+        np.ascontiguousarray(channels[None]), np.full((1, 3), np.nan), provenance={"psf": str(file.path)}
+    )
+
+
+def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
+    height, width = image.pixels.shape[:2]
+    if crop is None:
+        return height, width
+    crop.slices((height, width))
+    return crop.height, crop.width
+
+
+def _image_warnings(image: ImageFile) -> tuple[str, ...]:
+    lowest, highest = float(image.pixels.min()), float(image.pixels.max())
+    if lowest == highest:
+        raise FileError(
+            image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"
+        )
+    count = saturated_pixels(image.pixels)
+    if not count:
+        return ()
+    share = count / image.pixels.size
+    return (f"{count} pixels of the image ({share:.2%}) are saturated (at {highest:g}): expect halos there.",)
+
+
+def _describe(file: ImageFile) -> str:
+    return ", ".join((f"{file.path}: {file.describe()}", *file.notes))
+
+
+def _describe_window(crop: Crop | None, asked: Binning, factor: int, result: FloatImage) -> str:
+    window = "whole image" if crop is None else f"window of {crop.height} x {crop.width}"
+    is_automatic = asked is None and factor > 1
+    binned = f"binned {factor} x {factor}" if factor > 1 else "not binned"
+    limit = f"at most {AUTO_PIXELS / 1e6:g} megapixel"
+    why = f" (automatic: {limit}; --bin 1 for all)" if is_automatic else ""
+    return f"{window}, {binned}{why}: {result.shape[0]} x {result.shape[1]}"
+
+
+def _source(file: ImageFile) -> dict[str, Any]:
+    digest = hashlib.sha256(np.ascontiguousarray(file.pixels).data).hexdigest()
+    return {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
+
+
+def _dark_record(dark: Dark) -> dict[str, Any]:
+    values = {
+        name: float(np.mean(value))
+        for name, value in (("image_counts", dark.image), ("psf_counts", dark.psf))
+    }
+    return {**values, "from": dark.reason}
+
+
+def _crop_record(crop: Crop | None, image: ImageFile) -> dict[str, int] | None:
+    if crop is None:
+        return None
+    height, width = image.pixels.shape[:2]
+    return _slices_record(crop.slices((height, width)))
+
+
+def _slices_record(slices: tuple[slice, slice]) -> dict[str, int]:
+    rows, columns = slices
+    return {
+        "top": rows.start,
+        "left": columns.start,
+        "height": rows.stop - rows.start,
+        "width": columns.stop - columns.start,
+    }

@@ -1,0 +1,210 @@
+"""The command line: what it prints, its exit statuses, no traceback for a user's mistake."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from instrument.cli import COMMANDS, main
+
+MOCK_BENCH = """\
+[camera]
+driver = "mock"
+[stage]
+driver = "mock"
+[led_array]
+driver = "mock"
+[slm]
+driver = "mock"
+[scene]
+control = "simulated"
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DIFFUSERBENCH_DEBUG", raising=False)
+    return tmp_path
+
+
+def program(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    code = "import sys; from instrument.cli import main; sys.exit(main())"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        timeout=120,
+        check=False,
+    )
+
+
+# What one can do --------------------------------------------------------------------------------------
+def test_alone_it_says_what_one_can_do(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {name} " in shown for name in COMMANDS)
+    assert "Examples:" in shown
+    assert main(["--help"]) == 0
+    assert capsys.readouterr().out == shown
+
+
+def test_help_imports_nothing_but_the_standard_library() -> None:
+    code = (
+        "import sys; from instrument.cli import main; main(['--help']); "
+        "print(sorted(m for m in ('numpy', 'pydantic', 'typer', 'rich', 'cv2') if m in sys.modules))"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert shown.stdout.endswith("[]\n")
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_each_command_explains_itself_with_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([name, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"Usage: diffuserbench {name}" in shown
+    if "Commands:" not in shown:
+        assert f"diffuserbench {name}" in shown.split("Examples:")[1]
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("diffuserbench ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["snpa"], "no command 'snpa'. Did you mean 'snap'?"),
+        (["--colour"], "no option '--colour'"),
+        (["snap", "--averge", "3"], "--average"),
+        (["snap", "--average", "many"], "--average"),
+        (["snap", "--average", "0"], "--average"),
+        (["snap", "--dark", "--source"], "choose one of"),
+        (["check", "--bench", "absent.toml"], "absent.toml: there is no such file"),
+        (["snap", "--out", "photo.jpg"], "'.jpg' is no format"),
+        (["snap", "--out", "absent/photo.tif"], "absent does not exist"),
+        (["snap", "--out", "a.png", "--average", "2"], "PNG cannot hold"),
+    ],
+)
+def test_mistakes_are_told_in_words_with_status_2(
+    arguments: list[str], told: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    output = capsys.readouterr()
+    assert told in output.err
+    assert "Traceback" not in output.err
+    assert list(here.iterdir()) == []
+
+
+# new ----------------------------------------------------------------------------------------------------
+def test_new_writes_a_file_that_is_understood_and_spares_an_existing_one(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["new"]) == 0
+    assert "SIMULATED" in capsys.readouterr().out
+    assert "[camera]" in (here / "bench.toml").read_text()
+    (here / "bench.toml").write_text("mine")
+    assert main(["new"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (here / "bench.toml").read_text() == "mine"
+    assert main(["new", "--force"]) == 0
+    assert (here / "bench.toml").read_text() != "mine"
+
+
+# check --------------------------------------------------------------------------------------------------
+@pytest.mark.usefixtures("mock_drivers")
+def test_check_reports_every_device_and_ends_dark(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH)
+    assert main(["check"]) == 0
+    shown = capsys.readouterr().out
+    for expected in (
+        "camera: Mock M1",
+        "stage:",
+        "led_array:",
+        "slm:",
+        "SIMULATED",
+        "axis x_um",
+        "Light off",
+    ):
+        assert expected in shown
+
+
+@pytest.mark.usefixtures("mock_drivers")
+def test_check_reports_all_failing_devices_with_status_1(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = MOCK_BENCH.replace('[stage]\ndriver = "mock"', '[stage]\ndriver = "mock"\nfail = ["open"]')
+    broken = broken.replace('[slm]\ndriver = "mock"', '[slm]\ndriver = "mock"\nfail = ["open", "close"]')
+    (here / "bench.toml").write_text(broken)
+    assert main(["check"]) == 1
+    output = capsys.readouterr()
+    assert "stage (mock): open failed. Check the cable." in output.err
+    assert "slm (mock): open failed." in output.err
+    assert "close slm (mock)" in output.err
+    assert "camera: Mock M1" in output.out
+
+
+def test_every_mistake_of_a_bench_file_reaches_the_terminal(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text('[camera]\ndriver = "simulatd"\n[benhc]\n[scene]\ncontrol = 3\n')
+    assert main(["check"]) == 2
+    told = capsys.readouterr().err
+    assert "bench.toml:2: [camera] driver" in told
+    assert "bench.toml:3: [benhc]" in told
+    assert "bench.toml:5: [scene] control" in told
+
+
+# snap ---------------------------------------------------------------------------------------------------
+@pytest.mark.usefixtures("mock_drivers")
+def test_snap_keeps_counts_and_metadata(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH)
+    assert main(["snap", "--out", "photo.tif", "--exposure-ms", "7.5"]) == 0
+    with tifffile.TiffFile(here / "photo.tif") as tiff:
+        assert tiff.asarray().dtype == np.uint16
+        metadata = json.loads(tiff.pages[0].description)
+    assert metadata["exposure_ms"] == 7.5
+    assert metadata["light"] == "scene"
+    assert "SIMULATED" in metadata["bench"]
+    assert "SIMULATED" in capsys.readouterr().err
+    assert main(["snap", "--out", "photo.tif"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["snap", "--out", "mean.npy", "--average", "4", "--source"]) == 0
+    assert np.load(here / "mean.npy").dtype == np.float32
+    assert json.loads((here / "mean.json").read_text())["led_pattern"].startswith("point source")
+
+
+@pytest.mark.usefixtures("mock_drivers")
+@pytest.mark.parametrize(
+    ("fault", "status"),
+    [('fail = ["snap"]', 1), ('interrupt = ["snap"]', 130), ('fail = ["stop_sequence"]', 1)],
+)
+def test_a_failing_camera_leaves_no_file_and_a_dark_bench(
+    fault: str, status: int, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH.replace("[stage]", f"{fault}\n[stage]", 1))
+    assert main(["snap", "--out", "photo.tif"]) == status
+    output = capsys.readouterr()
+    assert "Traceback" not in output.err
+    if status == 1:
+        assert "camera (mock)" in output.err
+    assert (here / "photo.tif").exists() == ("stop_sequence" in fault)
+
+
+def test_the_program_itself_ends_with_the_status_and_without_a_traceback(tmp_path: Path) -> None:
+    ended = program("check", "--bench", "absent.toml", cwd=tmp_path)
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert "Traceback" in program("--debug", "check", "--bench", "absent.toml", cwd=tmp_path).stderr

@@ -1,0 +1,201 @@
+"""PSF and image are matched, dark-subtracted, cropped and binned; what cannot belong together is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from instrument.calibration_file import save_calibration
+from instrument.errors import BenchError, FileError
+from instrument.images import ImageFile, write_image
+from instrument.preparation import (
+    Crop,
+    auto_binning,
+    bin_image,
+    check_pair,
+    check_psf,
+    dark_from_corners,
+    reduce,
+    saturated_pixels,
+)
+from instrument.reconstruction_job import job_from_calibration, job_from_files
+from recon.types import Calibration, Geometry
+
+
+def file(pixels: npt.NDArray[Any], name: str = "file.tif") -> ImageFile:
+    return ImageFile(Path(name), pixels)
+
+
+def psf_pixels(
+    dtype: str = "uint16", offset: int = 34, shape: tuple[int, int] = (60, 80)
+) -> npt.NDArray[Any]:
+    psf = np.full(shape, offset, np.float64)
+    psf[20:40, 30:50] += 100 * np.arange(20)
+    return psf.astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("text", "window"),
+    [
+        ("1,2,3,4", (slice(1, 4), slice(2, 6))),
+        ("10x20", (slice(25, 35), slice(30, 50))),
+        (" 60 x 80 ", (slice(0, 60), slice(0, 80))),
+    ],
+)
+def test_crops(text: str, window: tuple[slice, slice]) -> None:
+    assert Crop.parse(text).slices((60, 80)) == window
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "axb", "-1,0,3,3", "0x5", "1,2,0,4", "1.5x2"])
+def test_a_crop_that_makes_no_sense_is_refused(text: str) -> None:
+    with pytest.raises(BenchError, match="--crop"):
+        Crop.parse(text)
+
+
+@pytest.mark.parametrize("text", ["61x80", "60x81", "1,0,60,80", "0,70,10,11"])
+def test_a_crop_outside_the_image_is_refused(text: str) -> None:
+    with pytest.raises(BenchError, match="60 x 80"):
+        Crop.parse(text).slices((60, 80))
+
+
+def test_binning_is_the_mean_and_leaves_out_the_rest() -> None:
+    image = np.arange(35, dtype=np.uint16).reshape(5, 7)
+    binned = bin_image(image, 2)
+    assert binned.dtype == np.float32
+    assert binned.shape == (2, 3)
+    assert binned[0, 0] == (0 + 1 + 7 + 8) / 4
+    colour = np.stack([image, 2 * image, 3 * image], axis=-1)
+    np.testing.assert_allclose(bin_image(colour, 2)[..., 2], 3 * binned)
+    with pytest.raises(BenchError, match="--bin 6"):
+        bin_image(image, 6)
+
+
+@pytest.mark.parametrize(("shape", "factor"), [((480, 640), 1), ((1200, 1600), 2), ((2160, 2560), 4)])
+def test_automatic_binning(shape: tuple[int, int], factor: int) -> None:
+    assert auto_binning(shape) == factor
+
+
+def test_reduce_subtracts_first_and_keeps_negative_values() -> None:
+    image = np.array([[10, 30], [30, 50], [9, 9]], np.uint16)
+    assert reduce(image, 40.0, Crop(0, 0, 2, 2), 2).tolist() == [[-10.0]]
+    dark = np.array([[10, 30], [30, 50], [0, 0]], np.float32)
+    assert reduce(image, dark, Crop(0, 0, 2, 2), 1).tolist() == [[0, 0], [0, 0]]
+
+
+def test_raw_frames_of_one_camera_share_the_offset_of_the_psfs_darkest_corner() -> None:
+    psf, image = psf_pixels(), psf_pixels() + np.uint16(500)
+    psf[:20, :20] += np.uint16(7)
+    dark = dark_from_corners(file(psf), file(image))
+    assert dark.image == dark.psf == 34
+    assert "estimated" in dark.reason
+
+
+def test_a_float_psf_tells_nothing_about_the_images_offset() -> None:
+    dark = dark_from_corners(file(psf_pixels("float32", 0) / 10), file(psf_pixels(offset=100)))
+    assert (dark.image, dark.psf) == (100, 0)
+
+
+def test_an_image_darker_than_the_psfs_corners_keeps_its_own_offset() -> None:
+    dark = dark_from_corners(file(psf_pixels(offset=300)), file(psf_pixels(offset=20)))
+    assert (dark.image, dark.psf) == (20, 300)
+
+
+@pytest.mark.parametrize(
+    ("psf", "image", "pattern"),
+    [
+        (psf_pixels(), psf_pixels(shape=(60, 90)), "both must have one shape"),
+        (psf_pixels(), psf_pixels(shape=(80, 60)), "may be rotated"),
+        (np.dstack([psf_pixels()] * 3), psf_pixels(), "the PSF is colour"),
+        (psf_pixels() // 20, psf_pixels(), None),
+        ((psf_pixels() // 20).astype(np.uint8), psf_pixels(), "8 bit, but the image .* 16 bit"),
+        (psf_pixels("float32"), psf_pixels(), None),
+        (psf_pixels(), np.dstack([psf_pixels()] * 3), None),
+    ],
+)
+def test_pairs(psf: npt.NDArray[Any], image: npt.NDArray[Any], pattern: str | None) -> None:
+    if pattern is None:
+        check_pair(file(psf), file(image))
+    else:
+        with pytest.raises(FileError, match=pattern):
+            check_pair(file(psf), file(image))
+
+
+def test_mixed_depth_is_accepted_when_meant() -> None:
+    check_pair(file((psf_pixels() // 20).astype(np.uint8)), file(psf_pixels()), allow_mixed_depth=True)
+
+
+@pytest.mark.parametrize(
+    ("psf", "pattern"),
+    [(np.zeros((9, 9), np.uint8), "empty"), (np.full((9, 9), 7, np.uint8), "every pixel is 7")],
+)
+def test_a_psf_without_content_is_refused(psf: npt.NDArray[Any], pattern: str) -> None:
+    with pytest.raises(FileError, match=pattern):
+        check_psf(file(psf))
+
+
+@pytest.mark.parametrize("full_scale", [255, 1023, 4095, 65520, 65535])
+def test_a_saturated_psf_is_refused_unless_allowed(full_scale: int) -> None:
+    psf = np.minimum(psf_pixels(offset=0).astype(np.int64) * 40, full_scale).astype(np.uint16)
+    with pytest.raises(FileError, match=rf"saturated \(at {full_scale}\).*shorter exposure"):
+        check_psf(file(psf))
+    assert "saturated" in check_psf(file(psf), allow_saturated=True)[0]
+
+
+def test_a_few_saturated_pixels_are_a_warning_and_a_single_bright_one_is_none() -> None:
+    psf = psf_pixels().astype(np.uint16)
+    psf[20, 30:32] = 4095
+    psf[25:40, 30:50] = 3500
+    (warning,) = check_psf(file(psf))
+    assert warning.startswith("2 pixels")
+    psf[20, 31] = 0
+    assert saturated_pixels(psf) == 0
+
+
+def test_job_from_files_says_what_was_chosen(tmp_path: Path) -> None:
+    write_image(tmp_path / "psf.tif", psf_pixels())
+    write_image(tmp_path / "raw.tif", psf_pixels(offset=134))
+    job = job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", crop=Crop.parse("40x40"), binning=2)
+    assert job.measurement.shape == (20, 20)
+    assert job.calibration.psfs.shape == (1, 1, 20, 20)
+    assert job.calibration.psfs.min() == 0
+    assert "34.0 counts" in job.notes["Dark"]
+    assert job.notes["Pixels"] == "window of 40 x 40, binned 2 x 2: 20 x 20"
+    assert job.provenance["crop"] == {"top": 10, "left": 20, "height": 40, "width": 40}
+    assert job.provenance["psf"]["path"] == str(tmp_path / "psf.tif")
+
+
+def test_a_psf_that_vanishes_with_the_dark_is_refused(tmp_path: Path) -> None:
+    write_image(tmp_path / "psf.tif", psf_pixels())
+    write_image(tmp_path / "raw.tif", psf_pixels())
+    with pytest.raises(FileError, match="nothing of the PSF is left"):
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=60000.0)
+    write_image(tmp_path / "dark.tif", np.zeros((9, 9), np.uint16))
+    with pytest.raises(FileError, match=r"dark frame is 9 x 9"):
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=tmp_path / "dark.tif")
+
+
+def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
+    psfs = np.stack([bin_image(psf_pixels(offset=0), 2)] * 2)[:, None]
+    background = np.full((1, 30, 40), 34, np.float32)
+    positions = np.array([[0, 0, 1e4], [0, 0, 2e4]], np.float64)
+    calibration = Calibration(psfs, positions, background, Geometry(pixel_pitch_um=4.0))
+    save_calibration(calibration, tmp_path / "run" / "calibration")
+    write_image(tmp_path / "raw.tif", psf_pixels())
+    job = job_from_calibration(tmp_path / "run", tmp_path / "raw.tif", binning=2)
+    assert job.measurement.shape == job.calibration.psfs.shape[-2:] == (15, 20)
+    np.testing.assert_allclose(job.measurement, job.calibration.psfs[0, 0], atol=1e-3)
+    assert job.calibration.geometry.pixel_pitch_um == 8.0
+    write_image(tmp_path / "other.tif", psf_pixels(shape=(50, 80)))
+    with pytest.raises(FileError, match="no whole binning"):
+        job_from_calibration(tmp_path / "run", tmp_path / "other.tif")
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("absent", "does not exist"), (".", "no calibration")])
+def test_a_folder_without_a_calibration_is_refused(tmp_path: Path, name: str, pattern: str) -> None:
+    write_image(tmp_path / "raw.tif", psf_pixels())
+    with pytest.raises(FileError, match=pattern):
+        job_from_calibration(tmp_path / name, tmp_path / "raw.tif")
