@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
@@ -37,7 +39,7 @@ class Convolution3D(LinearOperator):
     field_shape, grid_shape, centre, corner
         As in ``PadCropConvolution``.
     spectrum : ndarray, complex, (n_channels or 1, n_z, grid_height, grid_width // 2 + 1)
-        Transfer functions.
+        Transfer functions; a volume of memory, taken when they are first needed.
     """
 
     def __init__(
@@ -60,7 +62,8 @@ class Convolution3D(LinearOperator):
         psf_shape = psfs.shape[2:]
         self.sensor_shape = (int(sensor_shape[0]), int(sensor_shape[1]))
         self.field_shape = tuple(s + p - 1 for s, p in zip(self.sensor_shape, psf_shape, strict=True))
-        self.grid_shape = fft.fast_shape(self.field_shape)
+        height, width = fft.fast_shape(self.field_shape)
+        self.grid_shape = (height, width)
         self.corner = (psf_shape[0] - 1, psf_shape[1] - 1)
         self.centre = (
             self.sensor_shape[0] // 2 + psf_shape[0] - 1 - psf_shape[0] // 2,
@@ -68,25 +71,34 @@ class Convolution3D(LinearOperator):
         )
         n_z = len(psfs)
         super().__init__((n_channels, n_z, *self.grid_shape), (n_channels, *self.sensor_shape), dtype)
-        self.spectrum = np.empty(
-            (psfs.shape[1], n_z, *fft.spectrum_shape(self.grid_shape)), fft.complex_dtype(self.dtype)
-        )
-        padded = np.zeros(self.grid_shape, self.dtype)
-        for channel in range(psfs.shape[1]):
-            for z in range(n_z):
-                padded[: psf_shape[0], : psf_shape[1]] = psfs[z, channel]
-                fft.rfft(padded, out=self.spectrum[channel, z])
+        self._psfs = psfs
         self.groups = PlaneGroups(n_z)
-        plane = fft.spectrum_shape(self.grid_shape)
-        self._sums = np.empty((self.groups.count, *plane), self.spectrum.dtype)
-        self._scratch = np.empty((self.groups.count, *plane), self.spectrum.dtype)
         self._work = np.empty(self.grid_shape, self.dtype)
-        self._norm_bound = float(np.sqrt(max(float(self.power(c).max()) for c in range(psfs.shape[1]))))
+
+    def transfer_plane(self, z: int, channel: int = 0, out: Array | None = None) -> Array:
+        """Return the transfer function of one depth, computed from its PSF."""
+        psf = self._psfs[z, channel]
+        self._work[...] = 0
+        self._work[: psf.shape[0], : psf.shape[1]] = psf
+        return fft.rfft(self._work, out=out)
+
+    @cached_property
+    def spectrum(self) -> Array:
+        """Transfer functions of all depths; computed when first needed and then kept."""
+        n_z, channels = self._psfs.shape[:2]
+        spectrum = np.empty(
+            (channels, n_z, *fft.spectrum_shape(self.grid_shape)), fft.complex_dtype(self.dtype)
+        )
+        for channel in range(channels):
+            for z in range(n_z):
+                self.transfer_plane(z, channel, spectrum[channel, z])
+        return spectrum
 
     def power(self, channel: int = 0) -> Array:
         """``sum_z |H_z|^2`` of one channel: eigenvalues of ``A A^H`` before the crop."""
-        total = np.zeros(self.spectrum.shape[2:], self.dtype)
-        for H in self.spectrum[channel]:
+        total = np.zeros(fft.spectrum_shape(self.grid_shape), self.dtype)
+        for z in range(self.domain_shape[1]):
+            H = self.transfer_plane(z, channel)
             total += H.real**2 + H.imag**2
         return total
 
@@ -108,16 +120,19 @@ class Convolution3D(LinearOperator):
         if out is None:
             out = np.empty(self.range_shape, self.dtype)
         x = np.ascontiguousarray(x, self.dtype).reshape(self.domain_shape)
+        plane = fft.spectrum_shape(self.grid_shape)
         for channel, volume in enumerate(x):
             H = self.channel_spectrum(channel)
-            self._sums[...] = 0
+            sums = np.zeros((self.groups.count, *plane), H.dtype)
 
-            def job(group: int, z0: int, z1: int, volume: Array = volume, H: Array = H) -> None:
-                kernels.forward_planes(volume, H, self._sums[group], self._scratch[group], z0, z1)
+            def job(
+                group: int, z0: int, z1: int, volume: Array = volume, H: Array = H, sums: Array = sums
+            ) -> None:
+                kernels.forward_planes(volume, H, sums[group], np.empty(plane, H.dtype), z0, z1)
 
             self.groups.run(job)
-            total = self._sums[0]
-            for other in self._sums[1:]:
+            total = sums[0]
+            for other in sums[1:]:
                 total += other
             out[channel] = fft.irfft(total, self.grid_shape[1], out=self._work)[self.sensor_window]
         return out
@@ -128,7 +143,7 @@ class Convolution3D(LinearOperator):
 
         if out is None:
             out = np.empty(self.domain_shape, self.dtype)
-        E = self._sums[0]
+        E = np.empty(fft.spectrum_shape(self.grid_shape), fft.complex_dtype(self.dtype))
         for channel in range(self.domain_shape[0]):
             H = self.channel_spectrum(channel)
             self._work[...] = 0
@@ -136,13 +151,13 @@ class Convolution3D(LinearOperator):
             fft.rfft(self._work, out=E)
             volume = out[channel]
 
-            def job(group: int, z0: int, z1: int, volume: Array = volume, H: Array = H) -> None:
-                kernels.adjoint_planes(E, H, volume, self._scratch[group], z0, z1)
+            def job(_: int, z0: int, z1: int, volume: Array = volume, H: Array = H) -> None:
+                kernels.adjoint_planes(E, H, volume, np.empty_like(E), z0, z1)
 
             self.groups.run(job)
         return out
 
-    @property
+    @cached_property
     def norm_bound(self) -> float:
         """``sqrt(max sum_z |H_z|^2)``: cropping can only lessen the norm of the circular sum."""
-        return self._norm_bound
+        return float(np.sqrt(max(float(self.power(c).max()) for c in range(self._psfs.shape[1]))))

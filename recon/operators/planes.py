@@ -24,6 +24,7 @@ class PlaneGroups:
         self.n_planes = n_planes
         self.count = min(GROUPS, n_planes)
         self.edges: npt.NDArray[np.int64] = np.arange(self.count + 1) * n_planes // max(self.count, 1)
+        self.of_plane = np.repeat(np.arange(self.count), np.diff(self.edges))
 
     def run(self, job: Callable[[int, int, int], object]) -> None:
         """Call ``job(group, first_plane, last_plane + 1)`` for every group, on as many workers as allowed."""

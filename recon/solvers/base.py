@@ -69,7 +69,7 @@ class Solver(ABC):
         check = StopCheck(rules or StoppingRules())
         history: list[IterationRecord] = []
         reason: StopReason | None = None
-        start = self.solution.copy()
+        start = self._start()
         seconds = 0.0
         while reason is None:
             began = time.perf_counter()
@@ -83,10 +83,19 @@ class Solver(ABC):
                 callback(self, record)
             if reason is None and cancel is not None and cancel.is_set():
                 reason = StopReason.CANCELLED
-        solution = self.solution
-        if not np.isfinite(solution).all():
-            reason, solution = StopReason.NOT_FINITE, start
-        return Outcome(solution.copy(), tuple(history), reason, seconds)
+        solution = self._end()
+        # One number is enough to find a NaN or an infinity, and takes no second array.
+        if not np.isfinite(np.sum(solution, dtype=np.float64)):
+            reason, solution = StopReason.NOT_FINITE, np.zeros_like(solution) if start is None else start
+        return Outcome(solution, tuple(history), reason, seconds)
+
+    def _start(self) -> Array | None:
+        """Return what to fall back on if the iterate is lost; None (zeros) where memory is dear."""
+        return self.solution.copy()
+
+    def _end(self) -> Array:
+        """Return the result, which is the caller's from then on."""
+        return self.solution.copy()
 
     def checkpoint(self) -> dict[str, Any]:
         """Return a copy of the state: arrays and numbers by name, to be kept and given to :meth:`restore`."""
