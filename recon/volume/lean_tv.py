@@ -12,7 +12,7 @@ Solves ``min_{x >= 0} 1/2 ||b - A x||^2 + tau ||Psi x||_1`` (Kuo 2020, Eq. 4.2),
 * Split variable and multiplier are kept as one state. With ``s = Psi x + eta / mu``, ``u = shrink(s)`` and
   ``eta / mu = s - u``, an over-relaxed iteration is ``s <- s + alpha (Psi x - u)``.
 
-An iteration is one sweep over planes (states, right-hand side r, its transform R, and its sum with ``conj(g)``),
+An iteration is one sweep over planes (states, right-hand side r, transform R, sum with ``conj(g)``),
 one solve on the sensor plane, and one sweep over spectral rows, ``X <- T^-1 R + g E``, where
 ``g = T^-1 M^H``. Six volumes are kept: X (which R overwrites), g and four states.
 
