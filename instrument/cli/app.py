@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -75,3 +76,19 @@ def operator() -> Callable[[str], None] | None:
             raise KeyboardInterrupt  # end of input: nobody is there any more
 
     return ask
+
+
+@contextmanager
+def saying_what_is_left(*files: Path) -> Iterator[None]:
+    """Let an interruption (Ctrl-C, SIGTERM) say which of the files to be written are there."""
+    before = {file: _changed_ns(file) for file in files}
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit) as interruption:
+        written = [str(file) for file in files if _changed_ns(file) != before[file]]
+        interruption.add_note(f"Written: {', '.join(written)}." if written else "Nothing was written.")
+        raise
+
+
+def _changed_ns(file: Path) -> int | None:
+    return file.stat().st_mtime_ns if file.exists() else None

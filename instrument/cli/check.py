@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import cast
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -36,7 +37,7 @@ def check(bench: BenchOption = None) -> None:
         for kind in opened.devices:
             try:
                 device = opened.open_device(kind)
-                console.print(_table(kind, device))
+                _print(console, kind, device)
             except DeviceError as error:
                 failures.append(str(error))
         label = opened.label
@@ -54,10 +55,11 @@ def check(bench: BenchOption = None) -> None:
     console.print("Light off, nothing moving, devices closed.")
 
 
-def _table(kind: str, device: Device) -> Table:
+def _print(console: Console, kind: str, device: Device) -> None:
     identity = device.identity
     mark = "  SIMULATED" if identity.simulated else ""
-    table = Table(title=f"{kind}: {identity.vendor} {identity.model}{mark}", title_justify="left")
+    console.print(f"{kind}: {identity.vendor} {identity.model}{mark}", markup=False, style="bold")
+    table = Table(show_header=False, box=box.ROUNDED)
     table.add_column("what", no_wrap=True)
     table.add_column("value", overflow="fold")
     table.add_row("driver", identity.driver)
@@ -68,7 +70,7 @@ def _table(kind: str, device: Device) -> Table:
     table.add_section()
     for name, value in _limits(device):
         table.add_row(name, value)
-    return table
+    console.print(table)
 
 
 def _flat(settings: Mapping[str, Setting]) -> Iterator[tuple[str, str]]:

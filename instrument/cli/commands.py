@@ -24,4 +24,7 @@ COMMANDS: Mapping[str, Command] = {
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
     "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
     "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
+    "reconstruct": Command(
+        RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"
+    ),
 }

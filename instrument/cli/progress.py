@@ -15,6 +15,7 @@ from rich.progress import (
 
 def progress_bar() -> Progress:
     """Return a bar to be used as a context; tasks may have a field ``note``, shown at the end of the line."""
+    console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -23,6 +24,7 @@ def progress_bar() -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
-        console=Console(stderr=True),
+        console=console,
         transient=True,
+        disable=not console.is_terminal,
     )

@@ -16,6 +16,7 @@ import typer
 from drivers.errors import DeviceError
 from instrument.cli.commands import Command
 from instrument.errors import BenchError
+from recon.errors import InputError
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
@@ -64,6 +65,9 @@ def report(error: BaseException) -> int:
     if isinstance(error, DeviceError):
         _say(str(error), error)
         return 1
+    if isinstance(error, InputError):
+        _say(str(error), error)
+        return 2
     if isinstance(error, OSError) and (sentence := _file_trouble(error)):
         _say(sentence, error)
         return 2

@@ -13,7 +13,7 @@ import typer
 
 from instrument.atomic import check_writable
 from instrument.bench import Bench, Snapshot
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import BenchOption, command_app, examples, open_and_say, saying_what_is_left
 from instrument.cli.progress import progress_bar
 from instrument.errors import FileError
 from instrument.images import check_suffix, side_car, write_image
@@ -75,7 +75,7 @@ def snap(
     light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark})
     target = out or Path(f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif")
     _check_target(target, average, force=force)
-    with open_and_say(bench) as opened:
+    with saying_what_is_left(target), open_and_say(bench) as opened:
         if exposure_ms is not None:
             opened.camera.set_exposure_ms(exposure_ms)
         if gain is not None:

@@ -1,0 +1,54 @@
+"""The summary figure of a reconstruction from files: PSF, photograph, picture, convergence, settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.atomic import whole_file
+from instrument.figures import Convergence, Panel, Summary, save_figure, summary_figure
+from instrument.reconstruction_job import Job
+from recon.result import Reconstruction
+
+
+def write_figure(path: Path, result: Reconstruction, job: Job) -> None:
+    """Draw the figure and write it whole or not at all, in the format of the suffix.
+
+    Raises
+    ------
+    FileError, OSError
+        When it cannot be written.
+    """
+    with whole_file(path) as temporary:
+        save_figure(summary_figure(_summary(result, job)), temporary)
+
+
+def _summary(result: Reconstruction, job: Job) -> Summary:
+    psf = np.moveaxis(job.calibration.psfs[0], 0, -1)
+    height, width = result.image.shape[:2]
+    panels = (
+        Panel("PSF", _shown(psf[..., 0] if psf.shape[-1] == 1 else psf), gamma=0.5, caption="square root"),
+        Panel("Photograph", _shown(job.measurement), caption="dark level subtracted"),
+        Panel("Reconstruction", _shown(result.image), caption=f"{height} x {width}"),
+    )
+    facts = [("method", result.method), ("prior", result.prior)]
+    if result.tau is not None:
+        facts.append(("tau", f"{result.tau:.3g}"))
+    if result.stop_reason is not None:
+        facts.append(("stopped", str(result.stop_reason)))
+    facts.append(("time", f"{result.seconds:.1f} s"))
+    return Summary("Reconstruction", panels, _convergence(result), lines=facts)
+
+
+def _shown(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    return np.maximum(image, 0)
+
+
+def _convergence(result: Reconstruction) -> Convergence:
+    known = [(r.seconds, float(np.log10(r.change))) for r in result.history if r.change > 0]
+    if not known:
+        return Convergence((), (), "one shot: no iterations")
+    seconds, changes = zip(*known, strict=True)
+    return Convergence(seconds, changes, "log10 of the relative change per iteration")

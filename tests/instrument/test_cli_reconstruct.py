@@ -1,0 +1,298 @@
+"""``diffuserbench reconstruct``: files from anywhere to a picture; every unusable input in words."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+import tifffile
+from scipy.signal import convolve2d
+
+from instrument.calibration_file import save_calibration
+from instrument.cli import main
+from instrument.images import write_image
+from recon.types import Calibration, Geometry
+
+RNG = np.random.default_rng(3)
+SHAPE = (48, 64)
+OFFSET = 20
+SOURCES = ((20, 25), (30, 45))
+
+
+def psf_image() -> npt.NDArray[np.float64]:
+    psf = np.zeros(SHAPE)
+    psf[16:32, 22:42] = RNG.random((16, 20)) ** 8
+    return psf
+
+
+PSF = psf_image()
+
+
+def photograph() -> npt.NDArray[np.float64]:
+    """Points of light seen by the camera, by plain summation in space."""
+    scene = np.zeros(SHAPE)
+    for row, column in SOURCES:
+        scene[row, column] = 1
+    full = convolve2d(scene, PSF)
+    top, left = SHAPE[0] // 2, SHAPE[1] // 2
+    return full[top : top + SHAPE[0], left : left + SHAPE[1]]
+
+
+def counts(image: npt.NDArray[Any], scale: float, dtype: str) -> npt.NDArray[Any]:
+    return np.asarray(np.round(image / PSF.max() * scale) + OFFSET, dtype)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DIFFUSERBENCH_DEBUG", raising=False)
+    write_image("psf.tif", counts(PSF, 30000, "uint16"))
+    write_image("raw.tif", counts(photograph(), 20000, "uint16"))
+    return tmp_path
+
+
+QUICK = ("--iterations", "30", "--out", "out.tif")
+
+
+def brightest(image: npt.NDArray[Any]) -> set[tuple[int, int]]:
+    grey = image.mean(axis=-1) if image.ndim == 3 else image
+    order = np.argsort(grey, axis=None)[-2:]
+    return {(int(row), int(column)) for row, column in np.transpose(np.unravel_index(order, grey.shape))}
+
+
+def test_files_to_a_picture_with_everything_said(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", *QUICK, "--figure", "fig.png"]) == 0
+    picture = tifffile.imread(here / "out.tif")
+    assert picture.dtype == np.float32
+    assert picture.shape == SHAPE
+    assert brightest(picture) == set(SOURCES)
+    record = json.loads((here / "out.json").read_text())
+    assert record["method"] == "admm"
+    assert record["inputs"]["dark"]["image_counts"] == OFFSET
+    assert len(record["history"]) == record["iterations"]
+    preview = cv2.imread(str(here / "out.png"), cv2.IMREAD_UNCHANGED)
+    assert preview.dtype == np.uint8
+    assert (here / "fig.png").stat().st_size > 10_000
+    shown = capsys.readouterr().out
+    for chosen in (
+        "48 x 64 grey uint16",
+        "20.0 counts from both",
+        "not binned",
+        "admm, prior tv, tau",
+        "Wrote",
+    ):
+        assert chosen in shown
+    assert sorted(p.name for p in here.iterdir()) == [
+        "fig.png", "out.json", "out.png", "out.tif", "psf.tif", "raw.tif",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("suffix", "dtype"), [(".png", "uint16"), (".npy", "float32"), (".bmp", "uint8")])
+@pytest.mark.parametrize("colour", [False, True], ids=["grey", "colour"])
+def test_any_format_depth_and_colour(here: Path, suffix: str, dtype: str, colour: bool) -> None:
+    scale = 200 if dtype == "uint8" else 20000
+    psf, raw = counts(PSF, scale, dtype), counts(photograph(), scale, dtype)
+    if colour:
+        raw = np.stack([raw, OFFSET + (raw - OFFSET) // 2, OFFSET + (raw - OFFSET) // 4], axis=-1).astype(
+            dtype
+        )
+    for name, image in (("p", psf), ("r", raw)):
+        if suffix == ".npy":
+            np.save(here / f"{name}.npy", image)
+        else:
+            cv2.imwrite(str(here / f"{name}{suffix}"), image[..., ::-1] if image.ndim == 3 else image)
+    assert main(["reconstruct", "--psf", f"p{suffix}", "--image", f"r{suffix}", *QUICK]) == 0
+    picture = tifffile.imread(here / "out.tif")
+    assert picture.shape == ((*SHAPE, 3) if colour else SHAPE)
+    assert brightest(picture) == set(SOURCES)
+    if colour:
+        totals = picture.sum(axis=(0, 1))
+        assert totals[0] > 1.5 * totals[1] > 2 * totals[2]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--method", "fista", "--prior", "l1", "--time", "0.2"),
+        ("--method", "wiener"),
+        ("--method", "admm", "--prior", "nonnegative", "--tolerance", "1e-2"),
+        ("--dark", "20", "--tau", "0.001", "--iterations", "10"),
+        ("--dark", "dark.tif", "--bin", "2", "--iterations", "10"),
+        ("--crop", "40x40", "--iterations", "10"),
+    ],
+    ids=" ".join,
+)
+def test_options(here: Path, options: tuple[str, ...]) -> None:
+    write_image(here / "dark.tif", np.full(SHAPE, OFFSET, np.uint16))
+    assert main(["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", *options, "--out", "out.tif"]) == 0
+    assert np.isfinite(tifffile.imread(here / "out.tif")).all()
+
+
+def test_a_calibration_folder_in_place_of_a_psf(here: Path) -> None:
+    psfs = np.stack([PSF, PSF[::-1]])[:, None].astype(np.float32)
+    positions = np.array([[0, 0, 1e4], [0, 0, 3e4]], np.float64)
+    save_calibration(Calibration(psfs, positions, None, Geometry(4.0, 2.0)), here / "run" / "calibration")
+    calibrated = ["reconstruct", "--calibration", "run", "--image", "raw.tif", "--dark", "20", *QUICK]
+    assert main([*calibrated, "--z-mm", "11"]) == 0
+    assert brightest(tifffile.imread(here / "out.tif")) == set(SOURCES)
+    assert main([*calibrated, "--force"]) == 2  # two PSFs, and no depth to choose by
+
+
+def make_bad_files(folder: Path) -> None:
+    (folder / "text.tif").write_text("no image")
+    (folder / "folder").mkdir()
+    write_image(folder / "small.tif", np.arange(100, dtype=np.uint16).reshape(10, 10))
+    write_image(folder / "zero.tif", np.zeros(SHAPE, np.uint16))
+    write_image(folder / "flat.tif", np.full(SHAPE, 500, np.uint16))
+    write_image(folder / "colour.tif", np.dstack([counts(PSF, 30000, "uint16")] * 3))
+    write_image(folder / "eight.png", counts(PSF, 200, "uint8"))
+    write_image(folder / "burnt.tif", np.minimum(counts(PSF, 30000, "uint16"), 4095))
+    broken = PSF.copy()
+    broken[3, 4] = np.nan
+    np.save(folder / "nan.npy", broken)
+    (folder / "taken.tif").write_bytes(b"precious")
+
+
+BAD = {
+    "absent psf": (["--psf", "absent.tif"], "absent.tif: there is no such file"),
+    "absent image": (["--image", "absent.tif"], "absent.tif: there is no such file"),
+    "folder": (["--psf", "folder"], "folder: is a folder"),
+    "no image": (["--psf", "text.tif"], "text.tif: is no image"),
+    "shape": (["--psf", "small.tif"], "10 x 10 grey uint16, but the image raw.tif is 48 x 64"),
+    "empty": (["--psf", "zero.tif"], "zero.tif: the PSF is empty"),
+    "constant": (["--psf", "flat.tif"], "flat.tif: the PSF is constant"),
+    "channels": (["--psf", "colour.tif"], "colour.tif: the PSF is colour"),
+    "bit depth": (["--psf", "eight.png"], "8 bit, but the image raw.tif has 16 bit"),
+    "saturated": (["--psf", "burnt.tif"], "are saturated (at 4095)"),
+    "nan psf": (["--psf", "nan.npy"], "no finite numbers"),
+    "nan image": (["--image", "nan.npy"], "no finite numbers"),
+    "black image": (["--image", "zero.tif"], "zero.tif: the image is constant"),
+    "crop": (["--crop", "100x100"], "--crop asks for 100 x 100"),
+    "crop text": (["--crop", "middle"], "TOP,LEFT,HEIGHT,WIDTH"),
+    "bin": (["--bin", "0"], "--bin '0'"),
+    "bin too large": (["--bin", "100"], "--bin 100"),
+    "dark": (["--dark", "absent.tif"], "absent.tif: there is no such file"),
+    "dark shape": (["--dark", "small.tif"], "the dark frame is 10 x 10"),
+    "dark nan": (["--dark", "nan"], "finite"),
+    "method": (["--method", "magic"], "magic"),
+    "prior": (["--prior", "magic"], "magic"),
+    "tau": (["--tau", "-1"], "tau"),
+    "wiener": (["--method", "wiener", "--iterations", "3"], "one shot"),
+    "iterations": (["--iterations", "0"], "--iterations"),
+    "time": (["--time", "-1"], "--time"),
+    "out suffix": (["--out", "out.jpg"], "out.jpg: a reconstruction is written as float32 TIFF"),
+    "out folder": (["--out", "absent/out.tif"], "absent does not exist"),
+    "out is folder": (["--out", "folder"], "folder"),
+    "out taken": (["--out", "taken.tif"], "taken.tif: exists already"),
+    "figure": (["--figure", "fig.doc"], "fig.doc: a figure is written as"),
+    "both": (["--calibration", "folder"], "either --psf FILE or --calibration"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_unusable_input_is_refused_in_one_sentence_and_nothing_is_written(
+    case: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_bad_files(here)
+    before = sorted(p.name for p in here.rglob("*"))
+    options, told = BAD[case]
+    arguments = {"--psf": "psf.tif", "--image": "raw.tif", "--out": "out.tif", "--iterations": "5"}
+    if "wiener" in options or "--iterations" in options:
+        del arguments["--iterations"]
+    arguments |= dict(zip(options[::2], options[1::2], strict=True))
+    assert main(["reconstruct", *(word for pair in arguments.items() for word in pair)]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert "Traceback" not in error
+    assert sorted(p.name for p in here.rglob("*")) == before
+    assert (here / "taken.tif").read_bytes() == b"precious"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "locked").mkdir(mode=0o500)
+    assert main(["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", "--out", "locked/out.tif"]) == 2
+    assert "no permission" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_told_before_the_work(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.statvfs
+
+    def nearly_full(path: Any) -> os.statvfs_result:
+        values = list(real(path))
+        values[4] = 1  # f_bavail
+        return os.statvfs_result(values)
+
+    monkeypatch.setattr(os, "statvfs", nearly_full)
+    assert main(["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", *QUICK]) == 2
+    assert "are free on its disk" in capsys.readouterr().err
+    assert not (here / "out.tif").exists()
+
+
+def test_ctrl_c_keeps_the_picture_so_far(here: Path) -> None:
+    code = "import sys; from instrument.cli import main; sys.exit(main())"
+    words = ["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", "--out", "out.tif", "--tolerance", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-c", code, *words, "--iterations", "100000000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=here,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    try:
+        assert process.stdout is not None
+        while not process.stdout.readline().startswith("Pixels"):
+            pass
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "the picture so far" in error
+    record = json.loads((here / "out.json").read_text())
+    assert record["stop_reason"] == "cancelled"
+    assert tifffile.imread(here / "out.tif").shape == SHAPE
+
+
+def hand_folder() -> Path:
+    named = os.environ.get("DIFFUSERBENCH_DATA")
+    return (Path(named) if named else Path(__file__).parents[3] / "shared" / "data") / "diffusercam_hand"
+
+
+@pytest.mark.skipif(
+    not hand_folder().is_dir(), reason=f"{hand_folder()} is absent; DIFFUSERBENCH_DATA may name its parent"
+)
+def test_the_hand_is_a_hand_with_five_fingers_on_black(here: Path) -> None:
+    data = hand_folder()
+    psf, raw = data / "psf_sample.tif", data / "rawdata_hand_sample.tif"
+    words = ["reconstruct", "--psf", str(psf), "--image", str(raw), "--bin", "4", "--out", "hand.tif"]
+    assert main([*words, "--iterations", "100"]) == 0
+    hand = tifffile.imread(here / "hand.tif")
+    assert hand.shape == (300, 400)
+    white = np.percentile(hand, 99.9)
+    assert 0.04 < np.mean(hand > 0.1 * white) < 0.15, "a hand covers part of the picture"
+    assert hand[hand < 0.08 * white].mean() < 0.01 * white, "on black"
+    # A strip through the picture's columns crosses four fingers, one through its rows the thumb.
+    assert count_runs(hand[:, 282:292].mean(axis=1) > 0.08 * white) == 4
+    assert count_runs(hand[78:88, :].mean(axis=0) > 0.08 * white) == 1
+
+
+def count_runs(line: npt.NDArray[np.bool_]) -> int:
+    """Return how many runs of at least 3 lit pixels a line has."""
+    edges = np.diff(np.concatenate([[0], line.astype(int), [0]]))
+    lengths = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
+    return int(np.count_nonzero(lengths >= 3))
