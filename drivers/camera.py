@@ -145,6 +145,17 @@ class Camera(Device):
         roi = self.roi
         return (roi.height // self.binning, roi.width // self.binning)
 
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """Shape of the frames that the present settings give, colour channels included."""
+        colour = self.pixel_format.startswith(("RGB", "BGR"))
+        return (*self.image_shape, 3) if colour else self.image_shape
+
+    @property
+    def frame_dtype(self) -> np.dtype[np.uint8] | np.dtype[np.uint16]:
+        """Type of the counts that the present pixel format gives."""
+        return np.dtype(np.uint8) if self.significant_bits <= 8 else np.dtype(np.uint16)
+
     # Taking images -----------------------------------------------------------------------------
     @abstractmethod
     def snap(self) -> Frame:
@@ -193,6 +204,9 @@ class Camera(Device):
     @abstractmethod
     def trigger(self) -> None:
         """Send one software trigger to a sequence that runs in trigger mode ``"software"``."""
+
+    drops_counted_by: ClassVar[str] = "the driver's own count"
+    """How ``dropped_before`` is known; recordings say so: ``"device frame numbers"``, ``"timestamps"`` ..."""
 
     frames_in_flight: ClassVar[int] = 2
     """Frames that can be between the sensor and the host while the next one is exposed, at most."""

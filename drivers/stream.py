@@ -75,12 +75,10 @@ class FrameStream:
         """Start the camera's sequence."""
         if self._thread is not None:
             raise DeviceError(self.camera.name, "this stream has been started before.", "Make a new one.")
-        colour = self.camera.pixel_format.startswith(("RGB", "BGR"))
-        shape = (*self.camera.image_shape, 3) if colour else self.camera.image_shape
-        dtype = np.uint8 if self.camera.significant_bits <= 8 else np.uint16
+        shape, dtype = self.camera.frame_shape, self.camera.frame_dtype
         # Two beyond the ring: one being filled, one for a reader that has just taken the oldest.
         self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
-        self._scratch = np.empty(shape, dtype)
+        self._scratch: Pixels = np.empty(shape, dtype)
         self.camera.start_sequence(self.n_buffers)
         self._running = True
         self._thread = threading.Thread(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.errors import DeviceError
 from drivers.frame import Frame
@@ -42,10 +42,20 @@ class StreamStatus:
     dropped_by_device: int
 
 
+class Missed(NamedTuple):
+    """Frames between one that a reader got and the one before."""
+
+    by_device: int
+    """Lost by the device or its driver."""
+    overwritten: int
+    """Lost in the ring, because the reader was too slow."""
+
+
 class StreamReader:
     """Gets every frame of a stream in order, from the moment it is made, and knows what it missed.
 
-    Made by :meth:`drivers.stream.FrameStream.reader`; for one thread.
+    Made by :meth:`drivers.stream.FrameStream.reader`; for one thread. ``missed`` says what lies between the
+    last frame got and the one before.
     """
 
     def __init__(self, stream: FrameStream) -> None:
@@ -53,8 +63,10 @@ class StreamReader:
         with stream.changed:
             self._first = self._next = stream.acquired
             self._dropped_at_start = stream.dropped
-            self._position = stream.acquired + stream.dropped - 1
+            self._number = stream.acquired - 1
+            self._position = self._number + stream.dropped
         self._delivered = 0
+        self.missed = Missed(0, 0)
 
     def next_frame(self, timeout_s: float | None = None) -> Frame | None:
         """Return the oldest frame not yet got; None when the stream has ended or ``timeout_s`` is over.
@@ -75,13 +87,14 @@ class StreamReader:
                 if stream.error is not None:
                     raise stream.error
                 return None
+            overwritten = slot.number - self._number - 1
+            self.missed = Missed(slot.position - self._position - 1 - overwritten, overwritten)
+            self._number, self._position = slot.number, slot.position
             self._next = slot.number + 1
             self._delivered += 1
-        missed = slot.position - self._position - 1
-        self._position = slot.position
-        if missed == slot.frame.metadata.dropped_before:
+        if sum(self.missed) == slot.frame.metadata.dropped_before:
             return slot.frame
-        return Frame(slot.frame.image, replace(slot.frame.metadata, dropped_before=missed))
+        return Frame(slot.frame.image, replace(slot.frame.metadata, dropped_before=sum(self.missed)))
 
     def skip_to_newest(self) -> None:
         """Pass over all waiting frames but the newest; they count as overwritten."""

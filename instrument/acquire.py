@@ -6,8 +6,6 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from instrument.bench import Bench
 from instrument.camera_settings import camera_settings
 from instrument.plan import BenchAbilities, Plan, check
@@ -67,10 +65,9 @@ def prepare(
 def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
     """Read once what plans are checked against: the devices' limits, and the free space in ``folder``."""
     camera, stage, slm = bench.camera, bench.stage, bench.slm
-    colour = camera.pixel_format.startswith(("RGB", "BGR"))
     return BenchAbilities(
-        frame_shape=(*camera.image_shape, 3) if colour else camera.image_shape,
-        frame_dtype=np.dtype(np.uint8) if camera.significant_bits <= 8 else np.dtype(np.uint16),
+        frame_shape=camera.frame_shape,
+        frame_dtype=camera.frame_dtype,
         exposure_ms=camera.exposure_ms,
         exposure_limits_ms=camera.exposure_limits_ms,
         gain_limits=camera.gain_limits,

@@ -13,7 +13,6 @@ configured) and the run's files are closed, in that order, each tried even when 
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -22,12 +21,11 @@ from enum import StrEnum
 
 from drivers.errors import StoppedError
 from instrument.bench import Bench, Snapshot
+from instrument.ending import end_run
 from instrument.plan import Plan, Step
-from instrument.safety import StepsFailedError, try_all
 from instrument.step_settings import StepSettings
 from instrument.store import FinishReason, FrameToStore, Run, RunWriter
 
-_log = logging.getLogger(__name__)
 _STOP_REPEAT_S = 0.005
 _STOP_WAIT_S = 2.0
 
@@ -275,26 +273,12 @@ class Runner:
         """Make the bench safe, then finish the run; a failure here never hides ``error``."""
         with contextlib.suppress(Exception):
             self._report(state=RunState.ENDING)
-        text = "" if error is None else str(error) or type(error).__name__
-        ended: list[Run] = []
-        steps = [
-            ("bench made safe", self._bench.safe_state),
-            ("run finished", lambda: ended.append(self._writer.finish(reason, text))),
-        ]
         try:
-            try_all(steps)
-        except StepsFailedError as failure:
-            if error is None:
-                raise
-            _log.error("%s", failure)
-            error.add_note(str(failure))
+            return end_run(self._bench, self._writer, reason, error)
         finally:
             self._finished.set()
             with contextlib.suppress(Exception):
                 self._report(state=RunState.FINISHED, reason=reason)
-        if error is not None:
-            error.add_note(f"What was acquired is in {self._writer.path}")
-        return ended[0] if ended else Run.open(self._writer.path)
 
     # Status --------------------------------------------------------------------------------------
     def _report_stored(self, snapshot: Snapshot) -> None:

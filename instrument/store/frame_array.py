@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,6 @@ class FrameArray:
         dtype: npt.DTypeLike,
         pixel_pitch_um: float,
         name: str,
-        frame_period_s: float | None = None,
     ) -> FrameArray:
         """Make an array without frames.
 
@@ -79,8 +78,6 @@ class FrameArray:
             uint8, uint16 or float32.
         pixel_pitch_um : float
             Pitch of the stored pixels on the sensor, micrometres.
-        frame_period_s : float, optional
-            Time from frame to frame, for recordings; None where frames are steps of a plan.
         """
         data_type = np.dtype(dtype).name
         if data_type not in _DTYPES:
@@ -94,7 +91,7 @@ class FrameArray:
         for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
             make_folder(folder)
         write_json(draft / _LEVEL / "zarr.json", _array_metadata(shape, data_type, axes))
-        write_json(draft / "zarr.json", _group_metadata(axes, pixel_pitch_um, frame_period_s, name))
+        write_json(draft / "zarr.json", _group_metadata(axes, pixel_pitch_um, name))
         draft.rename(path)
         sync_folder(path.parent)
         return cls(path)
@@ -143,11 +140,17 @@ class FrameArray:
             return np.moveaxis(flat.reshape(channels, height, width), 0, -1)
         return flat.reshape(self.frame_shape)
 
-    def resize(self, n_frames: int) -> None:
-        """Change the number of frames that the array says it has."""
+    def resize(self, n_frames: int, *, frame_period_s: float | None = None) -> None:
+        """Change the number of frames that the array says it has, and the time between them if given."""
         self._described["shape"][0] = n_frames
         write_json(self.path / _LEVEL / "zarr.json", self._described)
         self.n_frames = n_frames
+        if frame_period_s is not None:
+            group = json.loads((self.path / "zarr.json").read_text())
+            multiscale = group["attributes"]["ome"]["multiscales"][0]
+            multiscale["axes"][0]["unit"] = "second"
+            multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
+            write_json(self.path / "zarr.json", group)
 
     def checksum(self, index: int) -> StoredChunk | None:
         """Return size and CRC-32 of a frame as it is on the disk, None where it is not."""
@@ -203,17 +206,14 @@ def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[s
     }
 
 
-def _group_metadata(
-    axes: list[str], pixel_pitch_um: float, frame_period_s: float | None, name: str
-) -> dict[str, Any]:
-    time: Mapping[str, str] = {"unit": "second"} if frame_period_s is not None else {}
+def _group_metadata(axes: list[str], pixel_pitch_um: float, name: str) -> dict[str, Any]:
     kinds: dict[str, dict[str, str]] = {
-        "t": {"type": "time", **time},
+        "t": {"type": "time"},  # a plan's steps have no even spacing; a recording gets it at its end
         "c": {"type": "channel"},
         "y": {"type": "space", "unit": "micrometer"},
         "x": {"type": "space", "unit": "micrometer"},
     }
-    scales = {"t": frame_period_s or 1.0, "c": 1.0, "y": pixel_pitch_um, "x": pixel_pitch_um}
+    scales = {"t": 1.0, "c": 1.0, "y": pixel_pitch_um, "x": pixel_pitch_um}
     multiscale = {
         "name": name,
         "axes": [{"name": axis, **kinds[axis]} for axis in axes],

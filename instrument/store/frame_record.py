@@ -62,17 +62,37 @@ class FrameRecord:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Frames of a recording that are lost: ``count`` of them from ``first`` on, and why."""
+    """Frames of a recording that are lost: those from ``first`` on, and why.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame lost.
+    by_device : int
+        Frames that the camera or its driver lost.
+    not_written : int
+        Frames that came while the disk was too slow.
+    """
 
     first: int
-    count: int
-    reason: str
+    by_device: int
+    not_written: int
+
+    @property
+    def count(self) -> int:
+        """Number of frames lost, all following each other."""
+        return self.by_device + self.not_written
 
     def to_json(self) -> dict[str, Any]:
         """Return the log line."""
-        return {"kind": "gap", "first": self.first, "count": self.count, "reason": self.reason}
+        return {
+            "kind": "gap",
+            "first": self.first,
+            "by_device": self.by_device,
+            "not_written": self.not_written,
+        }
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> Gap:
         """Return what :meth:`to_json` wrote."""
-        return cls(int(line["first"]), int(line["count"]), str(line["reason"]))
+        return cls(int(line["first"]), int(line["by_device"]), int(line["not_written"]))

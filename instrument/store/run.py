@@ -198,10 +198,23 @@ class Run:
     # Frames --------------------------------------------------------------------------------------
     @property
     def n_frames(self) -> int:
-        """Number of frames that the run has when complete."""
+        """Number of frames: those of the plan, or those of a recording with its gaps."""
         if self.plan is not None:
             return len(self.plan)
-        return self.array.n_frames if self.has_frames else 0
+        ends = [gap.first + gap.count for gap in self.gaps]
+        return max([*ends, *(index + 1 for index in self.records)], default=0)
+
+    @property
+    def frame_period_s(self) -> float | None:
+        """Mean time from frame to frame, lost ones counted; None where that means nothing."""
+        if self.plan is not None or len(self.records) < 2:
+            return None
+        first, last = min(self.records), max(self.records)
+        began, ended = self.records[first].metadata, self.records[last].metadata
+        span_ns = ended.host_time_ns - began.host_time_ns
+        if began.device_time_ns is not None and ended.device_time_ns is not None:
+            span_ns = ended.device_time_ns - began.device_time_ns
+        return span_ns / (last - first) / 1e9 if span_ns > 0 else None
 
     @property
     def has_frames(self) -> bool:
@@ -262,7 +275,7 @@ class Run:
         return np.stack([self.frame(step) for step in steps])
 
     def missing(self) -> list[int]:
-        """Return the frames that the plan wants and the log does not call written, in order."""
+        """Return the frames that have a place but no data, in order: undone steps, a recording's gaps."""
         return [index for index in range(self.n_frames) if index not in self.records]
 
     def verify(self, index: int) -> DamagedFrame | None:

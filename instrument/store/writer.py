@@ -41,6 +41,9 @@ from instrument.store.run import (
     RunError,
 )
 
+_FIRST_CAPACITY = 256
+"""Frames that a recording's array is made for at first; it doubles as needed."""
+
 
 @dataclass(frozen=True, slots=True)
 class FrameToStore:
@@ -82,6 +85,7 @@ class RunWriter:
         try:
             run = Run.open(path)
             self._state = dict(run.state)
+            self._is_recording = run.plan is None
             self._n_frames = len(run.plan) if run.plan is not None else 0
             self._float = run.plan is not None and run.plan.averages
             self._pixel_pitch_um = float(run.provenance["pixel_pitch_um"])
@@ -190,7 +194,9 @@ class RunWriter:
         if not frames:
             return
         try:
-            array = self._array or self._make_array(frames[0])
+            array = self._array or self._make_array(frames)
+            if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
+                array.resize(max(last + 1, 2 * array.n_frames))
             images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
             stored = array.write(images)
             self._log.append(
@@ -213,9 +219,17 @@ class RunWriter:
         """Append a gap of a recording to the log."""
         self._append(gap.to_json())
 
+    def trim(self) -> None:
+        """Give a recording's array the length and the frame period that the log tells."""
+        run = Run.open(self.path)
+        if self._array is None or run.plan is not None:
+            return
+        self._array.resize(run.n_frames, frame_period_s=run.frame_period_s)
+
     def finish(self, reason: FinishReason, error: str = "") -> Run:
         """Say how the run ended, close its files, and return it for reading."""
         try:
+            self.trim()
             self.note("finished", reason=reason.value, error=error)
             self._set_state(
                 state="finished",
@@ -250,10 +264,12 @@ class RunWriter:
         self.close()
 
     # Inside --------------------------------------------------------------------------------------
-    def _make_array(self, first: FrameToStore) -> FrameArray:
+    def _make_array(self, frames: Sequence[FrameToStore]) -> FrameArray:
+        first = frames[0]
+        n_frames = max(_FIRST_CAPACITY, frames[-1].index + 1) if self._is_recording else self._n_frames
         self._array = FrameArray.create(
             self.path / FRAMES,
-            n_frames=self._n_frames,
+            n_frames=n_frames,
             frame_shape=first.image.shape,
             dtype=np.float32 if self._float else first.image.dtype,
             pixel_pitch_um=self._pixel_pitch_um,

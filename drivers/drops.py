@@ -1,0 +1,59 @@
+"""Counting the frames that a camera lost, from its frame numbers or, where it has none, its timestamps."""
+
+from __future__ import annotations
+
+
+class FrameNumberCounter:
+    """Counts by the device's own frame numbers: exact.
+
+    Parameters
+    ----------
+    modulus : int, optional
+        Where the numbers start again (``2**16`` for GigE Vision 1 block ids); None when they never do.
+    first_after_wrap : int
+        The number that follows ``modulus - 1``: 0, or 1 where 0 is reserved (GigE Vision 1).
+    """
+
+    counted_by = "device frame numbers"
+
+    def __init__(self, modulus: int | None = None, first_after_wrap: int = 0) -> None:
+        self._modulus = modulus
+        self._first = first_after_wrap
+        self._previous: int | None = None
+
+    def lost(self, number: int) -> int:
+        """Return the frames lost between the frame of this number and the one asked for before."""
+        previous, self._previous = self._previous, number
+        if previous is None:
+            return 0
+        step = number - previous
+        if step <= 0 and self._modulus is not None:
+            step += self._modulus - self._first
+        if step <= 0:
+            raise ValueError(f"frame number {number} came after {previous}")
+        return step - 1
+
+
+class TimestampCounter:
+    """Counts by timestamps and a known frame period: right while jitter stays under half a period.
+
+    Parameters
+    ----------
+    period_ns : float
+        Time from frame to frame as the camera is set.
+    """
+
+    counted_by = "timestamps"
+
+    def __init__(self, period_ns: float) -> None:
+        if period_ns <= 0:
+            raise ValueError(f"a frame period of {period_ns} ns")
+        self._period_ns = period_ns
+        self._previous_ns: int | None = None
+
+    def lost(self, time_ns: int) -> int:
+        """Return the frames lost between the frame of this time and the one asked for before."""
+        previous_ns, self._previous_ns = self._previous_ns, time_ns
+        if previous_ns is None:
+            return 0
+        return max(0, round((time_ns - previous_ns) / self._period_ns) - 1)

@@ -1,0 +1,53 @@
+"""The one way out of every acquisition."""
+
+from __future__ import annotations
+
+import logging
+
+from instrument.bench import Bench
+from instrument.safety import StepsFailedError, try_all
+from instrument.store import FinishReason, Run, RunWriter
+
+_log = logging.getLogger(__name__)
+
+
+def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseException | None) -> Run:
+    """Make the bench safe (light off, motion stopped), then finish the run: both tried whatever happens.
+
+    Parameters
+    ----------
+    bench : Bench
+    writer : RunWriter
+        Closed afterwards.
+    reason : FinishReason
+    error : BaseException, optional
+        What ended the acquisition. It gets notes on what failed here and on where the run is, and stays the
+        error that matters.
+
+    Returns
+    -------
+    Run
+        For reading.
+
+    Raises
+    ------
+    StepsFailedError
+        When something failed here and there is no ``error`` that says so.
+    """
+    text = "" if error is None else str(error) or type(error).__name__
+    ended: list[Run] = []
+    try:
+        try_all(
+            [
+                ("bench made safe", bench.safe_state),
+                ("run finished", lambda: ended.append(writer.finish(reason, text))),
+            ]
+        )
+    except StepsFailedError as failure:
+        if error is None:
+            raise
+        _log.error("%s", failure)
+        error.add_note(str(failure))
+    if error is not None:
+        error.add_note(f"What was acquired is in {writer.path}")
+    return ended[0] if ended else Run.open(writer.path)

@@ -1,0 +1,308 @@
+"""Record a camera's stream to disk: every frame with its metadata, every lost frame as a gap."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from drivers.errors import DeviceError
+from drivers.frame import Frame, FrameMetadata
+from drivers.stream import FrameStream
+from drivers.stream_reader import StreamReader
+from instrument.acquire import free_bytes, record_of
+from instrument.bench import Bench
+from instrument.ending import end_run
+from instrument.errors import BenchError
+from instrument.plan.abilities import SPARE_BYTES
+from instrument.store import FinishReason, FrameToStore, Gap, Run, RunError, RunWriter
+
+_log = logging.getLogger(__name__)
+_RING_BYTES = 256 * 2**20
+"""Memory that waits for a slow disk, unless ``n_buffers`` says otherwise."""
+_MOST_BUFFERS = 512
+_BATCH = 8
+"""Frames synced to the disk together, at most."""
+_DISK_CHECK_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    """A snapshot of a recording.
+
+    Attributes
+    ----------
+    written : int
+        Frames on the disk.
+    dropped_by_device : int
+        Frames that the camera or its driver lost.
+    not_written : int
+        Frames lost because the disk was slower than the camera.
+    waiting : int
+        Frames in memory on their way to the disk; more than ``n_buffers`` never are.
+    n_buffers : int
+    seconds : float
+        Since the first frame.
+    frames_per_s, bytes_per_s : float
+        Mean rates of what was written.
+    saturated_fraction : float
+        Of the newest frame.
+    free_bytes : int
+        Left on the disk.
+    """
+
+    written: int
+    dropped_by_device: int
+    not_written: int
+    waiting: int
+    n_buffers: int
+    seconds: float
+    frames_per_s: float
+    bytes_per_s: float
+    saturated_fraction: float
+    free_bytes: int
+
+
+class Recorder:
+    """Records until a number of frames or seconds is reached, or until ``stop``.
+
+    Memory is that of the stream's ring: when the disk is slower than the camera, frames are lost there and
+    counted, and nothing grows. A lost frame keeps its number: the recording's array has a gap.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open; its light is as the caller set it.
+    writer : RunWriter
+        A run without a plan.
+    n_frames : int, optional
+        Frames to record, lost ones counted.
+    seconds : float, optional
+        Time to record.
+    n_buffers : int, optional
+        Frames held in memory for the disk; None means as many as 256 MB hold.
+    on_progress : callable, optional
+        Called with the status after every batch of frames, at once when frames were lost.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        writer: RunWriter,
+        *,
+        n_frames: int | None = None,
+        seconds: float | None = None,
+        n_buffers: int | None = None,
+        on_progress: Callable[[RecordingStatus], None] | None = None,
+    ) -> None:
+        self._bench = bench
+        self._writer = writer
+        self._n_frames = n_frames
+        self._seconds = seconds
+        frame_bytes = math.prod(bench.camera.frame_shape) * bench.camera.frame_dtype.itemsize
+        self.n_buffers = n_buffers or min(_MOST_BUFFERS, max(2 * _BATCH, _RING_BYTES // frame_bytes))
+        self._on_progress = on_progress
+        self._stopping = threading.Event()
+        self._surroundings: FrameMetadata | None = None
+        self._next = 0
+        self._written = self._bytes = self._by_device = self._not_written = 0
+        self._began_s: float | None = None
+        self._disk_checked_s = 0.0
+        self._free_bytes = 0
+
+    def stop(self) -> None:
+        """End the recording after the frames being written; callable from any thread."""
+        self._stopping.set()
+
+    def execute(self) -> Run:
+        """Record; returns the finished run.
+
+        Raises
+        ------
+        DeviceError, RunError
+            When the camera or the disk fails; what was recorded is kept, the run marked as failed, the bench
+            made safe.
+        KeyboardInterrupt, SystemExit
+            After the run was marked as aborted and the bench made safe.
+        """
+        stream = FrameStream(self._bench.camera, self.n_buffers)
+        reader = stream.reader()
+        try:
+            self._writer.start(drops_counted_by=self._bench.camera.drops_counted_by, n_buffers=self.n_buffers)
+            with stream:
+                self._record(reader)
+        except Exception as error:
+            end_run(self._bench, self._writer, FinishReason.FAILED, error)
+            raise
+        except BaseException as error:
+            end_run(self._bench, self._writer, FinishReason.ABORTED, error)
+            raise
+        return end_run(self._bench, self._writer, FinishReason.COMPLETED, None)
+
+    def _record(self, reader: StreamReader) -> None:
+        while not self._is_done():
+            frame = reader.next_frame(0.1)
+            if frame is None:
+                continue
+            if self._began_s is None:
+                self._began_s = time.monotonic()
+            batch: list[FrameToStore] = []
+            gaps: list[Gap] = []
+            failure: DeviceError | None = None
+            while frame is not None:
+                self._place(frame, reader, batch, gaps)
+                if len(batch) == _BATCH or self._next == self._n_frames:
+                    break
+                try:
+                    frame = reader.next_frame(0.0)
+                except DeviceError as error:  # the frames that came before it are stored first
+                    failure, frame = error, None
+            self._store(batch, gaps, reader)
+            if failure is not None:
+                raise failure
+
+    def _place(self, frame: Frame, reader: StreamReader, batch: list[FrameToStore], gaps: list[Gap]) -> None:
+        by_device, not_written = reader.missed
+        if self._n_frames is not None:  # a gap at the end is no longer than the recording
+            left = self._n_frames - self._next
+            by_device = min(by_device, left)
+            not_written = min(not_written, left - by_device)
+        if by_device or not_written:
+            gaps.append(Gap(self._next, by_device, not_written))
+            self._by_device += by_device
+            self._not_written += not_written
+            self._next += by_device + not_written
+        if self._next != self._n_frames:
+            batch.append(FrameToStore(self._next, frame.image, self._with_surroundings(frame.metadata)))
+            self._next += 1
+
+    def _with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
+        """Add stage, LEDs and SLM, which stay as they are during a recording and so are asked once."""
+        if self._surroundings is None:
+            self._surroundings = self._bench.with_surroundings(metadata)
+        return replace(
+            metadata,
+            stage_position=self._surroundings.stage_position,
+            led_pattern=self._surroundings.led_pattern,
+            slm_image_hash=self._surroundings.slm_image_hash,
+        )
+
+    def _store(self, batch: list[FrameToStore], gaps: list[Gap], reader: StreamReader) -> None:
+        for gap in gaps:
+            self._writer.gap(gap)
+            _log.warning("%d frames lost from frame %d on (%s)", gap.count, gap.first, gap)
+        self._writer.write(batch)
+        self._written += len(batch)
+        self._bytes += sum(frame.image.nbytes for frame in batch)
+        self._check_disk()
+        if self._on_progress is not None:
+            newest = batch[-1].metadata.saturated_fraction if batch else 0.0
+            self._on_progress(self._status(reader, newest))
+
+    def _check_disk(self) -> None:
+        if time.monotonic() - self._disk_checked_s < _DISK_CHECK_S:
+            return
+        self._disk_checked_s = time.monotonic()
+        self._free_bytes = free_bytes(self._writer.path)
+        if self._free_bytes < SPARE_BYTES // 2:
+            raise RunError(
+                self._writer.path,
+                f"the disk is nearly full ({self._free_bytes / 1e6:.0f} MB left); the recording was ended.",
+                "All frames before are kept. Free some space, or record to another disk.",
+            )
+
+    def _is_done(self) -> bool:
+        if self._stopping.is_set() or (self._n_frames is not None and self._next >= self._n_frames):
+            return True
+        if self._seconds is None or self._began_s is None:
+            return False
+        return time.monotonic() - self._began_s >= self._seconds
+
+    def _status(self, reader: StreamReader, saturated_fraction: float) -> RecordingStatus:
+        seconds = max(1e-9, time.monotonic() - (self._began_s or 0.0))
+        return RecordingStatus(
+            written=self._written,
+            dropped_by_device=self._by_device,
+            not_written=self._not_written,
+            waiting=reader.status.waiting,
+            n_buffers=self.n_buffers,
+            seconds=seconds,
+            frames_per_s=self._written / seconds,
+            bytes_per_s=self._bytes / seconds,
+            saturated_fraction=saturated_fraction,
+            free_bytes=self._free_bytes,
+        )
+
+
+def record(
+    bench: Bench,
+    folder: Path | str | None = None,
+    *,
+    label: str = "recording",
+    n_frames: int | None = None,
+    seconds: float | None = None,
+    n_buffers: int | None = None,
+    on_progress: Callable[[RecordingStatus], None] | None = None,
+) -> Run:
+    """Record a camera's stream into a new run; see :class:`Recorder`.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open; light, stage and SLM stay as they are until the end, when the bench is made safe.
+    folder : path, optional
+        Where the run's folder is made; None means the bench's own data folder.
+    label : str
+        Becomes part of the folder's name.
+    n_frames, seconds
+        The end, whichever comes first; one of them is needed.
+    n_buffers, on_progress
+        As in :class:`Recorder`.
+
+    Raises
+    ------
+    BenchError
+        When neither ``n_frames`` nor ``seconds`` is given, or the disk has no room for ``n_frames``.
+    DeviceError, RunError
+        When the camera or the disk fails; what was recorded is kept.
+    """
+    if n_frames is None and seconds is None:
+        raise BenchError("Say how much to record: n_frames, seconds, or both.")
+    return prepare_recording(
+        bench,
+        folder,
+        label=label,
+        n_frames=n_frames,
+        seconds=seconds,
+        n_buffers=n_buffers,
+        on_progress=on_progress,
+    ).execute()
+
+
+def prepare_recording(
+    bench: Bench,
+    folder: Path | str | None = None,
+    *,
+    label: str = "recording",
+    n_frames: int | None = None,
+    seconds: float | None = None,
+    n_buffers: int | None = None,
+    on_progress: Callable[[RecordingStatus], None] | None = None,
+) -> Recorder:
+    """Make a recording's folder and return its recorder, for those who end it by ``stop``."""
+    folder = Path(folder) if folder is not None else bench.config.data_folder
+    camera = bench.camera
+    need = (n_frames or 1) * math.prod(camera.frame_shape) * camera.frame_dtype.itemsize
+    if (free := free_bytes(folder)) < need + SPARE_BYTES:
+        raise BenchError(
+            f"{folder}: {n_frames or 1} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to "
+            f"spare, but only {free / 1e9:.2f} GB are free. Free some, or choose another folder."
+        )
+    writer = RunWriter.create(folder, label=label, bench=record_of(bench))
+    return Recorder(
+        bench, writer, n_frames=n_frames, seconds=seconds, n_buffers=n_buffers, on_progress=on_progress
+    )

@@ -1,0 +1,28 @@
+"""Lost frames are counted from frame numbers, through their wrapping, or from timestamps."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.drops import FrameNumberCounter, TimestampCounter
+
+
+def test_frame_numbers_count_exactly() -> None:
+    counter = FrameNumberCounter()
+    assert [counter.lost(n) for n in (5, 6, 9, 10)] == [0, 0, 2, 0]
+    with pytest.raises(ValueError, match="came after"):
+        counter.lost(10)
+
+
+def test_frame_numbers_that_wrap() -> None:
+    counter = FrameNumberCounter(modulus=2**16)
+    assert [counter.lost(n) for n in (65534, 65535, 0, 2)] == [0, 0, 0, 1]
+    without_zero = FrameNumberCounter(modulus=2**16, first_after_wrap=1)
+    assert [without_zero.lost(n) for n in (65534, 65535, 1, 3)] == [0, 0, 0, 1]
+    assert FrameNumberCounter(modulus=2**16, first_after_wrap=1).lost(1) == 0
+
+
+def test_timestamps_count_whole_periods_despite_jitter() -> None:
+    counter = TimestampCounter(10e6)
+    times = [0, 10_400_000, 19_000_000, 49_000_000, 59_500_000]
+    assert [counter.lost(t) for t in times] == [0, 0, 0, 2, 0]
