@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +18,9 @@ from drivers.simulated.world import BANDS
 class LedArrayOptions(DriverOptions):
     """Options of the simulated LED array in ``bench.toml``."""
 
-    leds: Annotated[int, Field(ge=1, le=10_000)] = 257
-    led_pitch_mm: Annotated[float, Field(gt=0)] = 4.0
-    distance_mm: Annotated[float, Field(gt=0, description="From the array to its centre of view.")] = 60.0
+    leds: int = Field(257, ge=1, le=10_000, description="Number of LEDs.")
+    led_pitch_mm: float = Field(4.0, gt=0, description="Spacing of the LEDs.")
+    distance_mm: float = Field(60.0, gt=0, description="From the array to its centre of view.")
 
 
 class SimulatedLedArray(SimulatedDevice, LedArray):

@@ -28,26 +28,40 @@ class WorldOptions(DriverOptions):
     noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
     fixed_pattern: bool = Field(True, description="Whether pixels differ (response, offset, hot, dead).")
 
-    diffuser: DiffuserKind | None = None
-    diffuser_seed: int | None = Field(None, ge=0)
-    feature_size_um: Positive = 140.0
-    mean_slope_deg: Annotated[float, Field(gt=0, lt=20)] = 0.7
-    lenslet_um: Positive | None = None
-    focal_length_um: Positive | None = None
-    diffuser_distance_mm: Positive | None = None
-    aperture_mm: tuple[Positive, Positive] | None = Field(None, description="(height, width)")
-
-    fall_off: Literal["preset", "none", "gaussian", "table"] = "preset"
-    fall_off_sigma_deg: Positive = 13.0
-    fall_off_table: tuple[tuple[float, float], ...] = Field(
-        (), description="Pairs of angle in degrees, ascending from 0, and response."
+    diffuser: DiffuserKind | None = Field(None, description="Kind of diffuser; left out: the preset's.")
+    diffuser_seed: int | None = Field(
+        None, ge=0, description="Another diffuser with the same sensor; left out: seed."
+    )
+    feature_size_um: Positive = Field(140.0, description="Feature size of the smooth diffuser.")
+    mean_slope_deg: float = Field(0.7, gt=0, lt=20, description="Mean slope of the smooth diffuser.")
+    lenslet_um: Positive | None = Field(
+        None, description="Spacing of the microlens diffusers; left out: the preset's."
+    )
+    focal_length_um: Positive | None = Field(
+        None, description="Focal length of the microlenses; left out: the preset's."
+    )
+    diffuser_distance_mm: Positive | None = Field(
+        None, description="From the diffuser's textured side to the sensor; left out: the preset's."
+    )
+    aperture_mm: tuple[Positive, Positive] | None = Field(
+        None, description="[height, width] of the aperture on the diffuser; left out: the preset's."
     )
 
-    source_diameter_um: NotNegative | None = None
+    fall_off: Literal["preset", "none", "gaussian", "table"] = Field(
+        "preset", description="The sensor's angular response."
+    )
+    fall_off_sigma_deg: Positive = Field(13.0, description='Width of fall_off = "gaussian".')
+    fall_off_table: tuple[tuple[float, float], ...] = Field(
+        (), description='For fall_off = "table": pairs of angle in degrees, ascending from 0, and response.'
+    )
+
+    source_diameter_um: NotNegative | None = Field(
+        None, description="Diameter of the point source; left out: the preset's."
+    )
     source_brightness: Positive = Field(
         1.0, description="Brightness of the point source relative to the preset's."
     )
-    spectral_samples: Annotated[int, Field(ge=1, le=9)] = 3
+    spectral_samples: int = Field(3, ge=1, le=9, description="Wavelengths in each colour band.")
 
     @model_validator(mode="after")
     def _table_fits(self) -> Self:

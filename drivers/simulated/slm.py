@@ -21,13 +21,15 @@ Side = Annotated[int, Field(ge=1, le=8192)]
 class SlmOptions(DriverOptions):
     """Options of the simulated SLM in ``bench.toml``."""
 
-    shape: tuple[Side, Side] = Field((1080, 1920), description="(height, width) in pixels")
-    pixel_pitch_um: Annotated[float, Field(gt=0)] = 8.0
-    settle_ms: Annotated[float, Field(ge=0)] = 30.0
-    phase_at_full_level_rad: Annotated[float, Field(gt=0)] = 2 * np.pi * 255 / 256
-    lut_gamma: Annotated[
-        float, Field(gt=0, description="Phase follows (level / 255)^gamma; 1: linear, as it should be.")
-    ] = 1.0
+    shape: tuple[Side, Side] = Field((1080, 1920), description="[height, width] in pixels.")
+    pixel_pitch_um: float = Field(8.0, gt=0, description="Pixel pitch.")
+    settle_ms: float = Field(30.0, ge=0, description="From a confirmed image to settled optics.")
+    phase_at_full_level_rad: float = Field(
+        2 * np.pi * 255 / 256, gt=0, description="Phase at grey level 255."
+    )
+    lut_gamma: float = Field(
+        1.0, gt=0, description="Phase follows (level / 255)^gamma; 1: linear, as it should be."
+    )
 
 
 class SimulatedSlm(SimulatedDevice, Slm):

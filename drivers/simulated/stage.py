@@ -28,21 +28,30 @@ class AxisOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    lower_limit: float | None = None
-    upper_limit: float | None = None
-    home: float | None = None
-    speed_per_s: Positive | None = None
-    acceleration_per_s2: Positive | None = None
-    resolution: Positive | None = None
-    backlash: NotNegative | None = None
-    repeatability: NotNegative | None = None
+    lower_limit: float | None = Field(default=None, description="Lower soft limit.")
+    upper_limit: float | None = Field(default=None, description="Upper soft limit.")
+    home: float | None = Field(default=None, description="Where homing ends.")
+    speed_per_s: Positive | None = Field(default=None, description="Highest speed, units a second.")
+    acceleration_per_s2: Positive | None = Field(
+        default=None, description="Acceleration, units a second squared."
+    )
+    resolution: Positive | None = Field(default=None, description="Smallest step.")
+    backlash: NotNegative | None = Field(default=None, description="Play when the direction turns.")
+    repeatability: NotNegative | None = Field(
+        default=None, description="Standard deviation of where a move to one place ends."
+    )
 
 
 class StageOptions(DriverOptions):
     """Options of the simulated stage in ``bench.toml``."""
 
-    axis_names: tuple[str, ...] = ("x_um", "y_um", "z_um")
-    axes: dict[str, AxisOptions] = Field(default_factory=dict)
+    axis_names: tuple[str, ...] = Field(
+        ("x_um", "y_um", "z_um"),
+        description="One to six of x_um, y_um, z_um, roll_mrad, pitch_mrad, yaw_mrad.",
+    )
+    axes: dict[str, AxisOptions] = Field(
+        default_factory=dict, description="How single axes differ from the preset, by name."
+    )
     mount_offset_um: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="True source position minus stage reading, x, y, z."
     )
