@@ -45,9 +45,10 @@ class SceneSwitch(Protocol):
 class KnownOptics(Protocol):
     """A shared part that knows the optics between scene and sensor: the simulated world."""
 
-    @property
-    def geometry(self) -> Geometry:
-        """Optics as they are; the pixel pitch is that of unbinned pixels."""
+    distance_um: float
+    """From the diffuser to the sensor."""
+    aperture_mm: tuple[float, float]
+    """``(height, width)``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,17 +190,15 @@ class Bench:
     @property
     def geometry(self) -> Geometry:
         """The optics: as configured, else as the devices know them; the pitch is that of binned pixels."""
-        known = next(
-            (part.geometry for part in self.shared.values() if isinstance(part, KnownOptics)),
-            Geometry(),
-        )
         table = self.config.geometry
+        known = next((part for part in self.shared.values() if isinstance(part, KnownOptics)), None)
+        distance_mm, aperture_mm = (known.distance_um / 1e3, known.aperture_mm) if known else (None, None)
         pitch_um = table.pixel_pitch_um or self.camera.pixel_pitch_um
         return Geometry(
             pixel_pitch_um=pitch_um * self.camera.binning,
-            diffuser_distance_mm=table.diffuser_distance_mm or known.diffuser_distance_mm,
-            aperture_mm=table.aperture_mm or known.aperture_mm,
-            wavelength_nm=table.wavelength_nm or known.wavelength_nm,
+            diffuser_distance_mm=table.diffuser_distance_mm or distance_mm,
+            aperture_mm=table.aperture_mm or aperture_mm,
+            wavelength_nm=table.wavelength_nm,
         )
 
     # Photographs -------------------------------------------------------------------------------

@@ -58,14 +58,15 @@ def _section(title: str, model: type[BaseModel]) -> str:
     lines = [title, "", *_sentences(model), *_table(schema, schema)]
     for name, inner in schema.get("$defs", {}).items():
         if inner.get("type") == "object":
-            lines += [f"A `{name}` holds:", "", *_table(inner, schema)]
+            text = " ".join(inner.get("description", "").split())
+            lines += [f"Each `{name}`: {text}".replace("``", "`"), "", *_table(inner, schema)]
     return "\n".join(lines)
 
 
 def _sentences(model: type[BaseModel]) -> Iterator[str]:
     text = (model.__doc__ or "").strip().split("\n\n")[0]
     if text:
-        yield from (" ".join(text.split()), "")
+        yield from (" ".join(text.split()).replace("``", "`"), "")
 
 
 def _table(schema: dict[str, Any], root: dict[str, Any]) -> Iterator[str]:
