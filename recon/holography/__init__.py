@@ -1,0 +1,50 @@
+"""Holograms through a scattering mask (Kuo 2020, Ch. 7 and A.4): model, losses, optimisers, étendue.
+
+In short::
+
+    display = Display((540, 960), random_mask((2160, 3840)))
+    model = HologramModel(display, [Target(image)], Loss("frequency"))
+    hologram = compute_hologram(model, budget=Budget(iterations=100))
+    print(judge(hologram.slm, display, Target(image)).psnr_db)
+"""
+
+from recon.holography.display import DcTerm, Display
+from recon.holography.etendue import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
+from recon.holography.judge import Scores, judge
+from recon.holography.lowpass import Grid
+from recon.holography.mask import ScatteringMask, random_mask
+from recon.holography.model import Evaluation, HologramModel
+from recon.holography.optimise import (
+    Budget,
+    Hologram,
+    HologramRecord,
+    HologramStop,
+    compute_hologram,
+    one_step,
+)
+from recon.holography.target import Loss, Target, foveal_weights
+
+__all__ = [
+    "Budget",
+    "DcTerm",
+    "Display",
+    "Etendue",
+    "Evaluation",
+    "Grid",
+    "Hologram",
+    "HologramModel",
+    "HologramRecord",
+    "HologramStop",
+    "Loss",
+    "ScatteringMask",
+    "Scores",
+    "Target",
+    "compute_hologram",
+    "eyebox_for_field_of_view",
+    "field_of_view_for_eyebox",
+    "foveal_weights",
+    "judge",
+    "one_step",
+    "pixels_for",
+    "random_mask",
+]

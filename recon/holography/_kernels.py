@@ -1,0 +1,240 @@
+"""Compiled inner loops of the hologram model (imported lazily: numba costs half a second to import).
+
+Every loop works on rows ``start`` to ``stop`` and touches nothing else, so that rows can be shared between
+threads without changing a result. The arrays of a call share one precision (complex64 or complex128).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from rocket_fft import c2c, c2r, r2c
+
+ROWS_AT_ONCE = 8
+"""Rows transformed together: enough for the FFT's vector unit, few enough to stay in the cache."""
+
+
+@njit(nogil=True, cache=True)
+def columns(field: Any, forward: bool, threads: int) -> None:
+    """Transform ``field`` along its columns in place, not scaled."""
+    c2c(field, field, np.array([0]), forward, 1.0, threads)
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def fill(
+    field: Any, slm: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
+) -> None:
+    """``field[y, x] = slm[y // k, x // k] * table[mask[y, x]] * hy[y] * hx[x]`` (Eqs. 7.8, 7.15)."""
+    for y in range(start, stop):
+        for i in range(slm.shape[1]):
+            value = slm[y // k, i] * hy[y]
+            for x in range(i * k, (i + 1) * k):
+                field[y, x] = value * table[mask[y, x]] * hx[x]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def gather(
+    out: Any, field: Any, mask: Any, table: Any, hy: Any, hx: Any, k: int, start: int, stop: int
+) -> None:
+    """Adjoint of :func:`fill`, added to rows ``start`` to ``stop`` of the SLM-sized ``out``."""
+    for j in range(start, stop):
+        for y in range(j * k, (j + 1) * k):
+            weight = np.conj(hy[y])
+            for i in range(out.shape[1]):
+                total = out[j, i] * 0
+                for x in range(i * k, (i + 1) * k):
+                    total += field[y, x] * np.conj(table[mask[y, x]] * hx[x])
+                out[j, i] += total * weight
+
+
+@njit(nogil=True, cache=True)
+def _cell(position: float, k: int) -> tuple[int, float]:
+    """SLM pixel in which a mask cell at ``position`` (mask pixels) begins, and the part of it in there."""
+    first = int(np.floor(position / k))
+    return first, min((first + 1) * k - position, 1.0)
+
+
+@njit(nogil=True, cache=True)
+def _between(nodes: Any, y: int, x: int, height: int, width: int) -> tuple[float, float]:
+    """Displacement at the centre of cell ``(y, x)``, bilinear between nodes that span the whole mask."""
+    v = (y + 0.5) / height * (nodes.shape[0] - 1)
+    u = (x + 0.5) / width * (nodes.shape[1] - 1)
+    j, i = min(int(v), nodes.shape[0] - 2), min(int(u), nodes.shape[1] - 2)
+    v, u = v - j, u - i
+    above = nodes[j, i] * (1 - u) + nodes[j, i + 1] * u
+    below = nodes[j + 1, i] * (1 - u) + nodes[j + 1, i + 1] * u
+    dy, dx = above * (1 - v) + below * v
+    return dy, dx
+
+
+@njit(nogil=True, cache=True)
+def fill_displaced(
+    field: Any, slm: Any, mask: Any, table: Any, hy: Any, hx: Any, nodes: Any, k: int, start: int, stop: int
+) -> None:
+    """As :func:`fill`, but cell ``(y, x)`` sees the SLM at ``(y + dy, x + dx)``, weighted by area."""
+    height, width = mask.shape
+    for y in range(start, stop):
+        for x in range(width):
+            dy, dx = _between(nodes, y, x, height, width)
+            j, in_j = _cell(y + dy, k)
+            i, in_i = _cell(x + dx, k)
+            value = field[y, x] * 0
+            for row, wy in ((j, in_j), (j + 1, 1 - in_j)):
+                for column, wx in ((i, in_i), (i + 1, 1 - in_i)):
+                    if 0 <= row < slm.shape[0] and 0 <= column < slm.shape[1]:
+                        value += slm[row, column] * (wy * wx)
+            field[y, x] = value * table[mask[y, x]] * hy[y] * hx[x]
+
+
+@njit(nogil=True, cache=True)
+def gather_displaced(
+    out: Any, field: Any, mask: Any, table: Any, hy: Any, hx: Any, nodes: Any, k: int, start: int, stop: int
+) -> None:
+    """Adjoint of :func:`fill_displaced` for mask rows ``start`` to ``stop``, added to the whole ``out``."""
+    height, width = mask.shape
+    for y in range(start, stop):
+        for x in range(width):
+            dy, dx = _between(nodes, y, x, height, width)
+            j, in_j = _cell(y + dy, k)
+            i, in_i = _cell(x + dx, k)
+            value = field[y, x] * np.conj(table[mask[y, x]] * hy[y] * hx[x])
+            for row, wy in ((j, in_j), (j + 1, 1 - in_j)):
+                for column, wx in ((i, in_i), (i + 1, 1 - in_i)):
+                    if 0 <= row < out.shape[0] and 0 <= column < out.shape[1]:
+                        out[row, column] += value * (wy * wx)
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def rows_to_spectrum(
+    field: Any, spectrum: Any, ey: Any, ex: Any, filled: int, scale: float, start: int, stop: int
+) -> None:
+    """Finish the field's transform along its rows and add the intensity's spectrum, cropped to the pass-band.
+
+    ``field`` ends as the field in the image plane. Only its first ``filled`` columns are read. ``spectrum``
+    (rows, kept columns) receives the row transform of ``|field|^2 ey ex`` times ``scale``; its transform
+    along the columns is still to do.
+    """
+    width = field.shape[1]
+    kept = spectrum.shape[1]
+    axis = np.array([1])
+    intensity = np.empty((ROWS_AT_ONCE, width), ey.dtype)
+    half = np.empty((ROWS_AT_ONCE, width // 2 + 1), field.dtype)
+    for top in range(start, stop, ROWS_AT_ONCE):
+        n = min(ROWS_AT_ONCE, stop - top)
+        rows = field[top : top + n]
+        rows[:, filled:] = 0
+        c2c(rows, rows, axis, True, 1.0, 1)
+        for y in range(n):
+            gain = ey[top + y] * scale
+            for x in range(width):
+                value = rows[y, x]
+                intensity[y, x] = (value.real * value.real + value.imag * value.imag) * gain * ex[x]
+        r2c(intensity[:n], half[:n], axis, True, 1.0, 1)
+        for y in range(n):
+            for x in range(kept):
+                spectrum[top + y, x] += half[y, x]
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def rows_from_spectrum(
+    field: Any, spectrum: Any, ey: Any, ex: Any, scale: float, start: int, stop: int
+) -> None:
+    """Multiply ``field`` by the real image whose row spectra are given, then transform back along rows."""
+    width = field.shape[1]
+    kept = spectrum.shape[1]
+    axis = np.array([1])
+    image = np.empty((ROWS_AT_ONCE, width), ey.dtype)
+    half = np.empty((ROWS_AT_ONCE, width // 2 + 1), field.dtype)
+    for top in range(start, stop, ROWS_AT_ONCE):
+        n = min(ROWS_AT_ONCE, stop - top)
+        for y in range(n):
+            half[y, kept:] = 0
+            for x in range(kept):
+                half[y, x] = spectrum[top + y, x]
+        c2r(half[:n], image[:n], axis, False, 1.0, 1)
+        rows = field[top : top + n]
+        for y in range(n):
+            gain = ey[top + y] * scale
+            for x in range(width):
+                rows[y, x] *= image[y, x] * gain * ex[x]
+        c2c(rows, rows, axis, False, 1.0, 1)
+
+
+@njit(nogil=True, cache=True)
+def _butterworth(y: int, x: int, cutoff: float) -> float:
+    """Low-pass at a lag (Kuo 2020, Eq. 7.18); everything passes where the cut-off is 0."""
+    if cutoff == 0:
+        return 1.0
+    r = (y * y + x * x) / (cutoff * cutoff)
+    return 1.0 / (1.0 + r * r * r * r * r)
+
+
+@njit(nogil=True, cache=True)
+def filtered_power(spectrum: Any, target: Any, cutoff: float, top: int, full: bool) -> float:
+    """Power of the low-passed difference of the kept rows of ``spectrum`` to ``target``.
+
+    ``target`` holds the kept rows: the first ``top``, then the last ones. The mirrored half of the spectrum
+    counts too (``full``: the last column is the Nyquist column, which has no mirror image).
+    """
+    kept, columns_kept = target.shape
+    rows = spectrum.shape[0]
+    total = 0.0
+    for i in range(kept):
+        y = i if i < top else rows - kept + i
+        lag = i if i < top else i - kept
+        for x in range(columns_kept):
+            value = (spectrum[y, x] - target[i, x]) * _butterworth(lag, x, cutoff)
+            power = float(value.real) ** 2 + float(value.imag) ** 2
+            total += power if x == 0 or (full and x == columns_kept - 1) else 2 * power
+    return total
+
+
+@njit(nogil=True, cache=True)
+def subtract_and_filter(spectrum: Any, target: Any, cutoff: float, top: int) -> None:
+    """Replace the kept rows of ``spectrum`` by their low-passed difference to ``target``, others by 0."""
+    kept, columns_kept = target.shape
+    rows = spectrum.shape[0]
+    spectrum[top : rows - kept + top] = 0
+    for i in range(kept):
+        y = i if i < top else rows - kept + i
+        lag = i if i < top else i - kept
+        for x in range(columns_kept):
+            spectrum[y, x] = (spectrum[y, x] - target[i, x]) * _butterworth(lag, x, cutoff)
+
+
+@njit(nogil=True, cache=True)
+def low_pass(spectrum: Any, kept: int, cutoff: float, top: int) -> None:
+    """Multiply the kept rows of ``spectrum`` by the low-pass."""
+    rows = spectrum.shape[0]
+    for i in range(kept):
+        y = i if i < top else rows - kept + i
+        lag = i if i < top else i - kept
+        for x in range(spectrum.shape[1]):
+            spectrum[y, x] *= _butterworth(lag, x, cutoff)
+
+
+@njit(nogil=True, cache=True)
+def copy_kept(source: Any, target: Any, kept: int, columns_kept: int, top: int) -> None:
+    """Copy the kept lags between half spectra of different sizes; all else in ``target`` becomes 0."""
+    target[:] = 0
+    target[:top, :columns_kept] = source[:top, :columns_kept]
+    rest = kept - top
+    for i in range(rest):
+        y, z = target.shape[0] - rest + i, source.shape[0] - rest + i
+        for x in range(columns_kept):
+            target[y, x] = source[z, x]
+
+
+@njit(nogil=True, cache=True)
+def weigh(image: Any, weights: Any, scale: float) -> Any:
+    """Return the mean of ``(image scale)^2 weights`` and replace ``image`` by ``image weights scale``."""
+    total = 0.0
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            value = image[y, x] * scale
+            weighted = value * weights[y, x]
+            total += float(value) * float(weighted)
+            image[y, x] = weighted
+    return total / float(image.size)

@@ -1,0 +1,138 @@
+"""What a holographic display is made of, as far as the computation of its holograms knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.holography.mask import ScatteringMask
+
+
+@dataclass(frozen=True, slots=True)
+class DcTerm:
+    """Light that the SLM does not modulate, one value for all pixels.
+
+    Attributes
+    ----------
+    power : float
+        Its share of the light, 0 to below 1. The modulated part keeps the rest.
+    phase_rad : float
+        Its phase relative to the SLM's grey level zero.
+    """
+
+    power: float
+    phase_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.power < 1:
+            raise InputError(f"The DC term's share of the power lies in 0 to 1, not {self.power:g}.")
+
+    @property
+    def modulated(self) -> float:
+        """Amplitude of the modulated light."""
+        return sqrt(1 - self.power)
+
+    @property
+    def amplitude(self) -> complex:
+        """Complex amplitude of the unmodulated light."""
+        return complex(sqrt(self.power) * np.exp(1j * self.phase_rad))
+
+
+@dataclass(frozen=True, slots=True)
+class Display:
+    """SLM, mask and Fourier lens (Kuo 2020, Fig. 7.2b).
+
+    Attributes
+    ----------
+    slm_shape : (int, int)
+        ``(height, width)`` of the SLM in pixels (after binning).
+    mask : ScatteringMask
+        An integer number of mask pixels per SLM pixel, the same along both axes.
+    slm_pitch_um, wavelength_nm, focal_mm : float
+        ``focal_mm`` is the Fourier lens ``f1``; it matters for planes out of focus only.
+    dc : DcTerm
+    mask_fill : float
+        Width of a mask pixel's clear part over the mask pitch; its diffraction envelope is
+        ``sinc^2(fill x / field of view)``. 0 leaves the envelope out (as the dissertation does).
+    displacement : ndarray, float, (rows, columns, 2), or None
+        Where the mask really lies: the mask cell at ``(y, x)`` sees the SLM at ``(y + dy, x + dx)``, in mask
+        pixels; ``dy, dx`` on nodes that span the mask from edge to edge, bilinear in between.
+    """
+
+    slm_shape: tuple[int, int]
+    mask: ScatteringMask
+    slm_pitch_um: float = 16.0
+    wavelength_nm: float = 660.0
+    focal_mm: float = 75.0
+    dc: DcTerm = DcTerm(0.0)
+    mask_fill: float = 0.0
+    displacement: npt.NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("slm_pitch_um", "wavelength_nm", "focal_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be above 0, not {getattr(self, name)!r}.")
+        if not 0 <= self.mask_fill <= 1:
+            raise InputError(f"mask_fill lies in 0 to 1, not {self.mask_fill:g}.")
+        height, width = self.slm_shape
+        factor, rest = divmod(self.mask.shape[0], height)
+        if rest or factor < 1 or self.mask.shape[1] != factor * width:
+            raise InputError(
+                f"A mask of {self.mask.shape} pixels does not cover an SLM of {self.slm_shape} pixels with a "
+                "whole number of mask pixels per SLM pixel, the same along both axes."
+            )
+        nodes = self.displacement
+        if nodes is not None and (nodes.ndim != 3 or nodes.shape[2] != 2 or min(nodes.shape[:2]) < 2):
+            raise InputError(
+                f"displacement must be (rows, columns, 2) with at least 2 x 2 nodes, not {nodes.shape}."
+            )
+        if nodes is not None and not np.isfinite(nodes).all():
+            raise InputError("displacement has values that are not finite.")
+
+    @property
+    def factor(self) -> int:
+        """Mask pixels per SLM pixel along each axis, k."""
+        return self.mask.shape[0] // self.slm_shape[0]
+
+    @property
+    def expansion(self) -> int:
+        """Étendue expansion ``q = k^2`` (Eq. 7.10)."""
+        return self.factor**2
+
+    @property
+    def mask_pitch_um(self) -> float:
+        """Mask pixel pitch, micrometres."""
+        return self.slm_pitch_um / self.factor
+
+    def defocus(self, z_mm: float) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
+        """Return the Fresnel factor of a plane as a product of a column and a row (Eqs. 7.21, 7.22).
+
+        ``z_mm`` is the plane's distance from the Fourier lens' focal plane, away from the lens. With
+        ``u = X / (lambda f1)`` the phase is ``pi z X^2 / (lambda f1^2)``. The constant phase is left out.
+
+        Raises
+        ------
+        InputError
+            When the factor turns by more than pi between mask pixels at the aperture's edge: the plane
+            would be aliased.
+        """
+        curvature = np.pi * z_mm / (self.wavelength_nm * 1e-6 * self.focal_mm**2)
+        factors = []
+        for n in self.mask.shape:
+            x_mm = (np.arange(n) - (n - 1) / 2) * self.mask_pitch_um * 1e-3
+            if abs(curvature) * 2 * x_mm[-1] * self.mask_pitch_um * 1e-3 > np.pi:
+                limit = abs(z_mm) * np.pi / (abs(curvature) * 2 * x_mm[-1] * self.mask_pitch_um * 1e-3)
+                raise InputError(
+                    f"A plane {z_mm:g} mm out of focus is too far for this display (limit {limit:.3g} mm)."
+                )
+            factors.append(np.exp(1j * curvature * x_mm**2))
+        return factors[0], factors[1]
+
+    def envelope(self, shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors."""
+        y, x = (np.sinc(self.mask_fill * np.fft.fftfreq(n)) ** 2 for n in shape)
+        return y, x

@@ -1,0 +1,295 @@
+"""The forward model from SLM to seen image, its loss, and the gradient of that loss.
+
+In symbols (Kuo 2020, Eqs. 7.8, 7.15, 7.19, 7.22 and A.7), DC term ``d`` and envelope ``e`` added::
+
+    a   = m h_z U (alpha s + d)              field behind the mask, zero-padded to the band's grid
+    y   = F a                                field in the image plane
+    I   = e |y|^2, summed over frames        intensity
+    g   = c_s F^-1 { c_f F { I - target } }  what is counted
+    L   = 1/2 mean(g^2)                      summed over planes
+
+Only the kept lags of ``F I`` are ever formed, and ``I`` only a few rows at a time. Intensities are in units
+of the mean that an SLM of amplitude 1 gives, so ``L`` does not depend on sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.fft import irfft, rfft
+from recon.holography.display import Display
+from recon.holography.lowpass import Grid, make_band
+from recon.holography.target import Loss, Target
+from recon.threads import get_threads, in_blocks
+
+ComplexArray = npt.NDArray[Any]
+
+_BANDS = 8
+"""Mask row bands with accumulators of their own in the adjoint of a displaced mask; fixed, so that sums do
+not depend on the number of threads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Loss and gradient at one SLM pattern.
+
+    Attributes
+    ----------
+    loss : float
+    gradient : ndarray, complex, (n_frames, height, width)
+        Wirtinger gradient ``(dL/ds)^*``; a real change ``ds`` changes the loss by ``2 Re <gradient, ds>``.
+    seen_psnr_db : float
+        PSNR of the low-passed image over the whole field (all planes), the target's white as peak.
+    """
+
+    loss: float
+    gradient: ComplexArray
+    seen_psnr_db: float
+
+
+class HologramModel:
+    """Computes what an SLM pattern shows and how to change it.
+
+    Work arrays are allocated once; :attr:`nbytes` says how much. Not thread safe; use one per thread.
+
+    Parameters
+    ----------
+    display : Display
+    targets : sequence of Target
+        One per plane; planes share the loss.
+    loss : Loss
+    grid : "alias_free" or "dissertation"
+        See :mod:`recon.holography.lowpass`.
+    frames : int
+        Time-multiplexed SLM frames whose intensities average.
+    dtype : complex64 or complex128
+    """
+
+    def __init__(
+        self,
+        display: Display,
+        targets: Sequence[Target],
+        loss: Loss | None = None,
+        *,
+        grid: Grid = "alias_free",
+        frames: int = 1,
+        dtype: npt.DTypeLike = np.complex64,
+    ) -> None:
+        if not targets or frames < 1:
+            raise InputError("A hologram needs at least one target and one frame.")
+        self.display = display
+        self.targets = tuple(targets)
+        self.loss = Loss() if loss is None else loss
+        self.grid = grid
+        self.frames = frames
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
+        self._real: np.dtype[Any] = np.empty(0, self.dtype).real.dtype
+        unfiltered = self.loss.kind == "none"
+        self.band = make_band(display.slm_shape, display.factor, grid, unfiltered=unfiltered)
+        self._field = np.zeros((frames, *self.band.shape), self.dtype)
+        self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
+        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / frames)
+        response = display.mask.response(display.wavelength_nm) * aperture
+        self._table = response.astype(self.dtype)
+        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
+        ey, ex = display.envelope(self.band.shape)
+        self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
+        spectra = [target.spectrum(display, self.band) for target in self.targets]
+        self._wanted = [spectrum.astype(self.dtype) for spectrum, _ in spectra]
+        self.peaks = tuple(peak for _, peak in spectra)
+        self._cutoff = 0.0 if unfiltered else self.band.cutoff
+        self._weights: npt.NDArray[Any] | None = None
+        if self.loss.kind == "spatial":
+            height, width = self.band.seen_shape
+            self._weights = (self.loss.weights_on((height, width)) ** 2).astype(self._real)
+            self._small = np.empty((height, width // 2 + 1), self.dtype)
+            self._seen = np.empty((height, width), self._real)
+        nodes = display.displacement
+        self._nodes = None if nodes is None else np.ascontiguousarray(nodes, dtype=self._real)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in the work arrays, without the mask itself and the optimiser's vectors."""
+        arrays = [self._field, self._spectrum, *self._wanted]
+        if self._weights is not None:
+            arrays += [self._weights, self._small, self._seen]
+        return sum(a.nbytes for a in arrays)
+
+    def evaluate(self, slm: ComplexArray) -> Evaluation:
+        """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
+        from recon.holography import _kernels
+
+        patterns = self._check(slm)
+        gradient = np.zeros((self.frames, *self.display.slm_shape), self.dtype)
+        loss = 0.0
+        errors = []
+        for plane in range(len(self.targets)):
+            self._intensity_spectrum(patterns, plane)
+            error = _kernels.filtered_power(
+                self._spectrum, self._wanted[plane], self.band.cutoff, self.band.top, self.band.full
+            )
+            errors.append(error / self.peaks[plane] ** 2)
+            loss += self._loss(plane, error)
+            _kernels.columns(self._spectrum, False, get_threads())
+            for frame in range(self.frames):
+                self._backward(frame, plane, gradient[frame])
+        gradient *= self._real.type(self.display.dc.modulated)
+        error = float(np.mean(errors))
+        return Evaluation(loss, gradient, -10 * np.log10(error) if error > 0 else np.inf)
+
+    def seen(self, slm: ComplexArray, plane: int = 0) -> npt.NDArray[Any]:
+        """Return the low-passed image, real, on the band's ``seen_shape``, the axis in the middle."""
+        self._intensity_spectrum(self._check(slm), plane)
+        return self._image(self._spectrum)
+
+    def wanted(self, plane: int = 0) -> npt.NDArray[Any]:
+        """Return the low-passed target on the grid and in the units of :meth:`seen`."""
+        return self._image(self._wanted[plane])
+
+    def intensity(self, slm: ComplexArray, plane: int = 0) -> npt.NDArray[Any]:
+        """Return the intensity before any low-pass on the band's ``shape``, the centre in the middle."""
+        self._intensity_spectrum(self._check(slm), plane)
+        total = np.zeros(self.band.shape, self._real)
+        for field in self._field:
+            total += field.real**2 + field.imag**2
+        total *= self._ey[:, None] * self._ex
+        return np.fft.fftshift(total)
+
+    def back_propagate(self, amplitude: ComplexArray, plane: int = 0) -> ComplexArray:
+        """Return ``U^H m^* h^* F^-1 amplitude``: a field in the image plane integrated over the SLM pixels.
+
+        ``amplitude`` is complex on the band's ``shape`` in FFT order (Kuo 2020, Eqs. 7.11 and 7.12, without
+        taking the phase).
+        """
+        from recon.holography import _kernels
+
+        self._field[0] = amplitude
+        spectrum = np.zeros_like(self._spectrum)
+        spectrum[:, 0] = 1
+        _kernels.rows_from_spectrum(
+            self._field[0],
+            spectrum,
+            np.ones_like(self._ey),
+            np.ones_like(self._ex),
+            1.0,
+            0,
+            self.band.shape[0],
+        )
+        out = np.zeros(self.display.slm_shape, self.dtype)
+        self._columns_and_gather(0, plane, out)
+        return out
+
+    # Steps -------------------------------------------------------------------------------------
+    def _check(self, slm: ComplexArray) -> ComplexArray:
+        expected = (self.frames, *self.display.slm_shape)
+        if slm.shape != expected:
+            raise InputError(f"SLM patterns must be {expected}, not {slm.shape}.")
+        dc = self.display.dc
+        if dc.power == 0:
+            return np.ascontiguousarray(slm, self.dtype)
+        return np.ascontiguousarray(slm * dc.modulated + dc.amplitude, self.dtype)
+
+    def _intensity_spectrum(self, patterns: ComplexArray, plane: int) -> None:
+        """Fill ``_field`` with the image plane's fields and ``_spectrum`` with the intensity's kept lags."""
+        from recon.holography import _kernels
+
+        mask, k = self.display.mask.levels, self.display.factor
+        height, width = mask.shape
+        hy, hx = self._defocus[plane]
+        self._spectrum[:] = 0
+        for field, pattern in zip(self._field, patterns, strict=True):
+            field[height:, :width] = 0
+
+            def fill(start: int, stop: int, field: Any = field, pattern: Any = pattern) -> None:
+                if self._nodes is None:
+                    _kernels.fill(field, pattern, mask, self._table, hy, hx, k, start, stop)
+                else:
+                    _kernels.fill_displaced(
+                        field, pattern, mask, self._table, hy, hx, self._nodes, k, start, stop
+                    )
+
+            in_blocks(fill, height, grain=64)
+            _kernels.columns(field[:, :width], True, get_threads())
+            scale = 1.0 / np.prod(self.band.shape)
+
+            def rows(start: int, stop: int, field: Any = field, scale: float = scale) -> None:
+                _kernels.rows_to_spectrum(
+                    field, self._spectrum, self._ey, self._ex, width, scale, start, stop
+                )
+
+            in_blocks(rows, self.band.shape[0], grain=64)
+        _kernels.columns(self._spectrum, True, get_threads())
+
+    def _loss(self, plane: int, error: float) -> float:
+        """Return the loss and turn the kept lags into those of ``dL/dI`` (Kuo 2020, Eq. A.9)."""
+        from recon.holography import _kernels
+
+        band, spectrum = self.band, self._spectrum
+        if self._cutoff == 0:
+            error = _kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
+        _kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)
+        if self._weights is not None:
+            size = float(self._seen.size)
+            _kernels.copy_kept(spectrum, self._small, *band.kept, band.top)
+            irfft(self._small, self._seen.shape[1], out=self._seen)
+            error = _kernels.weigh(self._seen, self._weights, size)
+            rfft(self._seen, out=self._small)
+            self._small /= self._real.type(size)
+            _kernels.copy_kept(self._small, spectrum, *band.kept, band.top)
+        _kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
+        return error / 2
+
+    def _image(self, spectrum: ComplexArray) -> npt.NDArray[Any]:
+        """Return the low-passed image of a half spectrum, the field's centre in the middle."""
+        from recon.holography import _kernels
+
+        height, width = self.band.seen_shape
+        small = np.empty((height, width // 2 + 1), self.dtype)
+        _kernels.copy_kept(spectrum, small, *self.band.kept, self.band.top)
+        _kernels.low_pass(small, self.band.kept[0], self.band.cutoff, self.band.top)
+        return np.fft.fftshift(irfft(small, width) * self._real.type(height * width))
+
+    def _backward(self, frame: int, plane: int, out: ComplexArray) -> None:
+        from recon.holography import _kernels
+
+        field = self._field[frame]
+        scale = 1.0 / np.prod(self.band.shape)
+
+        def rows(start: int, stop: int) -> None:
+            _kernels.rows_from_spectrum(field, self._spectrum, self._ey, self._ex, scale, start, stop)
+
+        in_blocks(rows, self.band.shape[0], grain=64)
+        self._columns_and_gather(frame, plane, out)
+
+    def _columns_and_gather(self, frame: int, plane: int, out: ComplexArray) -> None:
+        from recon.holography import _kernels
+
+        mask, k, nodes = self.display.mask.levels, self.display.factor, self._nodes
+        height, width = mask.shape
+        hy, hx = self._defocus[plane]
+        field = self._field[frame]
+        _kernels.columns(field[:, :width], False, get_threads())
+        if nodes is None:
+
+            def gather(start: int, stop: int) -> None:
+                _kernels.gather(out, field, mask, self._table, hy, hx, k, start, stop)
+
+            in_blocks(gather, out.shape[0], grain=16)
+            return
+        edges = [height * band // _BANDS for band in range(_BANDS + 1)]
+        parts = np.zeros((_BANDS, *out.shape), self.dtype)
+
+        def scatter(start: int, stop: int) -> None:
+            for band in range(start, stop):
+                _kernels.gather_displaced(
+                    parts[band], field, mask, self._table, hy, hx, nodes, k, edges[band], edges[band + 1]
+                )
+
+        in_blocks(scatter, _BANDS)
+        out += parts.sum(axis=0)

@@ -1,0 +1,140 @@
+"""What a hologram is asked to show, and what is counted against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.holography.display import Display
+from recon.holography.lowpass import Band
+
+LossKind = Literal["none", "frequency", "spatial"]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """An intensity image over the whole field of view, in focus at ``z_mm``.
+
+    Attributes
+    ----------
+    image : ndarray, real, (height, width)
+        Linear intensity, non-negative, any size and scale; row 0 is the field's top.
+    z_mm : float
+        Distance of the plane from the Fourier lens' focal plane.
+    white : float or None
+        The value that PSNR counts as peak; the image's maximum by default.
+    """
+
+    image: npt.NDArray[Any]
+    z_mm: float = 0.0
+    white: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 2 or min(self.image.shape) < 8:
+            raise InputError(f"A target is (height, width) of at least 8 x 8 pixels, not {self.image.shape}.")
+        if not np.isfinite(self.image).all() or self.image.min() < 0 or self.image.max() <= 0:
+            raise InputError("A target must be finite, not negative, and not black everywhere.")
+
+    def scaled(self, display: Display) -> tuple[npt.NDArray[np.float64], float]:
+        """Return the image and its peak, scaled to what the display can emit, in FFT order (axis first).
+
+        A phase SLM cannot make the whole field darker: the mean of the intensity before the mask's envelope
+        is 1. So the target is scaled until its mean, the envelope divided out, is 1.
+        """
+        image = np.fft.ifftshift(np.asarray(self.image, np.float64))
+        ey, ex = display.envelope((image.shape[0], image.shape[1]))
+        scale = 1.0 / float((image / ey[:, None] / ex).mean())
+        peak = float(self.image.max()) if self.white is None else self.white
+        return image * scale, peak * scale
+
+    def spectrum(self, display: Display, band: Band) -> tuple[npt.NDArray[np.complex128], float]:
+        """Return Fourier coefficients at the band's kept lags, (rows, columns), and the scaled peak.
+
+        Lags that the image's own sampling does not reach are zero.
+        """
+        image, peak = self.scaled(display)
+        spectrum = np.fft.rfft2(image) / image.size
+        y, x = (lag.astype(int) for lag in band.lags())
+        known = (2 * np.abs(y)[:, None] < image.shape[0]) & (2 * x[None, :] < image.shape[1])
+        if band.full and image.shape == band.shape:
+            known[:] = True
+        rows = np.where(2 * np.abs(y) <= image.shape[0], y, 0) % image.shape[0]
+        columns = np.minimum(x, spectrum.shape[1] - 1)
+        return np.where(known, spectrum[np.ix_(rows, columns)], 0), peak
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Which differences count (Kuo 2020, Eqs. 7.16, 7.17, 7.19).
+
+    Attributes
+    ----------
+    kind : "none", "frequency" or "spatial"
+        Without constraint; only what passes the eye's low-pass; that, weighted over the field.
+    weights : ndarray, real, (height, width), or None
+        For ``"spatial"``: non-negative weights over the whole field, any size; see :func:`foveal_weights`.
+    """
+
+    kind: LossKind = "frequency"
+    weights: npt.NDArray[Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("none", "frequency", "spatial"):
+            raise InputError(f"The loss is 'none', 'frequency' or 'spatial', not {self.kind!r}.")
+        if (self.weights is not None) != (self.kind == "spatial"):
+            raise InputError("Weights are needed with the loss 'spatial', and only with it.")
+        weights = self.weights
+        if weights is not None and (
+            weights.ndim != 2 or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() <= 0
+        ):
+            raise InputError("Weights must be a (height, width) image, finite, not negative, not all zero.")
+
+    def weights_on(self, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        """Return the weights on a grid over the field, in FFT order, greatest value 1."""
+        from scipy.ndimage import map_coordinates
+
+        if self.weights is None:
+            return np.ones(shape)
+        weights = np.asarray(self.weights, float)
+        at = [
+            (np.fft.fftfreq(n) * m + m // 2).clip(0, m - 1) for n, m in zip(shape, weights.shape, strict=True)
+        ]
+        smooth = map_coordinates(weights, np.meshgrid(*at, indexing="ij"), order=1)
+        return np.asarray(smooth / weights.max(), np.float64)
+
+
+def foveal_weights(
+    shape: tuple[int, int],
+    *,
+    centre: tuple[float, float] = (0.5, 0.5),
+    radius: float = 0.28,
+    periphery: float = 0.1,
+    edge: float = 0.1,
+) -> npt.NDArray[np.float64]:
+    """Return weights that are 1 around a point and fall smoothly to ``periphery`` (Sec. 7.4).
+
+    Parameters
+    ----------
+    shape : (int, int)
+    centre : (float, float)
+        ``(y, x)`` in fractions of the field, (0, 0) the top left corner.
+    radius : float
+        Of the region that counts fully, in fractions of the field. The default circle covers a quarter of it.
+    periphery : float
+        Weight far outside.
+    edge : float
+        Width of the transition outside the radius, in fractions of the field.
+    """
+    if not (0 <= periphery <= 1 and radius > 0 and edge > 0):
+        raise InputError(
+            f"Foveal weights need radius and edge above 0 and periphery in 0 to 1, not {radius:g}, {edge:g}, "
+            f"{periphery:g}."
+        )
+    y, x = ((np.arange(n) + 0.5) / n for n in shape)
+    distance = np.hypot(y[:, None] - centre[0], x[None, :] - centre[1])
+    falling = np.clip((distance - radius) / edge, 0.0, 1.0)
+    return periphery + (1 - periphery) * (0.5 + 0.5 * np.cos(np.pi * falling))
