@@ -39,9 +39,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if command is None:
         sys.stderr.write(_unknown(name))
         return 2
-    from instrument.cli.run import run_command
+    try:
+        from instrument.cli.run import run_command
 
-    return run_command(name, command, rest, debug=debug)
+        return run_command(name, command, rest, debug=debug)
+    except KeyboardInterrupt:  # so early, or so late, that run_command could not say it
+        sys.stderr.write("interrupted.\n")
+        return 130
 
 
 def overview() -> str:

@@ -16,7 +16,6 @@ import typer
 from drivers.errors import DeviceError
 from instrument.cli.commands import Command
 from instrument.errors import BenchError
-from recon.errors import InputError
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
@@ -37,18 +36,21 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     _end_on_signals()
     try:
         app: typer.Typer = importlib.import_module(command.module).app
-        result = app(args=list(arguments), prog_name=f"diffuserbench {name}", standalone_mode=False)
+        # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
+        parser = typer.main.get_command(app)
+        with parser.make_context(f"diffuserbench {name}", list(arguments)) as context:
+            parser.invoke(context)
     except BaseException as error:
-        if debug and not isinstance(error, _UsageError | typer.Abort | SystemExit):
+        if debug and not isinstance(error, _UsageError | typer.Abort | typer.Exit | SystemExit):
             raise
         return report(error)
-    return result if isinstance(result, int) else 0
+    return 0
 
 
 def report(error: BaseException) -> int:
     """Say on stderr what went wrong and return the exit status; what is no known mistake is raised again."""
-    if isinstance(error, typer.Abort) and error.__cause__ is not None:
-        error = error.__cause__  # typer's wrapping of Ctrl-C
+    if isinstance(error, typer.Exit):
+        return error.exit_code
     if isinstance(error, _UsageError):
         error.show()  # type: ignore[attr-defined]
         return 2
@@ -65,13 +67,19 @@ def report(error: BaseException) -> int:
     if isinstance(error, DeviceError):
         _say(str(error), error)
         return 1
-    if isinstance(error, InputError):
+    if isinstance(error, ValueError) and _is_input_error(error):
         _say(str(error), error)
         return 2
     if isinstance(error, OSError) and (sentence := _file_trouble(error)):
         _say(sentence, error)
         return 2
     raise error
+
+
+def _is_input_error(error: ValueError) -> bool:
+    from recon.errors import InputError  # costs half a second, which only an error has to wait
+
+    return isinstance(error, InputError)
 
 
 def _file_trouble(error: OSError) -> str:

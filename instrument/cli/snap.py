@@ -27,6 +27,7 @@ class Light(enum.StrEnum):
     SCENE = "scene"
     SOURCE = "source"
     DARK = "dark"
+    AS_IS = "as-is"
 
 
 @app.command(
@@ -66,13 +67,19 @@ def snap(
     scene: Annotated[bool, typer.Option("--scene", help="The scene is lit (the default).")] = False,
     source: Annotated[bool, typer.Option("--source", help="The point source is lit: a PSF.")] = False,
     dark: Annotated[bool, typer.Option("--dark", help="Nothing is lit: a dark frame.")] = False,
+    as_is: Annotated[
+        bool,
+        typer.Option(
+            "--as-is", help="Switch nothing and ask nobody: for scripts on a bench with an operator."
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
 ) -> None:
     """Take a photograph and write it with its metadata (exposure, gain, stage position, light ...).
 
     The bench is opened for it and made safe again: light off, motion stopped.
     """
-    light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark})
+    light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark, Light.AS_IS: as_is})
     target = out or Path(f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif")
     _check_target(target, average, force=force)
     with saying_what_is_left(target), open_and_say(bench) as opened:
@@ -107,6 +114,8 @@ def _check_target(target: Path, average: int, *, force: bool) -> None:
 
 
 def _light(bench: Bench, light: Light) -> None:
+    if light is Light.AS_IS:
+        return
     bench.source_on() if light is Light.SOURCE else bench.source_off()
     bench.scene_on() if light is Light.SCENE else bench.scene_off()
 

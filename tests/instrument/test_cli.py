@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -35,10 +36,12 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+PROGRAM = "import sys; from instrument.cli import main; sys.exit(main())"
+
+
 def program(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    code = "import sys; from instrument.cli import main; sys.exit(main())"
     return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
+        [sys.executable, "-c", PROGRAM, *arguments],
         capture_output=True,
         text=True,
         cwd=cwd,
@@ -201,6 +204,36 @@ def test_a_failing_camera_leaves_no_file_and_a_dark_bench(
     if status == 1:
         assert "camera (mock)" in output.err
     assert (here / "photo.tif").exists() == ("stop_sequence" in fault)
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "told"),
+    [(signal.SIGINT, 130, "interrupted."), (signal.SIGTERM, 143, "stopped by a signal.")],
+    ids=["SIGINT", "SIGTERM"],
+)
+def test_a_signal_during_an_exposure_ends_it_at_once_and_says_what_is_left(
+    number: signal.Signals, status: int, told: str, tmp_path: Path
+) -> None:
+    (tmp_path / "bench.toml").write_text(
+        '[camera]\ndriver = "simulated"\nexposure_ms = 20000\n[simulated]\npreset = "tiny"\n'
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "snap", "--as-is", "--out", "photo.tif"],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    try:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("Bench:")
+        process.send_signal(number)
+        _, error = process.communicate(timeout=15)
+    finally:
+        process.kill()
+    assert process.returncode == status
+    assert error == f"{told}\nNothing was written.\n"
+    assert not (tmp_path / "photo.tif").exists()
 
 
 def test_the_program_itself_ends_with_the_status_and_without_a_traceback(tmp_path: Path) -> None:
