@@ -80,7 +80,7 @@ def reconstruct(
         for l1 a tau of 1 leaves nothing. Default: from the measurement's noise.
     iterations, time_s, tolerance : optional
         When to stop: count, wall seconds, relative change an iteration, whichever comes first. Without
-        ``iterations`` and ``time_s``: 300 iterations.
+        ``iterations`` and ``time_s``: 200 iterations.
     stop_at_noise : bool
         Also stop as soon as the residual is down to the expected noise.
     noise : NoiseModel or float, optional
@@ -121,7 +121,7 @@ def reconstruct(
     name, penalty = _named(prior, tau * peak)
     try:
         rules = StoppingRules(
-            iterations=300 if iterations is None and time_s is None else iterations,
+            iterations=200 if iterations is None and time_s is None else iterations,
             time_s=time_s,
             tolerance=tolerance,
             noise_norm=problem.noise_norm if stop_at_noise else None,

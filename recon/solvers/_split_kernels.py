@@ -2,7 +2,8 @@
 
 Arrays are ``(n_channels, height, width)``. Each channel is cut into strips of rows (``edges``) that do not
 depend on the number of threads, and sums are kept per row, so that results do not depend on it either.
-Scalars must come in the arrays' precision: a Python float would turn all arithmetic into float64.
+Penalties and thresholds are arrays with one entry a channel, in the precision of the images: a Python float
+would turn all arithmetic into float64.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ import numpy as np
 from numba import njit
 
 # Columns of ``sums``
-DATA, TV, L1, PRIMAL_V, PRIMAL_U, PRIMAL_W, DUAL_V, DUAL_U, DUAL_W, NORM_Y, NORM_U, NORM_W = range(12)
-N_SUMS = 12
+# (squared norms; CHANGE: of a split variable; MULTIPLIER: of its scaled dual variable)
+DATA, TV, L1 = 0, 1, 2
+PRIMAL_V, CHANGE_V, NORM_V, MULTIPLIER_V = 3, 4, 5, 6
+PRIMAL_U, CHANGE_U, NORM_U, MULTIPLIER_U = 7, 8, 9, 10
+PRIMAL_W, CHANGE_W, NORM_W, MULTIPLIER_W = 11, 12, 13, 14
+N_SUMS = 15
 
 # Reordering sums is fine (it is the same for every strip); NaN and infinity must stay what they are.
 FAST = {"reassoc", "contract", "nsz"}
@@ -43,7 +48,7 @@ def save_strip_neighbours(
             before = (edges[s] - 1) % height
             _update_differences(
                 y[c, before], y[c, edges[s]], tx[c, before].copy(), ty[c, before].copy(),
-                threshold, relax, isotropic, spare, above[c, s], sums,
+                threshold[c], relax, isotropic, spare, above[c, s], sums,
             )  # fmt: skip
 
 
@@ -57,7 +62,7 @@ def _update_differences(
     zero = threshold - threshold
     one = y.dtype.type(1)
     tiny = y.dtype.type(1e-30)
-    tv, primal, dual, norm = zero, zero, zero, zero
+    tv, primal, change, norm, multiplier = zero, zero, zero, zero, zero
     for j in range(width):
         dx = y[j + 1 if j + 1 < width else 0] - y[j]
         dy = following[j] - y[j]
@@ -79,12 +84,14 @@ def _update_differences(
         tx[j], ty[j] = a, b
         rx[j], ry[j] = p_new + p_new - a, q_new + q_new - b
         primal += (dx - p_new) ** 2 + (dy - q_new) ** 2
-        dual += (p_new - p) ** 2 + (q_new - q) ** 2
+        change += (p_new - p) ** 2 + (q_new - q) ** 2
         norm += p_new * p_new + q_new * q_new
+        multiplier += (a - p_new) ** 2 + (b - q_new) ** 2
     sums[TV] += tv
     sums[PRIMAL_U] += primal
-    sums[DUAL_U] += dual
+    sums[CHANGE_U] += change
     sums[NORM_U] += norm
+    sums[MULTIPLIER_U] += multiplier
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -97,28 +104,37 @@ def _update_data(
     ``prox(t) = t``.
     """
     zero = mu - mu
-    residual, primal, dual = zero, zero, zero
-    for j in range(my.size):
-        # Off the sensor: prox(t) = t, so t becomes the relaxed M y and R(t) = t.
-        step = relax * (my[j] - t[j])
-        dual += step * step
-        primal += (my[j] - t[j] - step) ** 2
-        new = t[j] + step
-        if not on_sensor or j < left or j >= left + data.size:
+    primal, change, norm = zero, zero, zero
+    first = left if on_sensor else my.size
+    last = left + data.size if on_sensor else my.size
+    for side in range(2):
+        for j in range(0 if side == 0 else last, first if side == 0 else my.size):
+            step = relax * (my[j] - t[j])
+            new = t[j] + step
+            primal += (my[j] - new) ** 2
+            change += step * step
+            norm += new * new
             t[j] = new
             my[j] = mu * new
-        else:
-            w, b = weight[j - left], data[j - left]
-            share = w / (w + mu)
-            p = t[j] + share * (b - t[j])
-            new = t[j] + relax * (my[j] - p)
-            p_new = new + share * (b - new)
-            residual += w * (my[j] - b) ** 2
-            t[j] = new
-            my[j] = mu * (p_new + p_new - new)
+    residual, multiplier = zero, zero
+    for j in range(first, last):
+        w, b = weight[j - left], data[j - left]
+        share = w / (w + mu)
+        p = t[j] + share * (b - t[j])
+        new = t[j] + relax * (my[j] - p)
+        p_new = new + share * (b - new)
+        residual += w * (my[j] - b) ** 2
+        primal += (my[j] - p_new) ** 2
+        change += (p_new - p) ** 2
+        norm += p_new * p_new
+        multiplier += (new - p_new) ** 2
+        t[j] = new
+        my[j] = mu * (p_new + p_new - new)
     sums[DATA] += residual
     sums[PRIMAL_V] += primal
-    sums[DUAL_V] += dual
+    sums[CHANGE_V] += change
+    sums[NORM_V] += norm
+    sums[MULTIPLIER_V] += multiplier
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -127,7 +143,7 @@ def _update_separable(
 ) -> None:
     """Update the separable prior's state of one row."""
     zero = relax - relax
-    primal, dual, norm, norm_y, l1 = zero, zero, zero, zero, zero
+    primal, change, norm, multiplier, l1 = zero, zero, zero, zero, zero
     for j in range(y.size):
         p = min(max(_soft(t[j], threshold), lower), upper)
         new = t[j] + relax * (y[j] - p)
@@ -135,15 +151,15 @@ def _update_separable(
         t[j] = new
         reflected[j] = p_new + p_new - new
         primal += (y[j] - p_new) ** 2
-        dual += (p_new - p) ** 2
+        change += (p_new - p) ** 2
         norm += p_new * p_new
-        norm_y += y[j] * y[j]
+        multiplier += (new - p_new) ** 2
         l1 += abs(p_new)
     sums[L1] += l1
     sums[PRIMAL_W] += primal
-    sums[DUAL_W] += dual
+    sums[CHANGE_W] += change
     sums[NORM_W] += norm
-    sums[NORM_Y] += norm_y
+    sums[MULTIPLIER_W] += multiplier
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -173,17 +189,17 @@ def sweep(
             row[:] = 0
             following = below[c, s] if i + 1 == edges[s + 1] else y[c, i + 1]
             out = y[c, i]
-            _update_separable(out, t_w[c, i], threshold_w, lower, upper, relax, rw, row)
+            _update_separable(out, t_w[c, i], threshold_w[c], lower, upper, relax, rw, row)
             _update_differences(
-                out, following, tx[c, i], ty[c, i], threshold_u, relax, isotropic, rx, ry, row
+                out, following, tx[c, i], ty[c, i], threshold_u[c], relax, isotropic, rx, ry, row
             )
-            out[0] = mu_w * rw[0] + mu_u * (rx[width - 1] - rx[0] + ry_above[0] - ry[0])
+            out[0] = mu_w[c] * rw[0] + mu_u[c] * (rx[width - 1] - rx[0] + ry_above[0] - ry[0])
             for j in range(1, width):
-                out[j] = mu_w * rw[j] + mu_u * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
+                out[j] = mu_w[c] * rw[j] + mu_u[c] * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
             ry_above[:] = ry
             on_sensor = top <= i < top + data.shape[1]
             k = i - top if on_sensor else 0
-            _update_data(my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v, relax, row)
+            _update_data(my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v[c], relax, row)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -201,11 +217,11 @@ def solve_spectrum(
     for r in range(start, stop):
         c, i = r // height, r % height
         h, a, b = H[0 if shared else c, i], Y[c, i], MY[c, i]
-        row = mu_w + mu_u * laplace_rows[i]
+        row, data, columns = mu_w[c] + mu_u[c] * laplace_rows[i], mu_v[c], mu_u[c]
         for j in range(width):
             hr, hi = h[j].real, h[j].imag
             br, bi = b[j].real, b[j].imag
-            scale = mu_v * (hr * hr + hi * hi) + row + mu_u * laplace_columns[j]
+            scale = data * (hr * hr + hi * hi) + row + columns * laplace_columns[j]
             yr = (a[j].real + hr * br + hi * bi) / scale
             yi = (a[j].imag + hr * bi - hi * br) / scale
             a[j] = complex(yr, yi)

@@ -29,6 +29,9 @@ from recon.solvers.stopping import IterationRecord
 from recon.solvers.structure import as_cropped_convolution
 from recon.threads import in_blocks
 
+SETTLING = (4, 8, 16, 32)
+"""Iterations before which the penalty of the differences is set from the object so far."""
+
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
 
@@ -37,13 +40,17 @@ STRIPS = 16
 class Penalties:
     """Penalty parameters of the three splits.
 
-    Relative to the mean of ``|H|^2``, so that they do not depend on the PSF's brightness; that they do not
-    depend on the data's brightness either follows from both sides being quadratic.
+    ``differences`` and ``separable`` are relative to the mean of ``|H|^2``, so that none depends on the PSF's
+    brightness. The defaults were found on dense, sparse and measured scenes at signal-to-noise ratios from 50
+    to 1000: after 100 iterations within about a factor of two of each scene's best constants.
     """
 
-    data: float = 1.0
-    differences: float = 1.0
-    separable: float = 1.0
+    data: float = 0.1
+    differences: float | None = None
+    """Default: from the object as it emerges, such that total variation's threshold is a tenth of its
+    brightness (its 99.9th percentile); settled after the first 32 iterations, so that convergence is certain.
+    """
+    separable: float = 0.3
 
 
 class Admm(Solver):
@@ -84,14 +91,17 @@ class Admm(Solver):
         self._weight = np.ascontiguousarray(structure.weight)
         self._data = np.ascontiguousarray(np.where(structure.weight > 0, data, 0), operator.dtype)
         self._tv, self._separable = _split_prior(prior)
-        self.prior = prior
+        self._isotropic = bool(self._tv and self._tv.isotropic)
         self._scalar = operator.dtype.type
         self.relax = relax
 
         power = float(np.mean(self._convolution.power))
         penalties = penalties or Penalties()
-        self._mu = np.array(
-            [penalties.data, penalties.differences * power, penalties.separable * power], np.float64
+        self._settles = penalties.differences is None
+        differences = 1.0 if penalties.differences is None else penalties.differences
+        # One row a split (v, u, w), one column a channel.
+        self._mu = np.outer(
+            [penalties.data, differences * power, penalties.separable * power], np.ones(len(data))
         )
         shape = operator.domain_shape
         self._y = np.zeros(shape, operator.dtype)
@@ -116,10 +126,14 @@ class Admm(Solver):
     @property
     def solution(self) -> Array:
         """The split variable that obeys the separable prior."""
-        return self._separable.prox(self._t_w, 1 / self._mu[2])
+        return np.stack(
+            [self._separable.prox(t, 1 / mu) for t, mu in zip(self._t_w, self._mu[2], strict=True)]
+        )
 
     def step(self) -> IterationRecord:
         """Update the splits in one sweep over memory, then solve for ``y`` in Fourier space."""
+        if self._settles and self._tv and self.iteration in SETTLING:
+            self._settle_differences(self._tv.weight)
         self._sweep()
         fft.rfft(self._y, out=self._Y)
         fft.rfft(self._my, out=self._MY)
@@ -131,11 +145,10 @@ class Admm(Solver):
 
     def _sweep(self) -> None:
         f = self._scalar
-        mu_v, mu_u, mu_w = (f(m) for m in self._mu)
-        weight = self._tv.weight if self._tv else 0.0
-        isotropic = bool(self._tv and self._tv.isotropic)
-        threshold_u = f(weight / self._mu[1]) if weight else f(0)
-        threshold_w = f(self._separable.weight / self._mu[2])
+        mu_v, mu_u, mu_w = self._mu.astype(self._y.dtype)
+        threshold_u = (self._tv.weight / mu_u if self._tv else 0 * mu_u).astype(mu_u.dtype)
+        threshold_w = (self._separable.weight / mu_w).astype(mu_w.dtype)
+        isotropic = self._isotropic
         relax = f(self.relax)
         self._kernels.save_strip_neighbours(
             self._y, self._tx, self._ty, self._edges, threshold_u, relax, isotropic, self._below, self._above
@@ -154,8 +167,7 @@ class Admm(Solver):
         in_blocks(strips, len(self._y) * (len(self._edges) - 1))
 
     def _solve(self) -> None:
-        f = self._scalar
-        mu_v, mu_u, mu_w = (f(m) for m in self._mu)
+        mu_v, mu_u, mu_w = self._mu.astype(self._y.dtype)
 
         def rows(start: int, stop: int) -> None:
             self._kernels.solve_spectrum(
@@ -172,9 +184,43 @@ class Admm(Solver):
         objective = 0.5 * s[k.DATA] + self._separable.weight * s[k.L1]
         if self._tv:
             objective += self._tv.weight * s[k.TV]
-        tiny = 1e-30
-        change = float(np.sqrt(s[k.DUAL_W] / max(s[k.NORM_W], tiny)))
-        return IterationRecord(0, 0.0, float(objective), data, change=change)
+        primal = max(_ratio(s[k.PRIMAL_V], s[k.NORM_V]), _ratio(s[k.PRIMAL_W], s[k.NORM_W]))
+        dual = max(_ratio(s[k.CHANGE_V], s[k.MULTIPLIER_V]), _ratio(s[k.CHANGE_W], s[k.MULTIPLIER_W]))
+        if self._tv:
+            primal = max(primal, _ratio(s[k.PRIMAL_U], s[k.NORM_U]))
+            dual = max(dual, _ratio(s[k.CHANGE_U], s[k.MULTIPLIER_U]))
+        return IterationRecord(
+            0, 0.0, float(objective), data, primal, dual, change=_ratio(s[k.CHANGE_W], s[k.NORM_W])
+        )
+
+    def _settle_differences(self, weight: float) -> None:
+        """Set the differences' penalty from each channel's brightness; their dual variable stays."""
+        for c, image in enumerate(self.solution[:, ::2, ::2]):
+            brightness = float(np.percentile(np.abs(image), 99.9))
+            if not (brightness > 0 and weight > 0):
+                continue
+            old, new = float(self._mu[1, c]), 10 * weight / brightness
+            tx, ty = self._tx[c], self._ty[c]
+            kept = _soft_pair(tx, ty, self._scalar(weight / old), self._isotropic)
+            for t, u in zip((tx, ty), kept, strict=True):
+                t -= u
+                t *= self._scalar(old / new)
+                t += u
+            self._mu[1, c] = new
+
+
+def _soft_pair(tx: Array, ty: Array, threshold: Any, isotropic: bool) -> tuple[Array, Array]:
+    """Threshold a pair of differences, together or each on its own."""
+    if isotropic:
+        size = np.sqrt(tx * tx + ty * ty)
+        keep = np.maximum(size - threshold, 0) / np.maximum(size, np.finfo(tx.dtype).tiny)
+        return tx * keep, ty * keep
+    return tx - np.clip(tx, -threshold, threshold), ty - np.clip(ty, -threshold, threshold)
+
+
+def _ratio(part: float, whole: float) -> float:
+    """Square root of a ratio of sums of squares; 0 for nothing of nothing."""
+    return float(np.sqrt(part / whole)) if whole > 0 else 0.0 if part == 0 else np.inf
 
 
 def _split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:

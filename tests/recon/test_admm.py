@@ -48,7 +48,7 @@ def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
     operator, data = problem(n_channels, erased)
     data = masked(operator, data)
     prior = PRIORS[name]
-    slow = Fista(operator, data, prior).run(StoppingRules(iterations=1000, tolerance=1e-7))
+    slow = Fista(operator, data, prior).run(StoppingRules(iterations=600, tolerance=1e-6))
     fast = Admm(operator, data, prior).run(StoppingRules(iterations=2000, tolerance=1e-9))
     expected = objective(operator, data, prior, slow.solution)
     assert objective(operator, data, prior, fast.solution) == pytest.approx(expected, rel=1e-4)

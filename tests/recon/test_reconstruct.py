@@ -51,7 +51,7 @@ def test_default_holds_over_noise(shoot, snr):
     default = psnr(reconstruct(shot.measurement, shot.psf).image, shot.truth)
     tuned = max(
         psnr(reconstruct(shot.measurement, shot.psf, tau=10.0**e).image, shot.truth)
-        for e in np.arange(-4, -1, 0.5)
+        for e in np.arange(-5, -1, 0.5)
     )
     print(f"snr {snr}: default {default:.2f} dB, tuned {tuned:.2f} dB")
     assert default > tuned - 1.0
@@ -63,7 +63,7 @@ def test_colour_channels_are_solved_each_with_its_psf(shot, shoot):
     both = reconstruct(measurement, np.stack([shot.psf, other.psf], axis=-1), iterations=60, tolerance=0)
     assert both.image.shape == (*shot.truth.shape, 2)
     alone = reconstruct(shot.measurement, shot.psf, iterations=60, tolerance=0, tau=None)
-    assert both.image[..., 0] == pytest.approx(alone.image, abs=0.01 * float(alone.image.max()))
+    assert np.linalg.norm(both.image[..., 0] - alone.image) < 1e-3 * np.linalg.norm(alone.image)
     assert psnr(both.image[..., 1] / 3, other.truth) > 24
     shared = reconstruct(measurement[..., :1], shot.psf, iterations=60, tolerance=0)
     assert shared.image.shape == (*shot.truth.shape, 1)
