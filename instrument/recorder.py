@@ -38,6 +38,8 @@ class RecordingStatus:
     ----------
     written : int
         Frames on the disk.
+    numbered : int
+        Those and the lost ones: the number of the next frame.
     dropped_by_device : int
         Frames that the camera or its driver lost.
     not_written : int
@@ -56,6 +58,7 @@ class RecordingStatus:
     """
 
     written: int
+    numbered: int
     dropped_by_device: int
     not_written: int
     waiting: int
@@ -105,7 +108,7 @@ class Recorder:
         self._seconds = seconds
         frame_bytes = math.prod(bench.camera.frame_shape) * bench.camera.frame_dtype.itemsize
         self.n_buffers = n_buffers or min(_MOST_BUFFERS, max(2 * _BATCH, _RING_BYTES // frame_bytes))
-        self._on_progress = on_progress
+        self.on_progress = on_progress
         self._stopping = threading.Event()
         self._surroundings: FrameMetadata | None = None
         self._next = 0
@@ -194,14 +197,25 @@ class Recorder:
     def _store(self, batch: list[FrameToStore], gaps: list[Gap], reader: StreamReader) -> None:
         for gap in gaps:
             self._writer.gap(gap)
-            _log.warning("%d frames lost from frame %d on (%s)", gap.count, gap.first, gap)
+            self._say_lost(gap)
         self._writer.write(batch)
         self._written += len(batch)
         self._bytes += sum(frame.image.nbytes for frame in batch)
         self._check_disk()
-        if self._on_progress is not None:
+        if self.on_progress is not None:
             newest = batch[-1].metadata.saturated_fraction if batch else 0.0
-            self._on_progress(self._status(reader, newest))
+            self.on_progress(self._status(reader, newest))
+
+    def _say_lost(self, gap: Gap) -> None:
+        """Tell of the first loss at once; the status counts the others."""
+        first = self._by_device + self._not_written == gap.count
+        _log.log(
+            logging.WARNING if first else logging.DEBUG,
+            "Frames lost from frame %d on: %d by the camera, %d because the disk was too slow.",
+            gap.first,
+            gap.by_device,
+            gap.not_written,
+        )
 
     def _check_disk(self) -> None:
         if time.monotonic() - self._disk_checked_s < _DISK_CHECK_S:
@@ -226,6 +240,7 @@ class Recorder:
         seconds = max(1e-9, time.monotonic() - (self._began_s or 0.0))
         return RecordingStatus(
             written=self._written,
+            numbered=self._next,
             dropped_by_device=self._by_device,
             not_written=self._not_written,
             waiting=reader.status.waiting,

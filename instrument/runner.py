@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 
 from drivers.errors import StoppedError
 from instrument.bench import Bench, Snapshot
@@ -51,6 +52,8 @@ class RunStatus:
         Steps whose frames are on the disk, and steps of the plan.
     step : Step or None
         The step being done, or the last one.
+    done_here : int
+        Steps among ``done`` that this runner did: those of a run that goes on were done before.
     seconds : float
         Since the run was started or resumed.
     seconds_left : float or None
@@ -66,6 +69,7 @@ class RunStatus:
     state: RunState
     done: int
     total: int
+    done_here: int = 0
     step: Step | None = None
     seconds: float = 0.0
     seconds_left: float | None = None
@@ -121,7 +125,7 @@ class Runner:
         self._writer = writer
         self._start = start
         self._todo = frozenset(range(len(plan)) if todo is None else todo)
-        self._on_progress = on_progress
+        self.on_progress = on_progress
         self._settings = StepSettings(bench)
         self._condition = threading.Condition()
         self._pausing = False
@@ -138,6 +142,17 @@ class Runner:
         """Where the run is now."""
         with self._condition:
             return self._status
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self._writer.path
+
+    @property
+    def is_pausing(self) -> bool:
+        """Whether the run is paused, or will be before its next step."""
+        with self._condition:
+            return self._pausing
 
     def pause(self) -> None:
         """Wait before the next step, light off, until ``resume``."""
@@ -283,10 +298,11 @@ class Runner:
     # Status --------------------------------------------------------------------------------------
     def _report_stored(self, snapshot: Snapshot) -> None:
         now = self.status
-        done_here = now.done + 1 - (now.total - len(self._todo))
+        done_here = now.done_here + 1
         seconds = time.monotonic() - self._started_s
         self._report(
             done=now.done + 1,
+            done_here=done_here,
             seconds=seconds,
             seconds_left=seconds / done_here * (len(self._todo) - done_here),
             dropped=now.dropped + snapshot.metadata.dropped_before,
@@ -297,5 +313,5 @@ class Runner:
         with self._condition:
             self._status = replace(self._status, **changes)  # type: ignore[arg-type]
             status = self._status
-        if self._on_progress is not None:
-            self._on_progress(status)
+        if self.on_progress is not None:
+            self.on_progress(status)

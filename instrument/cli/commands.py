@@ -18,12 +18,23 @@ class Command(NamedTuple):
 
 
 BENCH = "The bench"
+ACQUISITION = "Acquisition"
 RECONSTRUCTION = "Reconstruction"
 
 COMMANDS: Mapping[str, Command] = {
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
     "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
     "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
+    "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
+    "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.run_plan"),
+    "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.resume"),
+    "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.record"),
+    "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.list_runs"),
+    "show": Command(ACQUISITION, "say what is in a run, with a picture", "instrument.cli.show"),
+    "verify": Command(ACQUISITION, "read every frame of a run and check it", "instrument.cli.verify"),
+    "export": Command(
+        ACQUISITION, "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4", "instrument.cli.export"
+    ),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"
     ),

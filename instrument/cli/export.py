@@ -1,0 +1,80 @@
+"""``diffuserbench export``: a run's frames for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from instrument.cli.app import command_app, examples
+from instrument.cli.progress import progress_bar
+from instrument.export import export as export_run
+from instrument.store import Run
+
+app = command_app()
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench export RUN psfs.ome.tif --label psf",
+        "diffuserbench export RUN video.mp4",
+        "diffuserbench export RUN frames/ --frames 0:100",
+    )
+)
+def export(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The run's folder.")],
+    target: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TARGET",
+            help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files.",
+        ),
+    ],
+    label: Annotated[
+        str | None, typer.Option("--label", help="Only steps of this label.", show_default=False)
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            "--frames", metavar="A:B", help="Only frames A to B - 1; A:B:C every C-th.", show_default=False
+        ),
+    ] = None,
+    frames_per_s: Annotated[
+        float | None,
+        typer.Option("--fps", min=0.1, help="Frames a second of an MP4.", show_default=False),
+    ] = None,
+) -> None:
+    """Write a run's stored frames for other programs; the run stays as it is.
+
+    Frames that are not there (gaps of a recording, steps not done) are left out, and said.
+    """
+    found = Run.open(run)
+    wanted = set(range(found.n_frames)[_slice(frames)])
+    if label is not None:
+        wanted &= {step.index for step in found.steps(label)}
+    indices = [index for index in sorted(found.records) if index in wanted]
+    with progress_bar() as bar:
+        task = bar.add_task("Frames", total=len(indices), note="")
+        export_run(
+            found,
+            target,
+            indices,
+            frames_per_s=frames_per_s,
+            on_frame=lambda done: bar.update(task, completed=done),
+        )
+    typer.echo(f"Wrote {len(indices)} frames: {target}")
+    if absent := len(wanted) - len(indices):
+        typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
+
+
+def _slice(text: str | None) -> slice:
+    if text is None:
+        return slice(None)
+    try:
+        numbers = [int(part) if part else None for part in text.split(":")]
+        if len(numbers) == 1 and numbers[0] is not None:
+            return slice(numbers[0], numbers[0] + 1)
+        return slice(*numbers)
+    except (ValueError, TypeError):
+        raise typer.BadParameter(f"--frames {text!r}: give A:B, e.g. 0:100, or one number.") from None

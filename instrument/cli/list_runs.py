@@ -1,0 +1,49 @@
+"""``diffuserbench list``: the runs in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from instrument.cli.app import BenchOption, command_app, examples
+from instrument.config_file import load_config
+from instrument.store import Run, RunError
+from instrument.store.run import STATE
+
+app = command_app()
+
+
+@app.command(name="list", epilog=examples("diffuserbench list", "diffuserbench list /data/monday"))
+def list_runs(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="FOLDER", help="Default: data_folder of bench.toml.", show_default=False),
+    ] = None,
+    bench: BenchOption = None,
+) -> None:
+    """List the runs in a folder, the newest last: what became of each, its frames, its label."""
+    folder = folder or load_config(bench).data_folder
+    if not folder.is_dir():
+        typer.echo(f"{folder}: no such folder, so no runs yet.")
+        return
+    paths = sorted(p for p in folder.iterdir() if not p.name.startswith(".") and (p / STATE).is_file())
+    if not paths:
+        typer.echo(f"{folder}: no runs.")
+        return
+    table = Table(title=str(folder), title_justify="left", box=None)
+    for heading in ("run", "became", "frames", "kind", "bench"):
+        table.add_column(heading, overflow="fold", justify="right" if heading == "frames" else "left")
+    for path in paths:
+        try:
+            run = Run.open(path)
+        except RunError as error:
+            table.add_row(path.name, "UNREADABLE", "", "", error.problem)
+            continue
+        kind = "recording" if run.plan is None else "plan"
+        mark = "SIMULATED" if run.is_simulated else ""
+        table.add_row(path.name, run.condition, f"{len(run.records)} of {run.n_frames}", kind, mark)
+    Console(width=None if Console().is_terminal else 160).print(table, markup=False)

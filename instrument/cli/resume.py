@@ -1,0 +1,55 @@
+"""``diffuserbench resume``: go on with a run that was aborted, stopped, failed or killed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.progress import progress_bar
+from instrument.cli.running import carry_out, home_if_needed
+from instrument.resume import prepare_resume
+from instrument.store import FinishReason, Run, RunCondition, RunWriter
+from instrument.store.run import BENCH_TOML
+
+app = command_app()
+
+
+@app.command(name="resume", epilog=examples("diffuserbench resume runs/2026-11-21_14-03-22_axial-sweep"))
+def resume(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The run's folder.")],
+    bench: BenchOption = None,
+) -> None:
+    """Go on with the first step whose data are not safely stored; repeat none that are.
+
+    Every frame that the run has is read first and held against its checksum; what was found is said. The
+    bench is the run's own bench.toml unless --bench names another. A recording cannot go on; one that was
+    cut off is closed, so that it reads as what it is.
+    """
+    found = Run.open(run)
+    if found.plan is None:
+        _close_recording(found)
+        return
+    if found.condition is RunCondition.COMPLETED and not found.missing():
+        typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
+        return
+    with open_and_say(bench or run / BENCH_TOML) as opened:
+        home_if_needed(opened, found.plan)
+        with progress_bar() as bar:
+            task = bar.add_task("Verifying", total=len(found.records), note="")
+            runner, findings = prepare_resume(
+                opened, run, on_verify=lambda done, _: bar.update(task, completed=done)
+            )
+        typer.echo(f"Found {findings}", err=True)
+        carry_out(opened, runner)
+
+
+def _close_recording(run: Run) -> None:
+    if run.condition is not RunCondition.CRASHED:
+        typer.echo(f"{run.path}: a recording, {run.condition}; there is nothing to go on with.")
+        return
+    with RunWriter.reopen(run.path) as writer:
+        closed = writer.finish(FinishReason.ABORTED, "its program ended without finishing it")
+    typer.echo(f"{run.path}: the recording was cut off; closed with its {len(closed.records)} frames.")
