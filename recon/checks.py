@@ -13,6 +13,9 @@ from recon.types import Calibration
 SATURATED_SHARE = 1e-5
 """Share of pixels at exactly the maximum above which an image is taken for saturated."""
 
+SATURATED_LIGHT = 0.01
+"""Share of a PSF's light in saturated pixels from which the picture suffers."""
+
 
 def as_channels(image: npt.ArrayLike, name: str) -> npt.NDArray[np.float32]:
     """Return an image (height, width[, n_channels]) of any numeric dtype as float32, channels first.
@@ -75,9 +78,11 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
                 "Check the dark frame."
             )
         share = saturated_share(psf)
-        if share:
+        light = share * psf.size * high / float(np.sum(psf, dtype=np.float64))
+        if light > SATURATED_LIGHT:
             warnings.append(
-                f"{where} looks saturated: {share:.2%} of its pixels are at exactly its maximum {high:g}. "
+                f"{where} looks saturated: {share:.2%} of its pixels, with {light:.0%} of its light, are at "
+                f"exactly its maximum {high:g}. "
                 "The picture will be blurred; calibrate again with a shorter exposure."
             )
         negative = float(-np.sum(psf[psf < 0], dtype=np.float64) / np.sum(np.abs(psf), dtype=np.float64))
