@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self
 
@@ -55,6 +56,11 @@ class SharedPart(ABC):
     def __init__(self, options: DriverOptions) -> None: ...
 
 
+def port_claim(port: str) -> str:
+    """Return the claim for a serial port or any other file in ``/dev``, whatever link it is named by."""
+    return f"port {Path(port).resolve()}"
+
+
 class Device(ABC):
     """A device that can be opened, asked who it is, asked for its settings, and closed.
 
@@ -74,6 +80,15 @@ class Device(ABC):
 
     @abstractmethod
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None: ...
+
+    @classmethod
+    def claims(cls, options: DriverOptions) -> tuple[str, ...]:
+        """Return the names of what only one program at a time may hold for a device with these options.
+
+        A driver for a port returns the port (``port_claim``); a simulated one nothing. By default two devices
+        are the same when driver and options are.
+        """
+        return (f"{cls.__module__}.{cls.__qualname__} {options.model_dump_json()}",)
 
     @property
     @abstractmethod

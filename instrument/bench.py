@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera, Roi
+from drivers.claim import Claim
 from drivers.device import Device, SharedPart
 from drivers.frame import FrameMetadata
 from drivers.led_array import LedArray, LedPattern
@@ -94,6 +95,7 @@ class Bench:
         self.config = config
         self._ask = ask
         self._asked: dict[str, bool] = {}
+        self._claims: list[Claim] = []
         self.shared: Mapping[str, SharedPart] = {
             name: shared.part(shared.options) for name, shared in config.shared.items()
         }
@@ -131,9 +133,11 @@ class Bench:
         Raises
         ------
         DeviceError
-            Naming the device that is missing or refuses, and what to check.
+            Naming the device that is missing, refuses, or is in use by another program, and what to check.
         """
         try:
+            for kind in self.devices:
+                self._claim(kind)
             for kind in self.devices:
                 self.open_device(kind)
         except BaseException as error:
@@ -144,12 +148,21 @@ class Bench:
     def open_device(self, kind: Kind) -> Device:
         """Open one device and apply its configured settings."""
         _open_benches.add(self)
+        self._claim(kind)
         device = self.devices[kind]
         device.open()
         if kind == "camera":
             self._apply_camera_settings(cast(CameraTable, self.config.devices[kind].settings))
         _log.info("%s opened: %s", device.name, device.identity)
         return device
+
+    def _claim(self, kind: Kind) -> None:
+        """Keep other programs from a device, before it is touched, until the bench is closed."""
+        held = {claim.resource for claim in self._claims}
+        device = self.config.devices[kind]
+        for resource in device.driver.claims(device.options):
+            if resource not in held:
+                self._claims.append(Claim(resource, self.devices[kind].name))
 
     def _apply_camera_settings(self, wanted: CameraTable) -> None:
         camera = self.camera
@@ -391,6 +404,8 @@ class Bench:
         """
         steps = self._safe_steps()
         steps += [(f"close {device.name}", device.close) for device in reversed(list(self.devices.values()))]
+        steps += [(f"release {claim.resource}", claim.release) for claim in self._claims]
+        self._claims = []
         try:
             try_all(steps)
         finally:

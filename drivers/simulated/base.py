@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from drivers.device import Device, DeviceIdentity, SharedPart
+from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceNotOpenError
 from drivers.simulated.world import SimulatedWorld
 
@@ -19,6 +19,11 @@ class SimulatedDevice(Device):
     model: ClassVar[str]
     world: SimulatedWorld
     _is_open = False
+
+    @classmethod
+    def claims(cls, _options: DriverOptions) -> tuple[str, ...]:
+        """Claim nothing: every program has a simulated world of its own."""
+        return ()
 
     def _connect(self, shared: SharedPart | None) -> None:
         if not isinstance(shared, SimulatedWorld):

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.camera import Camera, Roi, TriggerMode
-from drivers.device import Device, DeviceIdentity, DriverOptions, Setting, SharedPart
+from drivers.device import Device, DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, LimitError
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import OFF, LedArray, LedPattern
@@ -58,6 +58,11 @@ class MockDevice(Device):
         self._options = options
         self.world = shared
         self._open = False
+
+    @classmethod
+    def claims(cls, options: DriverOptions) -> tuple[str, ...]:
+        assert isinstance(options, MockOptions)
+        return () if options.port == "none" else (port_claim(options.port),)
 
     def _call(self, method: str) -> None:
         self.world.calls.append(f"{self.kind}.{method}")
