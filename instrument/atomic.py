@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from instrument.errors import FileError
+
+_NEARLY_FULL_BYTES = 1 << 20
 
 
 @contextlib.contextmanager
@@ -35,6 +39,9 @@ def whole_file(path: Path | str) -> Iterator[Path]:
         temporary.replace(path)
         sync_folder(path.parent)
     except OSError as error:
+        if error.errno is None and shutil.disk_usage(path.parent).free < _NEARLY_FULL_BYTES:
+            # Some writers only notice that less was written than they asked for.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
         error.filename = str(path)
         raise
     finally:

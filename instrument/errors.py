@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,3 +76,21 @@ class ConfigError(BenchError):
             place = f"{path}:{problem.line}" if problem.line is not None else f"{path}"
             lines.append(f"  {place}: {problem.where}: {problem.text}")
         super().__init__("\n".join(lines))
+
+
+_REASONS = {
+    errno.EACCES: "no permission. Check who owns it, or choose another place.",
+    errno.EPERM: "not permitted. Check who owns it, or choose another place.",
+    errno.EROFS: "the disk is read-only. Choose another place.",
+    errno.ENOSPC: "no space left on the disk. Free some, or choose another place.",
+    errno.EDQUOT: "your disk quota is used up. Free some, or choose another place.",
+    errno.ENOENT: "there is no such file or folder.",
+    errno.EISDIR: "it is a folder; a file is expected.",
+    errno.ENOTDIR: "a part of this path is a file, not a folder.",
+    errno.ENAMETOOLONG: "the name is too long.",
+}
+
+
+def os_reason(error: OSError) -> str:
+    """Return what the operating system refused, as a sentence without the path, and what to do about it."""
+    return _REASONS.get(error.errno or 0, f"{error.strerror or error}.")

@@ -15,7 +15,7 @@ import typer
 
 from drivers.errors import DeviceError
 from instrument.cli.commands import Command
-from instrument.errors import BenchError
+from instrument.errors import BenchError, os_reason
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
@@ -84,21 +84,9 @@ def _is_input_error(error: ValueError) -> bool:
 
 def _file_trouble(error: OSError) -> str:
     """Return a sentence for trouble with a named file or a full disk, else nothing."""
-    reasons = {
-        errno.EACCES: "no permission. Check who owns it, or choose another place.",
-        errno.EPERM: "not permitted. Check who owns it, or choose another place.",
-        errno.EROFS: "the disk is read-only. Choose another place.",
-        errno.ENOSPC: "no space left on the disk. Free some, or choose another place.",
-        errno.EDQUOT: "your disk quota is used up. Free some, or choose another place.",
-        errno.ENOENT: "there is no such file or folder.",
-        errno.EISDIR: "is a folder; a file is expected.",
-        errno.ENOTDIR: "a part of this path is a file, not a folder.",
-        errno.ENAMETOOLONG: "the name is too long.",
-    }
-    if error.filename is None and error.errno != errno.ENOSPC:
-        return ""
-    where = f"{os.fsdecode(error.filename)}: " if error.filename is not None else ""
-    return where + reasons.get(error.errno or 0, f"{error.strerror or error}.")
+    if error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {os_reason(error)}"
+    return os_reason(error) if error.errno == errno.ENOSPC else ""
 
 
 def _say(text: str, error: BaseException) -> None:
