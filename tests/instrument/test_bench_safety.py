@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Sequence
 
 import pytest
 
-from drivers.errors import DeviceError, LimitError
+from drivers.errors import DeviceError, LimitError, StoppedError
 from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
 from instrument.errors import BenchError, OperatorNeededError
@@ -164,3 +166,36 @@ def test_the_bench_says_that_it_is_simulated() -> None:
     with bench_with().open() as bench:
         assert "SIMULATED" in bench.label
         assert str(bench).count("SIMULATED") == 5
+
+
+def test_stop_from_another_thread_ends_a_move_and_darkens_the_source() -> None:
+    text = """
+        camera.driver = "simulated"
+        stage.driver = "simulated"
+        led_array.driver = "simulated"
+        simulated.preset = "tiny"
+    """
+    with open_bench(parse_config(text, None)) as bench:
+        assert bench.stage is not None
+        assert bench.led_array is not None
+        bench.stage.home()
+        bench.source_on()
+        start = bench.source_position_um
+        target_um = bench.stage.limits["x_um"][1]
+        ended: list[BaseException] = []
+
+        def move() -> None:
+            try:
+                bench.place_source(x_um=target_um)
+            except StoppedError as error:
+                ended.append(error)
+
+        mover = threading.Thread(target=move)
+        mover.start()
+        while bench.source_position_um[0] == start[0]:
+            time.sleep(0.001)
+        bench.stop()
+        mover.join(timeout=10)
+        assert len(ended) == 1
+        assert bench.source_position_um[0] < target_um - 1000
+        assert bench.led_array.pattern.is_dark

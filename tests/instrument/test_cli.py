@@ -126,6 +126,13 @@ def test_new_writes_a_file_that_is_understood_and_spares_an_existing_one(
     assert (here / "bench.toml").read_text() != "mine"
 
 
+def test_drivers_are_listed_by_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["drivers"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["camera", "stage", "led_array", "slm"]
+    assert all("simulated" in line for line in lines)
+
+
 # check --------------------------------------------------------------------------------------------------
 @pytest.mark.usefixtures("mock_drivers")
 def test_check_reports_every_device_and_ends_dark(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
