@@ -3,6 +3,7 @@
 from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome, Solver
 from recon.solvers.fista import Fista
+from recon.solvers.literal_admm import LiteralAdmm
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
 from recon.solvers.wiener import wiener
 
@@ -10,6 +11,7 @@ __all__ = [
     "Admm",
     "Fista",
     "IterationRecord",
+    "LiteralAdmm",
     "Outcome",
     "Penalties",
     "Solver",

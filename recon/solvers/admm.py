@@ -90,7 +90,7 @@ class Admm(Solver):
         self._convolution = structure.convolution
         self._weight = np.ascontiguousarray(structure.weight)
         self._data = np.ascontiguousarray(np.where(structure.weight > 0, data, 0), operator.dtype)
-        self._tv, self._separable = _split_prior(prior)
+        self._tv, self._separable = split_prior(prior)
         self._isotropic = bool(self._tv and self._tv.isotropic)
         self._scalar = operator.dtype.type
         self.relax = relax
@@ -223,7 +223,7 @@ def _ratio(part: float, whole: float) -> float:
     return float(np.sqrt(part / whole)) if whole > 0 else 0.0 if part == 0 else np.inf
 
 
-def _split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
+def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
     """Take the prior apart into total variation and separable part."""
     terms = prior.terms()
     separable = sum_of(*(t for t in terms if isinstance(t, Separable)))

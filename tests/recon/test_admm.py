@@ -7,8 +7,9 @@ import pytest
 
 from recon import fft
 from recon.operators import Erasures, PadCropConvolution
-from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
-from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
+from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
+from recon.solvers import Admm, Fista, LiteralAdmm, Penalties, StoppingRules, StopReason
+from recon.solvers.admm import split_prior
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
@@ -42,7 +43,7 @@ def masked(operator, data):
     return data * operator.outer.valid if hasattr(operator, "outer") else data
 
 
-@pytest.mark.parametrize(("n_channels", "erased"), [(1, False), (1, True), (2, False)])
+@pytest.mark.parametrize(("n_channels", "erased"), [(1, False), (2, True)])
 @pytest.mark.parametrize("name", PRIORS)
 def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
     operator, data = problem(n_channels, erased)
@@ -52,6 +53,63 @@ def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
     fast = Admm(operator, data, prior).run(StoppingRules(iterations=2000, tolerance=1e-9))
     expected = objective(operator, data, prior, slow.solution)
     assert objective(operator, data, prior, fast.solution) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("relax", [1.0, 1.7])
+@pytest.mark.parametrize("name", ["tv", "isotropic tv", "l1", "box"])
+def test_is_the_textbook_s_admm_step_by_step(name, relax):
+    """Boyd et al. 2011, scaled form with over-relaxation, on dense matrices."""
+    operator, data = problem(erased=True)
+    data = masked(operator, data)
+    tv, separable = split_prior(PRIORS[name])
+    camera, size = operator.inner, int(np.prod(operator.domain_shape))
+    points = np.eye(size).reshape(size, *operator.domain_shape)
+    M = np.stack([camera.circular(p).ravel() for p in points], axis=1)
+    psi = Differences(operator.domain_shape, (1.0, 1.0), dtype=np.float64)
+    Psi = np.stack([psi.forward(p).ravel() for p in points], axis=1)
+    mask, b = np.zeros(operator.domain_shape), np.zeros(operator.domain_shape)
+    mask[camera.sensor_window], b[camera.sensor_window] = operator.outer.valid, data
+    mask, b = mask.ravel(), b.ravel()
+    weight = tv.weight if tv else 0.0
+
+    def prox_u(t, mu):
+        pair = t.reshape(2, -1)
+        length = np.linalg.norm(pair, axis=0) if tv and tv.isotropic else np.abs(pair)
+        return (pair * np.maximum(1 - weight / mu / np.maximum(length, 1e-300), 0)).ravel()
+
+    power = float(np.mean(camera.power))
+    splits = [
+        (M, 0.5, lambda t, mu: (b + mu * t) / (mask + mu)),
+        (Psi, 0.8 * power, prox_u),
+        (np.eye(size), 1.5 * power, lambda t, mu: separable.prox(t, 1 / mu)),
+    ]
+    normal = sum(mu * K.T @ K for K, mu, _ in splits)
+    y = np.zeros(size)
+    z = [prox(K @ y, mu) for K, mu, prox in splits]
+    d = [K @ y - v for (K, _, _), v in zip(splits, z, strict=True)]
+    fast = Admm(operator, data, PRIORS[name], penalties=Penalties(0.5, 0.8, 1.5), relax=relax)
+    for _ in range(10):
+        for i, (K, mu, prox) in enumerate(splits):
+            ahead = relax * (K @ y) + (1 - relax) * z[i]
+            z[i] = prox(ahead + d[i], mu)
+            d[i] = d[i] + ahead - z[i]
+        right = sum(mu * K.T @ (v - e) for (K, mu, _), v, e in zip(splits, z, d, strict=True))
+        y = np.linalg.solve(normal, right)
+        fast.step()
+        assert fast._y.ravel() == pytest.approx(y, abs=1e-10)
+        assert fast.solution.ravel() == pytest.approx(z[2], abs=1e-10)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_literal_algorithm_reaches_the_same_minimum(name):
+    operator, data = problem(2, erased=True)
+    data = masked(operator, data)
+    fast = Admm(operator, data, PRIORS[name]).run(StoppingRules(iterations=2000, tolerance=1e-7))
+    slow = LiteralAdmm(operator, data, PRIORS[name], (0.1, 3.0, 3.0)).run(
+        StoppingRules(iterations=3000, tolerance=1e-7)
+    )
+    expected = objective(operator, data, PRIORS[name], slow.solution)
+    assert objective(operator, data, PRIORS[name], fast.solution) == pytest.approx(expected, rel=1e-4)
 
 
 def test_penalties_and_relaxation_change_the_way_not_the_goal():
