@@ -31,8 +31,9 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
 
     Raises
     ------
-    StepsFailedError
-        When something failed here and there is no ``error`` that says so.
+    StepsFailedError, RunError
+        When something failed here and there is no ``error`` to note it on: the bench could not be made safe,
+        or the run's end not be written.
     """
     text = "" if error is None else str(error) or type(error).__name__
     ended: list[Run] = []
@@ -44,10 +45,15 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
             ]
         )
     except StepsFailedError as failure:
+        first, *others = (problem for _, problem in failure.failures)
         if error is None:
-            raise
-        _log.error("%s", failure)
-        error.add_note(str(failure))
+            for other in others:
+                first.add_note(str(other))
+            first.add_note(f"What was acquired is in {writer.path}")
+            raise first from None
+        for problem in (first, *others):
+            _log.error("%s", problem)
+            error.add_note(str(problem))
     if error is not None:
         error.add_note(f"What was acquired is in {writer.path}")
     return ended[0] if ended else Run.open(writer.path)

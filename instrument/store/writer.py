@@ -239,7 +239,7 @@ class RunWriter:
             )
         except OSError as failure:
             raise RunError(
-                self.path, f"its end could not be noted: {failure.strerror}.", _remedy(failure)
+                self.path, f"its array could not be trimmed: {failure.strerror}.", _remedy(failure)
             ) from failure
         finally:
             self.close()
@@ -278,11 +278,21 @@ class RunWriter:
         return self._array
 
     def _append(self, record: Mapping[str, Any]) -> None:
-        self._log.append([record])
+        try:
+            self._log.append([record])
+        except OSError as error:
+            raise RunError(
+                self.path, f"its log could not be written: {error.strerror}.", _remedy(error)
+            ) from error
 
     def _set_state(self, **changes: Any) -> None:
+        try:
+            write_json(self.path / STATE, self._state | changes)
+        except OSError as error:
+            raise RunError(
+                self.path, f"its state could not be written: {error.strerror}.", _remedy(error)
+            ) from error
         self._state.update(changes)
-        write_json(self.path / STATE, self._state)
 
 
 def _with_copies(plan: Plan, folder: Path) -> Plan:
