@@ -15,43 +15,52 @@ from recon.operators._plane_kernels import (
     to_spectrum,
 )
 
-STATISTICS = 3
+STATISTICS = 4
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def _update_plane(z: Any, d: Any, t: Any, relax: Any, positive: bool, st: Any) -> None:
-    """``x = z + d; u = prox(x + d); z <- z + relax (u - x)``; ``st``: l1, (u - x)^2, u^2."""
+def _update_plane(z: Any, d: Any, t: Any, relax: Any, step_scale: Any, positive: bool, st: Any) -> None:
+    """``x = z + d; u = prox(x + d); z <- z + relax (u - x)``; ``st``: l1, (u - x)^2, u^2, d^2.
+
+    Where gamma is multiplied by ``step_scale``, so is ``d``, about an unchanged x.
+    """
     zero = t - t
+    shift = relax / relax - step_scale
     for y in range(z.shape[0]):
         a = z[y]
         b = d[y]
         l1 = zero
         gap = zero
         uu = zero
+        dd = zero
         for i in range(a.shape[0]):
-            v = a[i] + b[i] + b[i]
+            scaled = step_scale * b[i]
+            state = a[i] + shift * b[i]
+            v = state + scaled + scaled
             u = max(v - t, zero) if positive else v - max(min(v, t), -t)
-            r = u - a[i] - b[i]
-            a[i] += relax * r
+            r = u - state - scaled
+            a[i] = state + relax * r
             l1 += abs(u)
             gap += r * r
             uu += u * u
+            dd += scaled * scaled
         st[0] += l1
         st[1] += gap
         st[2] += uu
+        st[3] += dd
 
 
 @njit(nogil=True, cache=True)
 def l1_sweep(
-    Z: Any, H: Any, E: Any, t: Any, relax: Any, positive: bool, total: Any, st: Any, z0: int, z1: int,
-    d: Any, scratch: Any,
+    Z: Any, H: Any, E: Any, t: Any, relax: Any, step_scale: Any, positive: bool, total: Any, st: Any, z0: int,
+    z1: int, d: Any, scratch: Any,
 ) -> None:  # fmt: skip
     """One iteration on planes ``z0 <= z < z1``; ``total += H F z``. ``E`` carries the factor gamma."""
     for z in range(z0, z1):
         conjugate_product(H[z], E, scratch)
         from_spectrum(scratch, d)
         st[z] = 0
-        _update_plane(Z[z], d, t, relax, positive, st[z])
+        _update_plane(Z[z], d, t, relax, step_scale, positive, st[z])
         to_spectrum(Z[z], scratch)
         add_product(total, H[z], scratch)
 
@@ -66,14 +75,6 @@ def l1_solution_plane(z: Any, d: Any, t: Any, positive: bool) -> None:
         for i in range(a.shape[0]):
             v = a[i] + b[i] + b[i]
             a[i] = max(v - t, zero) if positive else v - max(min(v, t), -t)
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def rescale_plane(z: Any, d: Any, factor: Any) -> None:
-    """Keep ``x = z + d`` where gamma, and with it ``d``, is multiplied by ``factor``."""
-    for y in range(z.shape[0]):
-        for i in range(z.shape[1]):
-            z[y, i] += (1 - factor) * d[y, i]
 
 
 def plane_scratch(shape: tuple[int, int], dtype: Any) -> tuple[Any, Any]:

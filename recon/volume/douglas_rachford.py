@@ -20,10 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import fft
+from recon.operators.background import BackgroundRemoval
 from recon.operators.base import Array
 from recon.operators.convolution3d import Convolution3D
 from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord
+from recon.volume.balance import is_due
 from recon.volume.scale import expected_height
 from recon.volume.sensor_system import SensorSystem, residual_norm
 
@@ -42,6 +44,8 @@ class DouglasRachford(Solver):
         Non-negativity as well.
     valid : ndarray of bool, (height, width), optional
         Pixels that were measured.
+    background : BackgroundRemoval, optional
+        A smooth background to be estimated as well, for the same valid pixels.
     initial : ndarray, (1, n_z, grid_height, grid_width), optional
         Starting point; default zeros.
     step : float, optional
@@ -49,11 +53,14 @@ class DouglasRachford(Solver):
         be expected to have.
     relaxation : float
         alpha, between 1 and 2.
+    balance : bool
+        Adapt gamma to ``||u|| / ||A^H e||``, the length of the way that x has to go over that of the
+        multiplier.
     keep_state : bool
         False lets the result take the state's place when :meth:`run` ends.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma")
+    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma")
 
     def __init__(
         self,
@@ -63,9 +70,11 @@ class DouglasRachford(Solver):
         *,
         positive: bool = True,
         valid: npt.NDArray[np.bool_] | None = None,
+        background: BackgroundRemoval | None = None,
         initial: Array | None = None,
         step: float | None = None,
         relaxation: float = 1.7,
+        balance: bool = True,
         keep_state: bool = True,
     ) -> None:
         super().__init__()
@@ -78,9 +87,12 @@ class DouglasRachford(Solver):
         self.weight = float(weight)
         self.positive = positive
         self.relaxation = relaxation
+        self.balance = balance
         self.keep_state = keep_state
         dtype = operator.dtype
-        self.system = SensorSystem(operator.grid_shape, operator.sensor_window, valid, dtype=dtype)
+        self.system = SensorSystem(
+            operator.grid_shape, operator.sensor_window, valid, background, dtype=dtype
+        )
         self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
         self.z = np.zeros(operator.domain_shape[1:], dtype)
         if initial is not None:
@@ -92,7 +104,7 @@ class DouglasRachford(Solver):
             step = (
                 _THRESHOLD * height / weight if height > 0 and weight > 0 else 1 / float(self._power.mean())
             )
-        self.gamma = float(step)
+        self.gamma = self._used_gamma = float(step)
         self.e = np.zeros_like(self.data)
         self._statistics = np.zeros((len(self.z), _l1_kernels.STATISTICS))
         spectrum = fft.spectrum_shape(operator.grid_shape)
@@ -102,7 +114,7 @@ class DouglasRachford(Solver):
         )
 
     def _solve_data_term(self, forward_z: Array) -> None:
-        self.system.set_curvature(self._power * self._power.dtype.type(self.gamma))
+        self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
         self.system.solve(self.data - self.system.masked(forward_z), self.e)
 
     def step(self) -> IterationRecord:
@@ -110,7 +122,8 @@ class DouglasRachford(Solver):
         k = self._kernels
         dtype = self.operator.dtype
         E = self.system.spectrum_of(self.e)
-        E *= dtype.type(self.gamma)
+        E *= dtype.type(self._used_gamma)
+        step_scale = dtype.type(self.gamma / self._used_gamma)
         H = self.operator.channel_spectrum(0)
         threshold, relaxation = dtype.type(self.gamma * self.weight), dtype.type(self.relaxation)
         self._totals[...] = 0
@@ -118,17 +131,20 @@ class DouglasRachford(Solver):
         def job(group: int, z0: int, z1: int) -> None:
             plane, spectrum = k.plane_scratch(self.operator.grid_shape, dtype)
             k.l1_sweep(
-                self.z, H, E, threshold, relaxation, self.positive, self._totals[group], self._statistics,
-                z0, z1, plane, spectrum,
+                self.z, H, E, threshold, relaxation, step_scale, self.positive, self._totals[group],
+                self._statistics, z0, z1, plane, spectrum,
             )  # fmt: skip
 
         self.operator.groups.run(job)
         residual = residual_norm(self.e)
-        l1, gap, size = self._statistics.sum(axis=0)
+        l1, gap, size, dual = self._statistics.sum(axis=0)
         total = self._totals[0]
         for other in self._totals[1:]:
             total += other
         gap = float(np.sqrt(gap / size)) if size > 0 else 0.0
+        self._used_gamma = self.gamma
+        if self.balance and is_due(self.iteration) and size > 0 and dual > 0:
+            self.gamma *= float(np.clip(np.sqrt(size / dual), 0.2, 5.0))
         self.system.follow(gap)
         self._solve_data_term(self.system.from_spectrum(total))
         return IterationRecord(
@@ -154,9 +170,9 @@ class DouglasRachford(Solver):
     def _write_solution(self, z: Array) -> Array:
         k = self._kernels
         E = self.system.spectrum_of(self.e)
-        E *= E.dtype.type(self.gamma)
+        E *= z.dtype.type(self._used_gamma)
         H = self.operator.channel_spectrum(0)
-        threshold = z.dtype.type(self.gamma * self.weight)
+        threshold = z.dtype.type(self._used_gamma * self.weight)
 
         def job(_: int, z0: int, z1: int) -> None:
             plane, spectrum = k.plane_scratch(self.operator.grid_shape, z.dtype)

@@ -28,12 +28,13 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import fft
+from recon.operators.background import BackgroundRemoval
 from recon.operators.base import Array
 from recon.operators.convolution3d import Convolution3D
 from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord
 from recon.threads import get_threads, in_blocks
-from recon.volume.scale import expected_height
+from recon.volume.balance import is_due
 from recon.volume.sensor_system import SensorSystem, residual_norm
 
 _TILE = 256
@@ -56,11 +57,13 @@ class LeanTotalVariation(Solver):
         Length of the gradient instead of the sum of its components.
     valid : ndarray of bool, (height, width), optional
         Pixels that were measured.
+    background : BackgroundRemoval, optional
+        A smooth background to be estimated as well, for the same valid pixels.
     initial : ndarray, (1, n_z, grid_height, grid_width), optional
         Starting point; default zeros.
     penalty : float, optional
-        mu to start with. Default: such that the threshold ``tau / mu`` is ``_THRESHOLD`` of the height that a
-        voxel may be expected to have.
+        mu to start with. Default: ``_PENALTY`` of the mean over frequencies of ``sum_z |H_z|^2``, the
+        curvature of the data term: independent of exposure, size and tau.
     kappa : float
         Penalty of non-negativity relative to that of TV.
     relaxation : float
@@ -83,9 +86,10 @@ class LeanTotalVariation(Solver):
         axis_weights: npt.ArrayLike = (1.0, 1.0, 1.0),
         isotropic: bool = False,
         valid: npt.NDArray[np.bool_] | None = None,
+        background: BackgroundRemoval | None = None,
         initial: Array | None = None,
         penalty: float | None = None,
-        kappa: float = 0.1,
+        kappa: float = 1.0,
         relaxation: float = 1.7,
         balance: bool = True,
         keep_state: bool = True,
@@ -106,7 +110,7 @@ class LeanTotalVariation(Solver):
         _, nz, ny, nx = operator.domain_shape
         self.axis_weights = np.ascontiguousarray(np.broadcast_to(np.asarray(axis_weights, dtype), (nz, 3)))
         self.kappa = dtype.type(kappa)
-        self.system = SensorSystem((ny, nx), operator.sensor_window, valid, dtype=dtype)
+        self.system = SensorSystem((ny, nx), operator.sensor_window, valid, background, dtype=dtype)
         self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
 
         self.g = np.empty((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
@@ -124,8 +128,7 @@ class LeanTotalVariation(Solver):
             self.e -= self.system.masked(operator.forward(volume)[0])
             fft.rfft(volume[0], out=self.X)
         if penalty is None:
-            height = expected_height(operator, self.system, self.data)
-            penalty = self.weight / (_THRESHOLD * height) if height > 0 and weight > 0 else 1.0
+            penalty = _PENALTY * float(operator.power().mean())
         self.penalty = float(penalty)
         self._used_penalty = self.penalty
         self._misfit = 0.5 * float(np.vdot(self.e, self.e))
@@ -190,7 +193,7 @@ class LeanTotalVariation(Solver):
         dual_residual = float(np.sqrt((dual + kappa * dual_p) / max(y + kappa * y_p, 1e-300)))
         objective = self._misfit + self.weight * float(tv)
         self._misfit = 0.5 * float(np.vdot(self.e, self.e))
-        if self.balance and self.iteration in _BALANCED_AFTER and dual_residual > 0:
+        if self.balance and is_due(self.iteration) and dual_residual > 0:
             ratio = np.sqrt(primal_residual / dual_residual)
             self.penalty *= float(np.clip(ratio, 0.2, 5.0))
         return IterationRecord(
@@ -262,6 +265,4 @@ class LeanTotalVariation(Solver):
         in_blocks(job, len(self._dy2))
 
 
-_THRESHOLD = 0.1
-_BALANCED_AFTER = frozenset((2, 4, 6, 8, 12, 16, 24, 32, 48, 64))
-"""Iterations after which mu is adapted: ever more seldom, so that convergence is not disturbed."""
+_PENALTY = 0.5

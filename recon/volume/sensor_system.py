@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import fft
+from recon.operators.background import BackgroundRemoval
 from recon.operators.base import Array
 
 
@@ -27,6 +28,9 @@ class SensorSystem:
         Where the sensor lies on the grid.
     valid : ndarray of bool, (height, width), optional
         Pixels that were measured; default all.
+    background : BackgroundRemoval, optional
+        A smooth background to be estimated as well, for the same valid pixels: a projection that is a further
+        factor of ``C``.
     tolerance : float
         Residual to reach, relative to the right-hand side (see :meth:`follow`).
     max_steps : int
@@ -37,6 +41,7 @@ class SensorSystem:
         grid_shape: tuple[int, int],
         window: tuple[slice, slice],
         valid: npt.NDArray[np.bool_] | None = None,
+        background: BackgroundRemoval | None = None,
         *,
         dtype: npt.DTypeLike = np.float32,
         tolerance: float = 1e-4,
@@ -46,6 +51,7 @@ class SensorSystem:
         self.tolerance = tolerance
         self.max_steps = max_steps
         self.dtype = np.dtype(dtype)
+        self._background = background
         self._mask = None if valid is None or valid.all() else valid.astype(self.dtype)
         self._plane = np.zeros(grid_shape, self.dtype)
         self._spectrum = np.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
@@ -67,13 +73,15 @@ class SensorSystem:
         self.tolerance = float(np.clip(0.02 * progress, floor, 1e-4))
 
     def crop(self, plane: Array) -> Array:
-        """``C``: the sensor's part of a plane, zero where a pixel is not valid. A copy."""
+        """``C``: what the sensor says of a plane. A copy."""
         return self.masked(plane[self.window].copy())
 
     def masked(self, image: Array) -> Array:
-        """Zero, in place, the pixels that are not valid."""
+        """Take out, in place, what says nothing: pixels that are not valid, a smooth background."""
         if self._mask is not None:
             image *= self._mask
+        if self._background is not None:
+            self._background.forward(image[None], image[None])
         return image
 
     def spectrum_of(self, e: Array) -> Array:

@@ -1,0 +1,62 @@
+"""The smooth background as a projection."""
+
+import numpy as np
+import pytest
+from scipy.fft import dctn
+
+from recon.operators import Convolution3D
+from recon.operators.background import BackgroundRemoval
+from recon.solvers import StoppingRules
+from recon.volume import DouglasRachford
+
+
+@pytest.mark.parametrize("erased", [0.0, 0.3])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), (np.float64, 1e-12)])
+def test_is_an_orthogonal_projection(erased, dtype, tolerance):
+    rng = np.random.default_rng(0)
+    shape = (2, 13, 10)
+    valid = rng.random(shape) >= erased
+    P = BackgroundRemoval(shape, (4, 3), valid, dtype)
+    x, y = rng.standard_normal((2, *shape)).astype(dtype)
+    px = P.forward(x)
+    np.testing.assert_allclose(P.forward(px), px, atol=tolerance)
+    assert abs(np.vdot(px, y) - np.vdot(x, P.adjoint(y))) < 10 * tolerance
+    smooth = P.background(rng.standard_normal(shape).astype(dtype))
+    np.testing.assert_allclose(P.forward(smooth), 0, atol=10 * tolerance)
+    np.testing.assert_allclose(P.background(smooth), smooth, atol=10 * tolerance)
+
+
+def test_removes_the_low_dct_frequencies_and_no_others():
+    x = np.random.default_rng(1).random((1, 12, 9))
+    coefficients = dctn(BackgroundRemoval((1, 12, 9), (5, 2), dtype=np.float64).forward(x)[0], norm="ortho")
+    expected = dctn(x[0], norm="ortho")
+    expected[:5, :2] = 0
+    np.testing.assert_allclose(coefficients, expected, atol=1e-12)
+
+
+def test_background_is_recovered():
+    """Two blocks under a background as bright, with and without its estimation."""
+    rng = np.random.default_rng(2)
+    psfs = np.zeros((3, 1, 24, 24))
+    for z in range(3):
+        psfs[z, 0].flat[rng.choice(24 * 24, 30, replace=False)] = 1
+    camera = Convolution3D(psfs, (32, 32), dtype=np.float64)
+    truth = np.zeros(camera.domain_shape)
+    truth[0, 1, 24:27, 26:29] = truth[0, 0, 30:34, 21:24] = 1
+    y, x = np.mgrid[:32, :32] / 32
+    background = 3 + 5 * np.cos(np.pi * x) + 4 * np.cos(np.pi * y) * np.cos(2 * np.pi * x) + 8
+    clean = camera.forward(truth)
+    data = clean + background + 0.02 * rng.standard_normal(clean.shape)
+    removal = BackgroundRemoval(data.shape, (5, 5), dtype=np.float64)
+    weight = 0.02 * float(np.abs(camera.adjoint(removal.forward(data))).max())
+    rules = StoppingRules(iterations=300)
+    found = DouglasRachford(camera, data, weight, background=removal).run(rules).solution
+    blind = DouglasRachford(camera, data, weight).run(rules).solution
+
+    def error(x):
+        return np.linalg.norm(x - truth) / np.linalg.norm(truth)
+
+    assert error(found) < 0.35
+    assert error(blind) > 2 * error(found)
+    estimate = removal.background(data - camera.forward(found))
+    assert np.linalg.norm(estimate - background) < 0.01 * np.linalg.norm(background)
