@@ -1,0 +1,76 @@
+"""Bayer frames as erased colour; the noise estimate on frames with and without holes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import InputError, reconstruct
+from recon.bayer import PATTERNS, interpolate_bayer, split_bayer
+from recon.metrics import psnr
+from recon.noise import estimate_deviation
+
+
+def mosaic(image, pattern):
+    raw = np.empty(image.shape[:2], image.dtype)
+    for k, colour in enumerate(pattern):
+        raw[k // 2 :: 2, k % 2 :: 2] = image[k // 2 :: 2, k % 2 :: 2, "RGB".index(colour)]
+    return raw
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_split_keeps_every_pixel_in_its_colour(pattern):
+    image = np.random.default_rng(0).integers(1, 4000, (7, 8, 3), np.uint16)
+    split, erased = split_bayer(mosaic(image, pattern), pattern)
+    assert split.dtype == np.uint16
+    assert np.array_equal(split, np.where(erased, 0, image))
+    assert (erased.sum(axis=2) == 2).all()
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_interpolation_keeps_planes_and_what_was_measured(pattern):
+    y, x = np.mgrid[:9, :10].astype(np.float32)
+    image = np.stack([x + 2 * y, 3 * x - y, 5 + 0 * x], axis=-1)
+    found = interpolate_bayer(mosaic(image, pattern), pattern)
+    assert found[1:-1, 1:-1] == pytest.approx(image[1:-1, 1:-1], abs=1e-4)
+    split, erased = split_bayer(mosaic(image, pattern), pattern)
+    assert np.array_equal(found[~erased], split[~erased])
+
+
+def test_a_bayer_frame_is_reconstructed_in_colour(shoot):
+    shots = [shoot(snr=100, seed=s) for s in (0, 0, 0)]
+    gains = (1.0, 2.0, 0.5)
+    colour = np.stack([g * s.measurement for g, s in zip(gains, shots, strict=True)], axis=-1)
+    measurement, erasures = split_bayer(mosaic(colour, "GRBG"), "GRBG")
+    result = reconstruct(measurement, shots[0].psf, erasures=erasures)
+    for c, gain in enumerate(gains):
+        found = psnr(result.image[..., c] / gain, shots[0].truth)
+        print(f"channel {c}: {found:.1f} dB")
+        assert found > 20
+
+
+def test_refuses_what_is_no_bayer_frame():
+    with pytest.raises(InputError, match="'RGBG' is not known"):
+        split_bayer(np.zeros((4, 4)), "RGBG")
+    with pytest.raises(InputError, match=r"must be .height, width."):
+        split_bayer(np.zeros((4, 4, 3)), "RGGB")
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.5, 0.2, "bayer"])
+def test_noise_is_estimated_through_holes(shoot, kept):
+    shot = shoot(snr=10)
+    rng = np.random.default_rng(1)
+    valid = np.ones(shot.measurement.shape, bool)
+    if kept == "bayer":
+        valid[:] = False
+        valid[::2, 1::2] = True
+    elif kept < 1:
+        valid = rng.random(valid.shape) < kept
+    frame = np.where(valid, shot.measurement, 1e9)
+    assert estimate_deviation(frame, valid) == pytest.approx(shot.noise, rel=0.25)
+
+
+def test_noise_of_nothing_is_nothing():
+    assert estimate_deviation(np.ones((1, 1))) == 0
+    assert estimate_deviation(np.ones((50, 50))) == 0
+    assert estimate_deviation(np.ones((50, 50)), np.zeros((50, 50), bool)) == 0
