@@ -8,16 +8,28 @@ memory costs as much as the transform).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.threads import get_threads, set_threads
+from recon.threads import get_threads, in_blocks, set_threads
 
-__all__ = ["fast_length", "fast_shape", "get_threads", "irfft", "rfft", "set_threads", "spectrum_shape"]
+__all__ = [
+    "complex_dtype",
+    "fast_length",
+    "fast_shape",
+    "get_threads",
+    "irfft",
+    "irfft_strip",
+    "multiply",
+    "rfft",
+    "rfft_strip",
+    "set_threads",
+    "spectrum_shape",
+]
 
 RealArray = npt.NDArray[Any]
 ComplexArray = npt.NDArray[Any]
@@ -73,8 +85,7 @@ def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> Com
     if out is None:
         out = np.empty(spectrum_shape(x.shape), complex_dtype(x.dtype))
     _check(out, spectrum_shape(x.shape), complex_dtype(x.dtype))
-    forward, _ = _backend()
-    forward(_batched(x, axes), _batched(out, axes), _axes(axes), get_threads())
+    _kernels().forward(_batched(x, axes), _batched(out, axes), _axes(axes), get_threads())
     return out
 
 
@@ -99,10 +110,40 @@ def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = 
     if out is None:
         out = np.empty(shape, dtype)
     _check(out, shape, dtype)
-    _, inverse = _backend()
     scale = 1.0 / float(np.prod(shape[-axes:], dtype=float))
-    inverse(_batched(X, axes), _batched(out, axes), _axes(axes), scale, get_threads())
+    _kernels().inverse(_batched(X, axes), _batched(out, axes), _axes(axes), scale, get_threads())
     return out
+
+
+def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
+    """Forward transform of images that are zero but for a strip of rows, a quarter cheaper when half are.
+
+    Parameters
+    ----------
+    x : ndarray, (n, rows, width)
+        The rows that are not zero.
+    start : int
+        Place of the first of them.
+    out : ndarray, complex, (n, height, width // 2 + 1)
+    """
+    _kernels().forward_strip(np.ascontiguousarray(x), out, start, get_threads())
+    return out
+
+
+def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
+    """Rows ``start`` to ``start + rows`` of the inverse transform, into ``out`` (n, rows, width).
+
+    ``X`` (n, height, width // 2 + 1) is overwritten.
+    """
+    scale = 1.0 / (float(X.shape[1]) * out.shape[2])
+    _kernels().inverse_strip(X, out, start, scale, get_threads())
+    return out
+
+
+def multiply(X: ComplexArray, H: ComplexArray, *, conjugate: bool = False) -> None:
+    """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate."""
+    kernel = _kernels().multiply
+    in_blocks(lambda a, b: kernel(X, H, conjugate, a, b), X.shape[0] * X.shape[1], grain=64)
 
 
 def _check(out: npt.NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
@@ -121,8 +162,8 @@ def _axes(axes: int) -> npt.NDArray[np.int64]:
 
 
 @cache
-def _backend() -> tuple[Callable[..., None], Callable[..., None]]:
+def _kernels() -> Any:
     """Import numba on first use: it costs half a second that most commands need not pay."""
     from recon import _fft_kernels
 
-    return _fft_kernels.forward, _fft_kernels.inverse
+    return _fft_kernels

@@ -73,7 +73,8 @@ class PadCropConvolution(LinearOperator):
         padded = np.zeros((len(psfs), *self.grid_shape), self.dtype)
         padded[:, : psf_shape[0], : psf_shape[1]] = psfs
         self.spectrum = fft.rfft(padded)
-        self._work = np.empty(self.domain_shape, self.dtype)
+        # Only the rows of the grid that hold the sensor are ever transformed to or from real space.
+        self._rows = np.empty((n_channels, self.sensor_shape[0], self.grid_shape[1]), self.dtype)
         self._spectrum_work = np.empty(fft.spectrum_shape(self.domain_shape), fft.complex_dtype(self.dtype))
         self._norm_bound = float(np.sqrt(np.max(self.power)))
 
@@ -92,12 +93,15 @@ class PadCropConvolution(LinearOperator):
     def circular(self, x: Array, out: Array | None = None) -> Array:
         """Circular convolution on the grid: what a sensor as large as the grid would see."""
         X = fft.rfft(x, out=self._spectrum_work)
-        X *= self.spectrum
+        fft.multiply(X, self.spectrum)
         return fft.irfft(X, self.grid_shape[1], out=out)
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return what the sensor sees of the object ``x``."""
-        cropped = self.circular(x, self._work)[self.sensor_window]
+        X = fft.rfft(x, out=self._spectrum_work)
+        fft.multiply(X, self.spectrum)
+        rows = fft.irfft_strip(X, self.corner[0], self._rows)
+        cropped = rows[self._columns]
         if out is None:
             return cropped.copy()
         out[...] = cropped
@@ -105,11 +109,15 @@ class PadCropConvolution(LinearOperator):
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Correlate sensor data ``y`` with the PSF (Eq. 3.8)."""
-        self._work[...] = 0
-        self._work[self.sensor_window] = y
-        X = fft.rfft(self._work, out=self._spectrum_work)
-        np.multiply(X, np.conj(self.spectrum), out=X)
+        self._rows[...] = 0
+        self._rows[self._columns] = y
+        X = fft.rfft_strip(self._rows, self.corner[0], self._spectrum_work)
+        fft.multiply(X, self.spectrum, conjugate=True)
         return fft.irfft(X, self.grid_shape[1], out=out)
+
+    @property
+    def _columns(self) -> tuple[slice, slice, slice]:
+        return (slice(None), slice(None), self.sensor_window[2])
 
     @property
     def norm_bound(self) -> float:

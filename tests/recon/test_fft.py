@@ -45,6 +45,31 @@ def test_writes_into_the_arrays_it_is_given():
     assert back == pytest.approx(x)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("start", "rows"), [(0, 9), (2, 4), (0, 1), (5, 4)])
+def test_strips_of_images(start, rows, dtype):
+    rng = np.random.default_rng(0)
+    tolerance = 1e-5 if dtype == np.float32 else 1e-13
+    image = np.zeros((2, 9, 8), dtype)
+    image[:, start : start + rows] = rng.standard_normal((2, rows, 8))
+    X = np.full((2, 9, 5), np.nan, fft.complex_dtype(dtype))
+    fft.rfft_strip(image[:, start : start + rows], start, X)
+    assert X == pytest.approx(scipy.fft.rfft2(image), abs=tolerance)
+    whole = rng.standard_normal((2, 9, 8)).astype(dtype)
+    strip = fft.irfft_strip(fft.rfft(whole), start, np.empty((2, rows, 8), dtype))
+    assert strip == pytest.approx(whole[:, start : start + rows], abs=tolerance)
+
+
+def test_multiplies_in_place():
+    rng = np.random.default_rng(0)
+    X, H = (rng.standard_normal((n, 4, 3)) + 1j * rng.standard_normal((n, 4, 3)) for n in (2, 1))
+    Y = X.copy()
+    fft.multiply(Y, H)
+    assert Y == pytest.approx(X * H)
+    fft.multiply(Y, H, conjugate=True)
+    assert Y == pytest.approx(X * abs(H) ** 2)
+
+
 def test_refuses_arrays_that_do_not_fit():
     x = np.zeros((4, 6))
     with pytest.raises(ValueError, match="complex128"):
