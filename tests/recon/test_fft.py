@@ -52,9 +52,9 @@ def test_strips_of_images(start, rows, dtype):
     tolerance = 1e-5 if dtype == np.float32 else 1e-13
     image = np.zeros((2, 9, 8), dtype)
     image[:, start : start + rows] = rng.standard_normal((2, rows, 8))
-    X = np.full((2, 9, 5), np.nan, fft.complex_dtype(dtype))
-    fft.rfft_strip(image[:, start : start + rows], start, X)
-    assert X == pytest.approx(scipy.fft.rfft2(image), abs=tolerance)
+    spectrum = np.full((2, 9, 5), np.nan, fft.complex_dtype(dtype))
+    fft.rfft_strip(image[:, start : start + rows], start, spectrum)
+    assert spectrum == pytest.approx(scipy.fft.rfft2(image), abs=tolerance)
     whole = rng.standard_normal((2, 9, 8)).astype(dtype)
     strip = fft.irfft_strip(fft.rfft(whole), start, np.empty((2, rows, 8), dtype))
     assert strip == pytest.approx(whole[:, start : start + rows], abs=tolerance)
@@ -63,11 +63,11 @@ def test_strips_of_images(start, rows, dtype):
 def test_multiplies_in_place():
     rng = np.random.default_rng(0)
     X, H = (rng.standard_normal((n, 4, 3)) + 1j * rng.standard_normal((n, 4, 3)) for n in (2, 1))
-    Y = X.copy()
-    fft.multiply(Y, H)
-    assert Y == pytest.approx(X * H)
-    fft.multiply(Y, H, conjugate=True)
-    assert Y == pytest.approx(X * abs(H) ** 2)
+    y = X.copy()
+    fft.multiply(y, H)
+    assert y == pytest.approx(X * H)
+    fft.multiply(y, H, conjugate=True)
+    assert y == pytest.approx(X * abs(H) ** 2)
 
 
 def test_refuses_arrays_that_do_not_fit():
