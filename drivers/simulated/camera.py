@@ -19,6 +19,7 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 ROI_STEP = 4
@@ -450,23 +451,31 @@ class SimulatedCamera(SimulatedDevice, Camera):
         if self._light is not None and self._light[0] == key:
             return self._light[1]
         rows, columns = self._region()
-        bands = self.world.photons_per_s(self._binning)
         total = np.zeros(self.image_shape, np.float32)
-        for band, light in enumerate(bands):
-            if light is None:
-                continue
-            absorbed = light[rows, columns] * np.float32(self._spec.quantum_efficiency[band])
-            total += absorbed * self._mosaic(band) if self.options.color else absorbed
+        for sensitivity, mosaic in self._filters():
+            light = self.world.photons_per_s(sensitivity, self._binning)
+            if light is not None:
+                total += light[rows, columns] if mosaic is None else light[rows, columns] * mosaic
         self._light = (key, total)
         return total
 
-    def _mosaic(self, band: int) -> npt.NDArray[np.float32]:
-        """Transmission of the RGGB filters for one band; regions begin on an even row and column."""
-        through = np.full((2, 2), self.options.crosstalk, np.float32)
-        for row, column in {0: ((0, 0),), 1: ((0, 1), (1, 0)), 2: ((1, 1),)}[band]:
-            through[row, column] = 1
+    def _filters(self) -> list[tuple[Rgb, npt.NDArray[np.float32] | None]]:
+        """Sensitivity to the three bands of each kind of pixel, and where those are (None: everywhere)."""
+        efficiency = self._spec.quantum_efficiency
+        if not self.options.color:
+            return [(efficiency, None)]
+        filters: list[tuple[Rgb, npt.NDArray[np.float32] | None]] = []
         height, width = self.image_shape
-        return np.tile(through, (-(-height // 2), -(-width // 2)))[:height, :width]
+        for color, places in enumerate((((0, 0),), ((0, 1), (1, 0)), ((1, 1),))):
+            red, green, blue = (
+                e * (1.0 if band == color else self.options.crosstalk) for band, e in enumerate(efficiency)
+            )
+            # RGGB; regions begin on an even row and column.
+            mosaic = np.zeros((height, width), np.float32)
+            for row, column in places:
+                mosaic[row::2, column::2] = 1
+            filters.append(((red, green, blue), mosaic))
+        return filters
 
     def _pixels(self) -> FixedPattern:
         key = (self._roi, self._binning)

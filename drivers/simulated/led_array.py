@@ -12,7 +12,7 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.simulated.base import SimulatedDevice
-from drivers.simulated.world import BANDS
+from recon.optics.spectrum import BANDS
 
 
 class LedArrayOptions(DriverOptions):

@@ -55,13 +55,32 @@ class WorldOptions(DriverOptions):
         (), description='For fall_off = "table": pairs of angle in degrees, ascending from 0, and response.'
     )
 
+    scene: Literal["none", "picture", "color_picture", "bars", "tilted_bars", "beads"] = Field(
+        "picture", description="What stands in front of the camera."
+    )
+    scene_distance_mm: Positive | None = Field(
+        None, description="From the diffuser to it, or to its middle; left out: where the stage homes."
+    )
+    scene_height_mm: Positive | None = Field(
+        None, description="Its height; left out: half of what the sensor sees from there."
+    )
+    scene_rgb: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        (1.0, 1.0, 1.0), description="Brightness of the scene's light in red, green, blue."
+    )
+    scene_tilt_deg: float = Field(45.0, ge=-80, le=80, description="Tilt of the tilted bars.")
+    scene_depth_mm: Positive | None = Field(
+        None, description="Depth of the beads' volume; left out: half its distance."
+    )
+    beads: int = Field(40, ge=1, le=10_000, description="Number of beads.")
+    bead_diameter_um: NotNegative = Field(15.0, description="Their diameter.")
+
     source_diameter_um: NotNegative | None = Field(
         None, description="Diameter of the point source; left out: the preset's."
     )
     source_brightness: Positive = Field(
         1.0, description="Brightness of the point source relative to the preset's."
     )
-    spectral_samples: int = Field(3, ge=1, le=9, description="Wavelengths in each colour band.")
+    spectral_samples: int = Field(1, ge=1, le=9, description="Wavelengths averaged in each colour band.")
 
     @model_validator(mode="after")
     def _table_fits(self) -> Self:

@@ -33,6 +33,9 @@ class Preset:
     travel_mm: tuple[float, float, float]
     """Half the travel in x and in y, and the farthest z."""
     nearest_z_mm: float
+    scene_photons_per_s_mm2_sr: float
+    """Sent along the axis by a square millimetre of white picture, in each band."""
+    bead_photons_per_s_sr: float
     source_photons_per_s_sr: float
     """Sent along the axis by the point source, in each band, with the LED behind it at its brightest."""
     focal_length_um: float = 1500.0
@@ -107,6 +110,8 @@ PRESETS: dict[str, Preset] = {
         source_distance_mm=300.0,
         travel_mm=(150.0, 150.0, 500.0),
         nearest_z_mm=7.3,
+        scene_photons_per_s_mm2_sr=2e10,
+        bead_photons_per_s_sr=2e12,
         source_photons_per_s_sr=1e13,
     ),
     "pointgrey": Preset(
@@ -120,6 +125,8 @@ PRESETS: dict[str, Preset] = {
         source_distance_mm=200.0,
         travel_mm=(100.0, 100.0, 500.0),
         nearest_z_mm=7.0,
+        scene_photons_per_s_mm2_sr=2e11,
+        bead_photons_per_s_sr=1e13,
         source_photons_per_s_sr=3e13,
     ),
     "microscope": Preset(
@@ -133,6 +140,8 @@ PRESETS: dict[str, Preset] = {
         source_distance_mm=2.5,
         travel_mm=(2.0, 2.0, 10.0),
         nearest_z_mm=1.5,
+        scene_photons_per_s_mm2_sr=2e10,
+        bead_photons_per_s_sr=2e10,
         source_photons_per_s_sr=2e10,
     ),
     "tiny": Preset(
@@ -146,6 +155,8 @@ PRESETS: dict[str, Preset] = {
         source_distance_mm=100.0,
         travel_mm=(60.0, 60.0, 300.0),
         nearest_z_mm=8.0,
+        scene_photons_per_s_mm2_sr=2e10,
+        bead_photons_per_s_sr=2e12,
         source_photons_per_s_sr=1e13,
     ),
 }

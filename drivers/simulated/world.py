@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from drivers.errors import DeviceError
 from drivers.simulated.clock import Clock
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.presets import PRESETS, Preset
+from drivers.simulated.scene_choice import make_scene
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -24,15 +25,18 @@ from recon.optics.fall_off import (
     table_fall_off,
 )
 from recon.optics.grid import PixelGrid
+from recon.optics.render import RenderSettings, render
+from recon.optics.scene import Scene
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
-from recon.optics.spectrum import BLUE, GREEN, RED, Band
+from recon.optics.spectrum import mixed_spectrum
+from recon.optics.truth import true_scene
 from recon.optics.wave import WavePropagator
+from recon.types import Geometry
 
 Position = tuple[float, float, float]
 Rgb = tuple[float, float, float]
 Image = npt.NDArray[np.float32]
 
-BANDS: tuple[Band, Band, Band] = (RED, GREEN, BLUE)
 CACHE_BYTES = 256 << 20
 
 
@@ -72,6 +76,9 @@ class SimulatedWorld(SharedPart):
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
         self._unplugged: set[str] = set()
+        self.scene_lit = False
+        """Whether the scene glows."""
+        self._scene = make_scene(options, preset, self.distance_um)
 
     # What the devices do to the world ---
     def carry_source(self, carrier: Callable[[], Position]) -> None:
@@ -106,7 +113,6 @@ class SimulatedWorld(SharedPart):
                 self._propagator = WavePropagator(
                     _diffuser(self.options, self.preset, self.aperture_mm),
                     self.distance_um,
-                    spectral_samples=self.options.spectral_samples,
                 )
             return self._propagator
 
@@ -129,52 +135,152 @@ class SimulatedWorld(SharedPart):
         rest_y, rest_x = (side - side // binning * binning for side in self.sensor.shape)
         return PixelGrid((height, width), pitch * binning, (-rest_x / 2 * pitch, -rest_y / 2 * pitch))
 
-    def psf(self, source_um: Position, band: int, binning: int = 1) -> Image:
+    def psf(self, source_um: Position, weights: Rgb, binning: int = 1) -> Image:
         """Light of a point source on the binned pixels, with the sensor's angular response.
 
         Parameters
         ----------
         source_um : tuple of float
             True position of the source.
-        band : int
-            0, 1, 2: red, green, blue.
+        weights : tuple of float
+            Of the red, green and blue bands.
         binning : int
 
         Returns
         -------
-        ndarray, float32, (height, width)
+        ndarray, float32, (height, width), read only
             Steradians (see :meth:`recon.optics.wave.WavePropagator.psf`).
         """
         # A nanometre decides nothing; without rounding no two visits of a place would share their picture.
         source = (round(source_um[0], 3), round(source_um[1], 3), round(source_um[2], 3))
-        return self._cached(("psf", source, band, binning), lambda: self._psf(source, band, binning))
+        return self._cached(("psf", source, weights, binning), lambda: self._psf(source, weights, binning))
 
-    def _psf(self, source: Position, band: int, binning: int) -> Image:
+    def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
         grid = self.sensor_grid(binning)
-        light = self.propagator.psf(source, grid, BANDS[band], diameter_um=self.source_diameter_um)
-        return light * response_on(grid, source, self.distance_um, self.fall_off)
+        spectrum = mixed_spectrum(weights, self.options.spectral_samples)
+        light = self.propagator.psf(source, grid, spectrum, diameter_um=self.source_diameter_um)
+        light *= response_on(grid, source, self.distance_um, self.fall_off)
+        return light
 
-    def photons_per_s(self, binning: int = 1) -> tuple[Image | None, Image | None, Image | None]:
-        """Photons a second on every binned pixel now, in red, green and blue (None: dark).
+    def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
+        """Photons a second on every binned pixel now, or None when all is dark.
 
-        Quantum efficiency and fixed pattern are not included, the pixels' angular response is.
+        Parameters
+        ----------
+        weights : tuple of float
+            Sensitivity to red, green and blue. The fixed pattern is not included, the angular response is.
         """
-        source = self.source_position_um
-        brightness = self.options.source_brightness * self.preset.source_photons_per_s_sr
-        bands: list[Image | None] = []
-        for band, glow in enumerate(self.emission):
-            light = None
-            if glow > 0:
-                light = self.psf(source, band, binning) * np.float32(glow * brightness)
-            bands.append(light)
-        return bands[0], bands[1], bands[2]
+        light = None
+        glow = _product(self.emission, weights)
+        if any(glow):
+            # Cached by colour, not by brightness: dimming the light costs nothing.
+            total = sum(glow)
+            brightness = total * self.options.source_brightness * self.preset.source_photons_per_s_sr
+            hue = (glow[0] / total, glow[1] / total, glow[2] / total)
+            light = self.psf(self.source_position_um, hue, binning) * np.float32(brightness)
+        scene = self._scene
+        if self.scene_lit and scene is not None:
+            seen = _product(self.options.scene_rgb, weights)
+            picture = self._cached(
+                ("scene", id(scene), seen, binning), lambda: self._render(scene, seen, binning)
+            )
+            light = picture if light is None else light + picture
+        return light
+
+    def _render(self, scene: Scene, weights: Rgb, binning: int) -> Image:
+        return render(
+            scene,
+            weights,
+            self.sensor_grid(binning),
+            self.propagator,
+            self.fall_off,
+            layer_photons=self.preset.scene_photons_per_s_mm2_sr,
+            bead_photons=self.preset.bead_photons_per_s_sr,
+            settings=RenderSettings(spectral_samples=self.options.spectral_samples),
+        )
 
     def light_key(self) -> tuple[Any, ...]:
         """Something that changes whenever :meth:`photons_per_s` does."""
         glow = self.emission
         x, y, z = self.source_position_um
         place = (round(x, 3), round(y, 3), round(z, 3)) if any(glow) else None
-        return (place, glow)
+        return (place, glow, id(self._scene) if self.scene_lit else None)
+
+    # The scene and the truth about it ---
+    @property
+    def scene(self) -> Scene | None:
+        """What stands in front of the camera."""
+        return self._scene
+
+    def set_scene(self, scene: Scene | None) -> None:
+        """Put another scene in front of the camera (None: nothing)."""
+        with self._lock:
+            self._scene = scene
+            for key in [key for key in self._cache if key[0] == "scene"]:
+                del self._cache[key]
+
+    @property
+    def geometry(self) -> Geometry:
+        """The optics as they are; the pixel pitch is that of unbinned pixels."""
+        return Geometry(self.sensor.pitch_um, self.distance_um * 1e-3, self.aperture_mm)
+
+    def ground_truth(
+        self,
+        shape: tuple[int, int],
+        pitch_um: float,
+        z_um: Sequence[float] | None = None,
+        *,
+        source_um: Position | None = None,
+        color: bool = False,
+        collected: bool = False,
+    ) -> Image:
+        """Return the true scene on a reconstruction's grid.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            ``(height, width)`` of the reconstruction. Its pixel ``(height // 2, width // 2)`` looks where the
+            calibration source was.
+        pitch_um : float
+            Pixel pitch of the measurement, after binning.
+        z_um : sequence of float, optional
+            Depth planes of a volume; everything goes to the plane nearest in ``1 / z``. Left out: one picture
+            of all depths.
+        source_um : tuple of float, optional
+            True position of the calibration source; left out, it was on the axis.
+        color : bool
+            Red, green and blue as last axis instead of what a monochrome sensor makes of them.
+        collected : bool
+            Times the share of its light that reaches a pixel through the aperture, relative to the axis
+            (oblique incidence, the pixels' angular response). A reconstruction from an on-axis PSF shows
+            this; Kuo 2020, Eq. 4.3 defines its object so.
+
+        Returns
+        -------
+        ndarray, float32, ``shape``, ``(nz, *shape)`` or with a last axis of 3
+            Brightness of every pixel's cell as a multiple of the point source's (one LED, white), upside down
+            as in :mod:`recon.types`.
+
+        Raises
+        ------
+        ValueError
+            When there is no scene.
+        """
+        if self._scene is None:
+            raise ValueError("There is no scene, so there is no ground truth.")
+        return true_scene(
+            self._scene,
+            shape,
+            pitch_um,
+            self.distance_um,
+            z_um=z_um,
+            source_um=source_um or (0.0, 0.0, 1.0),
+            light=self.options.scene_rgb,
+            sensitivity=None if color else self.sensor.quantum_efficiency,
+            layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
+            bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,
+            fall_off=self.fall_off if collected else None,
+        )
 
     def _cached(self, key: Any, make: Callable[[], Image]) -> Image:
         with self._lock:
@@ -201,6 +307,10 @@ class SimulatedWorld(SharedPart):
         """Raise :class:`DeviceError` when the device is unplugged."""
         if kind in self._unplugged:
             raise DeviceError(name, "was unplugged.", "Plug it in and open the bench again.")
+
+
+def _product(first: Rgb, second: Rgb) -> Rgb:
+    return first[0] * second[0], first[1] * second[1], first[2] * second[2]
 
 
 def _diffuser(options: WorldOptions, preset: Preset, aperture_mm: tuple[float, float]) -> Diffuser:

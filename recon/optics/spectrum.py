@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+Spectrum = tuple[tuple[float, float], ...]
+"""``(wavelength_nm, weight)`` pairs."""
+
 
 @dataclass(frozen=True, slots=True)
 class Band:
@@ -14,8 +17,8 @@ class Band:
     center_nm: float
     fwhm_nm: float = 0.0
 
-    def samples(self, count: int) -> tuple[tuple[float, float], ...]:
-        """``(wavelength_nm, weight)`` pairs whose weights sum to 1 (Gauss-Hermite quadrature)."""
+    def samples(self, count: int) -> Spectrum:
+        """Wavelengths with weights that sum to 1 (Gauss-Hermite quadrature)."""
         if count == 1 or self.fwhm_nm == 0:
             return ((self.center_nm, 1.0),)
         nodes, weights = np.polynomial.hermite_e.hermegauss(count)
@@ -30,3 +33,15 @@ class Band:
 RED = Band(630.0, 20.0)
 GREEN = Band(515.0, 35.0)
 BLUE = Band(460.0, 25.0)
+BANDS: tuple[Band, Band, Band] = (RED, GREEN, BLUE)
+"""The dissertation's LED array (Kuo 2020, A.2)."""
+
+
+def mixed_spectrum(weights: tuple[float, float, float], count: int) -> Spectrum:
+    """Red, green and blue in given proportions, ``count`` wavelengths each; dark bands are left out."""
+    return tuple(
+        (wavelength_nm, weight * part)
+        for band, weight in zip(BANDS, weights, strict=True)
+        if weight > 0
+        for wavelength_nm, part in band.samples(count)
+    )

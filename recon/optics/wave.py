@@ -27,8 +27,8 @@ from scipy import fft
 
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import FloatArray, PixelGrid, resample_energy
-from recon.optics.jit import compiled
-from recon.optics.spectrum import Band
+from recon.optics.spectrum import Spectrum
+from recon.optics.wave_kernels import add_intensity, modulate, propagate
 
 Emission = Literal["lambertian", "isotropic"]
 Source = tuple[float, float, float]
@@ -82,29 +82,25 @@ class WavePropagator:
     diffuser : Diffuser
     distance_um : float
         From the diffuser's relief to the sensor.
-    spectral_samples : int
-        Wavelengths averaged over a source's bandwidth.
     workers : int
         Threads for the transforms.
     """
 
-    def __init__(
-        self, diffuser: Diffuser, distance_um: float, *, spectral_samples: int = 3, workers: int = 2
-    ) -> None:
+    def __init__(self, diffuser: Diffuser, distance_um: float, *, workers: int = 2) -> None:
         if not distance_um > 0:
             raise ValueError(f"The sensor lies behind the diffuser: distance_um > 0, not {distance_um}.")
         self.diffuser = diffuser
         self.distance_um = distance_um
-        self.spectral_samples = spectral_samples
         self.workers = workers
         dy, dx = diffuser.slopes()
+        self._typical_slope = float(np.sqrt((dy**2 + dx**2).mean()))
         self._steepest = float(np.quantile(np.hypot(dy, dx), 0.9995))
 
     def psf(
         self,
         source_um: Source,
         grid: PixelGrid,
-        band: Band,
+        spectrum: Spectrum,
         *,
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
@@ -117,8 +113,8 @@ class WavePropagator:
             ``(x, y, z)`` with ``z > 0``, any continuous position.
         grid : PixelGrid
             The sensor's pixels.
-        band : Band
-            The source's spectrum.
+        spectrum : Spectrum
+            Wavelengths that the source sends out, each with a weight; intensities add up.
         diameter_um : float
             Diameter of a uniformly bright disc parallel to the sensor (0: a point).
         emission : {"lambertian", "isotropic"}
@@ -131,13 +127,13 @@ class WavePropagator:
             source): multiplied by the source's intensity along the axis, the light on the pixel. The angular
             response of the pixels is not included (:mod:`recon.optics.fall_off`).
         """
-        return self.caustic(source_um, grid, band, diameter_um=diameter_um, emission=emission).on(grid)
+        return self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission).on(grid)
 
     def caustic(
         self,
         source_um: Source,
         grid: PixelGrid,
-        band: Band,
+        spectrum: Spectrum,
         *,
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
@@ -152,14 +148,14 @@ class WavePropagator:
         rho = self.distance_um / scale
         blur = diameter_um * magnification / scale / pitch
         n_rows, n_columns = self.diffuser.heights_um.shape
-        margin = self._margin(source_um, band)
+        margin = self._margin(source_um, max(w for w, _ in spectrum))
         reach = margin + int(np.ceil(blur))
         rows = _needed(grid.y_edges_um, n_rows, y, magnification, pitch, reach)
         columns = _needed(grid.x_edges_um, n_columns, x, magnification, pitch, reach)
         energy = np.zeros((len(rows), len(columns)), np.float32)
         for tile in self._tiles(rows, columns, source_um):
             part = energy[_within(tile.rows, rows), _within(tile.columns, columns)]
-            for wavelength_nm, weight in band.samples(self.spectral_samples):
+            for wavelength_nm, weight in spectrum:
                 self._add_tile(part, tile, source_um, margin, rho, wavelength_nm, weight, emission)
         if blur > 0.5:
             energy = np.asarray(cv2.filter2D(energy, -1, disc_kernel(blur), borderType=cv2.BORDER_CONSTANT))
@@ -167,19 +163,32 @@ class WavePropagator:
         x_edges = (np.arange(columns.start, columns.stop + 1) - n_columns / 2) * pitch * scale
         return Caustic(energy.astype(np.float32, copy=False), y_edges, x_edges - magnification * x)
 
-    def _margin(self, source_um: Source, band: Band) -> int:
+    def displacement_um(self, z_um: float) -> float:
+        """Return how far the relief typically displaces light on the sensor (root mean square, on axis)."""
+        contrast = self.diffuser.glass.index - self.diffuser.ambient.index
+        return self._typical_slope * contrast * self.distance_um / (1 + self.distance_um / z_um)
+
+    def half_extent_um(self, z_um: float) -> tuple[float, float]:
+        """Half height and width on the sensor that hold all light of a source at a distance, off axis too."""
+        # 35 degrees off the axis; beyond, the little light that strays farther is cut off.
+        spread = self._margin((0.7 * z_um, 0.0, z_um), 650.0) * self.diffuser.pitch_um
+        scale = 1 + self.distance_um / z_um
+        height, width = self.diffuser.aperture_um
+        return (height / 2 + spread) * scale, (width / 2 + spread) * scale
+
+    def _margin(self, source_um: Source, wavelength_nm: float) -> int:
         """Return by how many samples light may leave its straight ray at the worst angle."""
         x, y, z = source_um
         half_height, half_width = (side / 2 for side in self.diffuser.aperture_um)
         tangent = np.hypot(abs(x) + half_width, abs(y) + half_height) / z
         cos = 1 / np.sqrt(1 + tangent**2)
         sin_squared = 1 - cos**2
-        contrast = np.sqrt(self.diffuser.glass.at(band.center_nm) ** 2 - sin_squared) - np.sqrt(
-            self.diffuser.ambient.at(band.center_nm) ** 2 - sin_squared
+        contrast = np.sqrt(self.diffuser.glass.at(wavelength_nm) ** 2 - sin_squared) - np.sqrt(
+            self.diffuser.ambient.at(wavelength_nm) ** 2 - sin_squared
         )
         stretched = self.distance_um / (1 + self.distance_um / z) / cos**3
         refracted = self._steepest * contrast * stretched
-        diffracted = 4 * np.sqrt(band.center_nm * 1e-3 * stretched)
+        diffracted = 4 * np.sqrt(wavelength_nm * 1e-3 * stretched)
         return int(np.ceil((refracted + diffracted) / self.diffuser.pitch_um))
 
     def _tiles(self, rows: range, columns: range, source_um: Source) -> list[_Tile]:
@@ -242,7 +251,7 @@ class WavePropagator:
         field = np.zeros(shape, np.complex64)
         first_row, first_column = tile.rows.start - margin, tile.columns.start - margin
         wavelength_um = wavelength_nm * 1e-3
-        _modulate(
+        modulate(
             field,
             diffuser.heights_um,
             row_window,
@@ -259,7 +268,7 @@ class WavePropagator:
             emission == "lambertian",
         )
         spectrum = fft.fft2(field, overwrite_x=True, workers=self.workers)
-        _propagate(
+        propagate(
             spectrum,
             fft.fftfreq(shape[0], pitch),
             fft.fftfreq(shape[1], pitch),
@@ -270,7 +279,7 @@ class WavePropagator:
         )
         field = fft.ifft2(spectrum, overwrite_x=True, workers=self.workers)
         inner = field[margin : margin + len(tile.rows), margin : margin + len(tile.columns)]
-        energy += np.float32(weight) * (inner.real**2 + inner.imag**2)
+        add_intensity(energy, inner, weight)
 
 
 def disc_kernel(diameter: float) -> npt.NDArray[np.float32]:
@@ -316,65 +325,3 @@ def _window(
     amplitude[:fade] *= ramp
     amplitude[-fade:] *= ramp[::-1]
     return np.asarray(amplitude, np.float32)
-
-
-@compiled
-def _modulate(
-    field: npt.NDArray[np.complex64],
-    heights: npt.NDArray[np.float32],
-    row_window: npt.NDArray[np.float32],
-    column_window: npt.NDArray[np.float32],
-    first_row: int,
-    first_column: int,
-    pitch: float,
-    x: float,
-    y: float,
-    z: float,
-    wavenumber: float,
-    glass_squared: float,
-    ambient_squared: float,
-    lambertian: bool,
-) -> None:
-    """Write the light behind the diffuser, its spherical curvature removed, into ``field``."""
-    n_rows, n_columns = heights.shape
-    for i in range(row_window.size):
-        row = first_row + i
-        if row < 0 or row >= n_rows or row_window[i] == 0:
-            continue
-        dy = y - (row - (n_rows - 1) / 2) * pitch
-        for j in range(column_window.size):
-            column = first_column + j
-            if column < 0 or column >= n_columns or column_window[j] == 0:
-                continue
-            dx = x - (column - (n_columns - 1) / 2) * pitch
-            square = dx * dx + dy * dy
-            distance_squared = square + z * z
-            sin_squared = square / distance_squared
-            contrast = np.sqrt(glass_squared - sin_squared) - np.sqrt(ambient_squared - sin_squared)
-            cos = z / np.sqrt(distance_squared)
-            solid_angle = pitch * pitch * cos / distance_squared
-            if lambertian:
-                solid_angle *= cos
-            phase = wavenumber * contrast * heights[row, column]
-            amplitude = np.sqrt(solid_angle) * row_window[i] * column_window[j]
-            field[i, j] = complex(amplitude * np.cos(phase), amplitude * np.sin(phase))
-
-
-@compiled
-def _propagate(
-    spectrum: npt.NDArray[np.complex64],
-    row_frequencies: FloatArray,
-    column_frequencies: FloatArray,
-    strength: float,
-    tan_squared: float,
-    direction_y: float,
-    direction_x: float,
-) -> None:
-    """Multiply by the transfer function of the stretched distance, in place."""
-    for i in range(row_frequencies.size):
-        fy = row_frequencies[i]
-        for j in range(column_frequencies.size):
-            fx = column_frequencies[j]
-            along = fy * direction_y + fx * direction_x
-            phase = -strength * (fy * fy + fx * fx + tan_squared * along * along)
-            spectrum[i, j] *= complex(np.cos(phase), np.sin(phase))

@@ -1,0 +1,210 @@
+"""What stands in front of the camera: flat pictures and beads at continuous places, in three colour bands.
+
+Brightness is relative: radiance 1 of a picture and power 1 of a bead are given their photons by whoever
+renders the scene. Pictures lie parallel to the sensor, ``x`` along their columns and ``y`` down their rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.optics.grid import FloatArray, overlap_matrix
+
+Image = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """A glowing picture parallel to the sensor; each of its pixels is uniformly bright.
+
+    Attributes
+    ----------
+    radiance : ndarray, float32, (height, width, 3)
+        Red, green and blue, not negative.
+    z_um : float
+        Distance from the diffuser.
+    size_um : tuple of float
+        ``(height, width)`` of the picture.
+    center_um : tuple of float
+        ``(x, y)`` of its centre.
+    """
+
+    radiance: Image
+    z_um: float
+    size_um: tuple[float, float]
+    center_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.radiance.ndim != 3 or self.radiance.shape[2] != 3:
+            raise ValueError(f"A layer's radiance is (height, width, 3), not {self.radiance.shape}.")
+        if not self.z_um > 0 or not min(self.size_um) > 0:
+            raise ValueError("A layer lies in front of the diffuser (z_um > 0) and has a size_um > 0.")
+
+    @property
+    def x_edges_um(self) -> FloatArray:
+        """Borders of the columns, ``(width + 1,)``."""
+        return _edges(self.center_um[0], self.size_um[1], self.radiance.shape[1])
+
+    @property
+    def y_edges_um(self) -> FloatArray:
+        """Borders of the rows, ``(height + 1,)``."""
+        return _edges(self.center_um[1], self.size_um[0], self.radiance.shape[0])
+
+    def flux(self, weights: tuple[float, float, float], y_edges: FloatArray, x_edges: FloatArray) -> Image:
+        """Radiance integrated over the cells of another grid in the layer's plane.
+
+        Parameters
+        ----------
+        weights : tuple of float
+            Of the three bands.
+        y_edges, x_edges : ndarray, float64
+            Ascending borders of the cells, micrometres.
+
+        Returns
+        -------
+        ndarray, float32
+            Radiance times area in square millimetres.
+        """
+        mixed = self.radiance @ np.asarray(weights, np.float32)
+        mixed *= np.float32(self.size_um[0] * self.size_um[1] * 1e-6 / mixed.size)
+        rows = overlap_matrix(self.y_edges_um, y_edges)
+        columns = overlap_matrix(self.x_edges_um, x_edges)
+        return np.ascontiguousarray((columns @ (rows @ mixed).T).T, np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beads:
+    """Small glowing discs or spheres that send light equally in all directions.
+
+    Attributes
+    ----------
+    positions_um : ndarray, float64, (n, 3)
+        ``x, y, z``; every ``z`` positive.
+    powers : ndarray, float64, (n, 3)
+        Brightness in red, green and blue.
+    diameter_um : float
+        Of every bead.
+    """
+
+    positions_um: FloatArray
+    powers: FloatArray
+    diameter_um: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.positions_um.ndim != 2 or self.positions_um.shape[1] != 3:
+            raise ValueError(f"Beads' positions are (n, 3), not {self.positions_um.shape}.")
+        if self.powers.shape != self.positions_um.shape:
+            raise ValueError(f"Beads' powers are {self.positions_um.shape}, not {self.powers.shape}.")
+        if np.any(self.positions_um[:, 2] <= 0):
+            raise ValueError("Beads lie in front of the diffuser: every z is positive.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Layers and beads that glow together; nothing hides anything else."""
+
+    name: str
+    layers: tuple[Layer, ...] = ()
+    beads: tuple[Beads, ...] = ()
+    depths_um: tuple[float, float] = field(init=False)
+    """Nearest and farthest distance of anything in it."""
+
+    def __post_init__(self) -> None:
+        depths = [layer.z_um for layer in self.layers]
+        depths += [float(z) for beads in self.beads for z in beads.positions_um[:, 2]]
+        if not depths:
+            raise ValueError(f"Scene {self.name!r} is empty.")
+        object.__setattr__(self, "depths_um", (min(depths), max(depths)))
+
+    def true_image(
+        self,
+        shape: tuple[int, int],
+        pitch_um: float,
+        distance_um: float,
+        weights: tuple[float, float, float],
+        *,
+        z_range_um: tuple[float, float] = (0.0, np.inf),
+        source_um: tuple[float, float, float] = (0.0, 0.0, 1.0),
+        layer_scale: float = 1.0,
+        bead_scale: float = 1.0,
+    ) -> FloatArray:
+        """Return the scene on a reconstruction's grid, free of any optics.
+
+        Parameters
+        ----------
+        shape : tuple of int
+            ``(height, width)``. Pixel ``(height // 2, width // 2)`` looks at the calibration source.
+        pitch_um : float
+            Pixel pitch on the sensor: pixel offset ``p`` looks at ``x = -p pitch z / d`` from there, so the
+            picture stands upside down.
+        distance_um : float
+            From the diffuser to the sensor.
+        weights : tuple of float
+            Of the three bands.
+        z_range_um : tuple of float
+            Only what lies in this range (lower bound included).
+        source_um : tuple of float
+            ``(x, y, z)`` of the source whose PSF the reconstruction uses.
+        layer_scale, bead_scale : float
+            Brightness of radiance 1 times a square millimetre, and of power 1.
+
+        Returns
+        -------
+        ndarray, float64, ``shape``
+            Brightness in each pixel's cell: radiance times area, and power.
+        """
+        image = np.zeros(shape)
+        magnification = distance_um / source_um[2]
+        low, high = z_range_um
+        height, width = shape
+        # Borders on the sensor, descending in the scene.
+        y = _borders(height, pitch_um, -magnification * source_um[1])
+        x = _borders(width, pitch_um, -magnification * source_um[0])
+        for layer in self.layers:
+            if low <= layer.z_um < high:
+                to_scene = -layer.z_um / distance_um
+                flux = layer.flux(weights, (y * to_scene)[::-1], (x * to_scene)[::-1])
+                image += layer_scale * flux[::-1, ::-1]
+        for place, power, diameter in self.points():
+            if low <= place[2] < high:
+                _splat(image, place, power @ np.asarray(weights) * bead_scale, diameter, distance_um, y, x)
+        return image
+
+    def points(self) -> Iterator[tuple[FloatArray, FloatArray, float]]:
+        """Position (3,), powers (3,) and diameter of every bead."""
+        for beads in self.beads:
+            for place, power in zip(beads.positions_um, beads.powers, strict=True):
+                yield place, power, beads.diameter_um
+
+
+def _edges(center: float, size: float, count: int) -> FloatArray:
+    return np.asarray(center + np.linspace(-size / 2, size / 2, count + 1))
+
+
+def _borders(count: int, pitch: float, shift: float) -> FloatArray:
+    """Borders of pixels whose number ``count // 2`` is centred at ``shift``."""
+    return np.asarray((np.arange(count + 1) - count // 2 - 0.5) * pitch + shift, np.float64)
+
+
+def _splat(
+    image: FloatArray,
+    place: FloatArray,
+    power: float,
+    diameter_um: float,
+    distance_um: float,
+    y_edges: FloatArray,
+    x_edges: FloatArray,
+) -> None:
+    """Add a bead to the cells that its disc covers (by a fine grid of points inside it)."""
+    rings = np.linspace(-1, 1, 11)
+    inside = np.array([(v, u) for v in rings for u in rings if u * u + v * v <= 1.0])
+    inside = inside * diameter_um / 2 if diameter_um > 0 else np.zeros((1, 2))
+    magnification = distance_um / place[2]
+    rows = np.searchsorted(y_edges, -(place[1] + inside[:, 0]) * magnification, side="right") - 1
+    columns = np.searchsorted(x_edges, -(place[0] + inside[:, 1]) * magnification, side="right") - 1
+    kept = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    np.add.at(image, (rows[kept], columns[kept]), power / len(inside))
