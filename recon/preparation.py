@@ -119,12 +119,13 @@ def prepare(
             f"The PSF has {len(psfs)} channels and the measurement {len(data)}: give one PSF for all "
             "channels or one for each."
         )
-    for channel, values in enumerate(data):
-        share = saturated_share(values)
+    for channel, (values, kept) in enumerate(zip(data, valid, strict=True)):
+        share = saturated_share(values[kept]) if kept.any() else 0.0
         if share:
             warnings.append(
                 f"The measurement's channel {channel} looks saturated: {share:.2%} of its pixels are at "
-                f"exactly its maximum {values.max():g}. Leave them out with erasures, or expose shorter."
+                f"exactly its maximum {values[kept].max():g}. "
+                "Leave them out with erasures, or expose shorter."
             )
 
     deviation = np.array([_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
