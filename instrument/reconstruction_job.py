@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.calibration_file import is_calibration, load_calibration
-from instrument.errors import FileError
+from instrument.erasures import Choice, Erased, erasures_of, reduce_valid
+from instrument.errors import BenchError, FileError
 from instrument.images import ImageFile, read_image
 from instrument.preparation import (
     AUTO_PIXELS,
@@ -47,6 +49,8 @@ class Job:
         On the measurement's pixels.
     notes : mapping of str to str
         What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``.
+    valid : ndarray of bool, shape of the measurement or (height, width), or None
+        The pixels that take part; None means all of them.
     warnings : tuple of str
     provenance : mapping
         Files with checksums and every setting, JSON-compatible.
@@ -55,6 +59,7 @@ class Job:
     measurement: FloatImage
     calibration: Calibration
     notes: Mapping[str, str]
+    valid: npt.NDArray[np.bool_] | None = None
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
@@ -66,6 +71,7 @@ def job_from_files(
     dark: DarkChoice = "auto",
     crop: Crop | None = None,
     binning: Binning = None,
+    erasures: Choice = "saturated",
     allow_saturated: bool = False,
     allow_mixed_depth: bool = False,
 ) -> Job:
@@ -77,11 +83,14 @@ def job_from_files(
         When a file cannot be used, the two do not belong together, or the window or binning does not fit.
     """
     psf, image = read_image(psf_path), read_image(image_path)
+    _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=allow_saturated)
     check_pair(psf, image, allow_mixed_depth=allow_mixed_depth)
     level = _dark(dark, psf, image)
     window = _window(crop, image)
     factor = auto_binning(window) if binning is None else binning
+    erased = erasures_of(erasures, image)
+    valid = _reduced_valid(erased, crop, factor)
     measurement = reduce(image.pixels, level.image, crop, factor)
     psf_pixels = np.maximum(reduce(psf.pixels, level.psf, crop, factor), 0)
     if not psf_pixels.any():
@@ -98,14 +107,17 @@ def job_from_files(
             "Image": _describe(image),
             "Dark": level.reason,
             "Pixels": _describe_window(crop, binning, factor, measurement),
+            "Erased": erased.reason,
         },
-        (*warnings, *_image_warnings(image)),
+        valid,
+        (*warnings, *_saturation(image, erased)),
         {
             "psf": _source(psf),
             "image": _source(image),
             "dark": _dark_record(level),
             "crop": _crop_record(crop, image),
             "binning": factor,
+            "erased": erased.reason,
         },
     )
 
@@ -117,6 +129,7 @@ def job_from_calibration(
     dark: DarkChoice = "auto",
     crop: Crop | None = None,
     binning: Binning = None,
+    erasures: Choice = "saturated",
 ) -> Job:
     """Prepare an image for a calibration folder, or a run folder with one calibration inside.
 
@@ -125,12 +138,16 @@ def job_from_calibration(
     """
     folder = find_calibration(folder)
     calibration, image = load_calibration(folder), read_image(image_path)
+    _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
     if calibration.psfs.shape[1] > 1 and not image.is_colour:
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
     pixels, level = _calibrated_dark(dark, image, calibration, match)
     factor = 1 if binning is None else binning
+    erased = erasures_of(erasures, image)
+    matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
+    valid = _reduced_valid(matched, crop, factor)
     measurement = reduce(pixels, level.image, crop, factor)
     return Job(
         measurement,
@@ -141,8 +158,10 @@ def job_from_calibration(
             + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
             "Dark": level.reason,
             "Pixels": _describe_window(crop, factor, factor, measurement),
+            "Erased": erased.reason,
         },
-        _image_warnings(image),
+        valid,
+        _saturation(image, erased),
         {
             "calibration": str(folder.resolve()),
             "image": _source(image),
@@ -150,6 +169,7 @@ def job_from_calibration(
             "image_binning": match,
             "crop": None if crop is None else _slices_record(crop.slices((shape[0], shape[1]))),
             "binning": factor,
+            "erased": erased.reason,
         },
     )
 
@@ -239,6 +259,19 @@ def _calibration_of(psf: FloatImage, file: ImageFile) -> Calibration:
     )
 
 
+def _reduced_valid(erased: Erased, crop: Crop | None, factor: int) -> npt.NDArray[np.bool_] | None:
+    """Return the mask on the measurement's pixels; refused where it leaves nothing."""
+    if erased.valid is None:
+        return None
+    valid = reduce_valid(erased.valid, crop, factor)
+    if not valid.any():
+        raise BenchError(
+            f"After erasing {erased.reason} and binning {factor} x {factor} no pixel is left: a binned pixel "
+            "needs all of its pixels. Erase less or bin less."
+        )
+    return valid
+
+
 def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
     height, width = image.pixels.shape[:2]
     if crop is None:
@@ -247,17 +280,20 @@ def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
     return crop.height, crop.width
 
 
-def _image_warnings(image: ImageFile) -> tuple[str, ...]:
+def _refuse_constant(image: ImageFile) -> None:
     lowest, highest = float(image.pixels.min()), float(image.pixels.max())
     if lowest == highest:
         raise FileError(
             image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"
         )
+
+
+def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
     count = saturated_pixels(image.pixels)
-    if not count:
+    if not count or erased.valid is not None:
         return ()
-    share = count / image.pixels.size
-    return (f"{count} pixels of the image ({share:.2%}) are saturated (at {highest:g}): expect halos there.",)
+    share = f"{count / image.pixels.size:.2%}"
+    return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
 
 
 def _describe(file: ImageFile) -> str:

@@ -17,6 +17,7 @@ import typer
 
 from instrument.cli.app import command_app, examples, saying_what_is_left
 from instrument.cli.progress import progress_bar
+from instrument.erasures import Choice
 from instrument.errors import BenchError
 from instrument.preparation import Crop
 from instrument.reconstruction_file import Outputs, write_reconstruction
@@ -99,6 +100,14 @@ def reconstruct(
         str,
         typer.Option("--bin", metavar="N|auto", help="Average N x N pixels; auto: to at most 0.5 megapixel."),
     ] = "auto",
+    erasures: Annotated[
+        str,
+        typer.Option(
+            "--erasures",
+            metavar="none|saturated|FILE|SHARE",
+            help="Pixels to leave out: saturated ones, a mask's zeros, or a random share.",
+        ),
+    ] = "saturated",
     method: Annotated[
         Method, typer.Option("--method", "-m", help="admm: best; fista: plain; wiener: one shot.")
     ] = Method.ADMM,
@@ -175,6 +184,7 @@ def reconstruct(
             _dark(dark),
             None if crop is None else Crop.parse(crop),
             _binning(binning),
+            _erasures(erasures),
             allow_saturated=allow_saturated,
             mixed_depth=mixed_depth,
         )
@@ -199,6 +209,7 @@ def _job(
     dark: DarkChoice,
     crop: Crop | None,
     binning: int | None,
+    erasures: Choice,
     *,
     allow_saturated: bool,
     mixed_depth: bool,
@@ -206,7 +217,9 @@ def _job(
     if (psf is None) == (calibration is None):
         raise BenchError("Give either --psf FILE or --calibration FOLDER (one of them).")
     if calibration is not None:
-        return job_from_calibration(calibration, image, dark=dark, crop=crop, binning=binning)
+        return job_from_calibration(
+            calibration, image, dark=dark, crop=crop, binning=binning, erasures=erasures
+        )
     assert psf is not None
     return job_from_files(
         psf,
@@ -214,6 +227,7 @@ def _job(
         dark=dark,
         crop=crop,
         binning=binning,
+        erasures=erasures,
         allow_saturated=allow_saturated,
         allow_mixed_depth=mixed_depth,
     )
@@ -229,6 +243,17 @@ def _dark(text: str) -> DarkChoice:
     if not math.isfinite(counts):
         raise BenchError(f"--dark {text}: the offset must be a finite number of counts.")
     return counts
+
+
+def _erasures(text: str) -> Choice:
+    if text == "none":
+        return "none"
+    if text == "saturated":
+        return "saturated"
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
 
 
 def _binning(text: str) -> int | None:
@@ -274,6 +299,7 @@ def _solve(
             tau=tau,
             iterations=limit,
             time_s=time_s,
+            erasures=None if job.valid is None else ~job.valid,
             tolerance=DEFAULT_TOLERANCE if tolerance is None else tolerance,
             callback=show,
             cancel=cancel,

@@ -141,6 +141,51 @@ def test_options(here: Path, options: tuple[str, ...]) -> None:
     assert np.isfinite(tifffile.imread(here / "out.tif")).all()
 
 
+def test_saturated_pixels_do_not_spoil_the_picture(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_image(here / "burnt.tif", np.minimum(counts(photograph(), 20000, "uint16"), 4095))
+    words = [
+        "reconstruct",
+        "--psf",
+        "psf.tif",
+        "--image",
+        "burnt.tif",
+        "--iterations",
+        "60",
+        "--out",
+        "out.tif",
+    ]
+    assert main(words) == 0
+    output = capsys.readouterr()
+    assert "saturated pixels" in output.out
+    assert "saturated" not in output.err
+    erased = tifffile.imread(here / "out.tif")
+    assert main([*words, "--erasures", "none", "--force"]) == 0
+    assert "are saturated and used" in capsys.readouterr().err
+    used = tifffile.imread(here / "out.tif")
+    truth = 20000 / 30000  # photograph and PSF are scaled to these counts
+    for source in SOURCES:
+        assert erased[source] == pytest.approx(truth, rel=0.1)
+        assert used[source] < 0.5 * truth
+
+
+def test_a_random_share_of_the_pixels_is_enough(here: Path) -> None:
+    words = [
+        "reconstruct",
+        "--psf",
+        "psf.tif",
+        "--image",
+        "raw.tif",
+        "--iterations",
+        "60",
+        "--out",
+        "out.tif",
+    ]
+    assert main([*words, "--erasures", "0.5"]) == 0
+    picture = tifffile.imread(here / "out.tif")
+    assert brightest(picture) == set(SOURCES)
+    assert picture[SOURCES[0]] == pytest.approx(20000 / 30000, rel=0.1)
+
+
 def test_a_calibration_folder_in_place_of_a_psf(here: Path) -> None:
     psfs = np.stack([PSF, PSF[::-1]])[:, None].astype(np.float32)
     positions = np.array([[0, 0, 1e4], [0, 0, 3e4]], np.float64)
@@ -187,6 +232,9 @@ BAD = {
     "dark": (["--dark", "absent.tif"], "absent.tif: there is no such file"),
     "dark shape": (["--dark", "small.tif"], "the dark frame is 10 x 10"),
     "dark nan": (["--dark", "nan"], "finite"),
+    "erasures": (["--erasures", "1.5"], "from 0 to below 1"),
+    "erased all": (["--erasures", "0.99", "--bin", "4"], "no pixel is left"),
+    "mask": (["--erasures", "absent.png"], "absent.png: there is no such file"),
     "method": (["--method", "magic"], "magic"),
     "prior": (["--prior", "magic"], "magic"),
     "tau": (["--tau", "-1"], "tau"),

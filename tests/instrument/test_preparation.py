@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from instrument.calibration_file import save_calibration
+from instrument.erasures import erasures_of, reduce_valid
 from instrument.errors import BenchError, FileError
 from instrument.images import ImageFile, write_image
 from instrument.preparation import (
@@ -199,3 +200,45 @@ def test_a_folder_without_a_calibration_is_refused(tmp_path: Path, name: str, pa
     write_image(tmp_path / "raw.tif", psf_pixels())
     with pytest.raises(FileError, match=pattern):
         job_from_calibration(tmp_path / name, tmp_path / "raw.tif")
+
+
+def test_saturated_pixels_are_erased_when_asked_and_counted() -> None:
+    image = psf_pixels()
+    image[5, 5:8] = 4095
+    erased = erasures_of("saturated", file(image))
+    assert erased.valid is not None
+    assert (~erased.valid).sum() == 3
+    assert erased.reason.startswith("3 saturated pixels")
+    assert erasures_of("none", file(image)).valid is None
+    assert erasures_of("saturated", file(psf_pixels())).valid is None
+
+
+def test_a_share_is_erased_at_random_and_the_same_every_time() -> None:
+    first, again = (erasures_of(0.8, file(psf_pixels())).valid for _ in range(2))
+    assert first is not None
+    assert again is not None
+    assert 0.75 < 1 - first.mean() < 0.85
+    np.testing.assert_array_equal(first, again)
+    for share in (1.0, -0.1, float("nan")):
+        with pytest.raises(BenchError, match="from 0 to below 1"):
+            erasures_of(share, file(psf_pixels()))
+
+
+def test_a_mask_erases_where_it_is_zero(tmp_path: Path) -> None:
+    mask = np.ones((60, 80), np.uint8)
+    mask[:10] = 0
+    write_image(tmp_path / "mask.png", mask)
+    valid = erasures_of(tmp_path / "mask.png", file(psf_pixels())).valid
+    np.testing.assert_array_equal(valid, mask == 1)
+    write_image(tmp_path / "mask.png", 0 * mask)
+    with pytest.raises(FileError, match="no pixel is left"):
+        erasures_of(tmp_path / "mask.png", file(psf_pixels()))
+    with pytest.raises(FileError, match="the mask is 60 x 80"):
+        erasures_of(tmp_path / "mask.png", file(psf_pixels(shape=(50, 80))))
+
+
+def test_a_binned_pixel_is_valid_where_all_of_its_pixels_are() -> None:
+    valid = np.ones((5, 6), bool)
+    valid[1, 2] = False
+    assert reduce_valid(valid, None, 2).tolist() == [[True, False, True], [True, True, True]]
+    assert reduce_valid(valid, Crop(2, 0, 2, 4), 2).all()
