@@ -115,6 +115,35 @@ class GeometryTable(Table):
         return Geometry(self.pixel_pitch_um, self.diffuser_distance_mm, self.aperture_mm, self.wavelength_nm)
 
 
+class DisplayTable(Table):
+    """The holographic display: SLM, scattering mask and Fourier lens, as holograms are computed for them."""
+
+    slm_binning: int = Field(2, ge=1, description="SLM pixels used as one, along each axis.")
+    expansion: int = Field(
+        16,
+        ge=1,
+        description="Étendue expansion: mask pixels in the area of one (binned) SLM pixel; a square.",
+    )
+    mask_file: str | None = Field(
+        None,
+        min_length=1,
+        description=(
+            "Image of the mask, one image pixel a mask pixel, two values (the greater is pi); relative to "
+            "this file's folder. Left out: a random mask."
+        ),
+    )
+    mask_seed: int = Field(0, ge=0, description="Of the random mask.")
+    mask_fill: float = Field(
+        1.0, ge=0, le=1, description="Clear width of a mask pixel over the mask's pitch; 0 leaves it out."
+    )
+    wavelength_nm: float = Field(660.0, gt=0, description="Of the laser; the mask is made for it.")
+    focal_mm: float = Field(75.0, gt=0, description="Focal length of the Fourier lens.")
+    dc_power: float = Field(
+        0.0, ge=0, lt=1, description="Share of the light that the SLM does not modulate and nothing blocks."
+    )
+    dc_phase_rad: float = Field(0.0, description="Its phase relative to grey level 0.")
+
+
 DEVICE_TABLES: Mapping[Kind, type[Table]] = {
     "camera": CameraTable,
     "stage": StageTable,
@@ -128,6 +157,7 @@ PLAIN_TABLES: Mapping[str, type[Table]] = {
     "source": SourceTable,
     "scene": SceneTable,
     "geometry": GeometryTable,
+    "display": DisplayTable,
 }
 
 
@@ -171,6 +201,7 @@ class BenchConfig:
     source: SourceTable
     scene: SceneTable
     geometry: GeometryTable
+    display: DisplayTable
     devices: Mapping[Kind, DeviceConfig]
     shared: Mapping[str, SharedConfig] = field(default_factory=dict)
 

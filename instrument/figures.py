@@ -46,6 +46,7 @@ class Convergence:
     label: str
     reached: str = ""
     """A word or two at the last point, e.g. ``"26.1 dB"``."""
+    x_label: str = "seconds of reconstruction"
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
             weight="bold",
         )
         axes.margins(x=0.02, y=0.18)
-    axes.set_xlabel("seconds of reconstruction", fontsize=10, color=_INK)
+    axes.set_xlabel(convergence.x_label, fontsize=10, color=_INK)
     axes.set_title(convergence.label, fontsize=13, color=_INK, loc="left", pad=5)
     axes.grid(True, color="#e3e8ec", linewidth=0.8)
     axes.tick_params(labelsize=9, colors=_INK, length=0)

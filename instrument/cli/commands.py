@@ -20,6 +20,7 @@ class Command(NamedTuple):
 BENCH = "The bench"
 ACQUISITION = "Acquisition"
 RECONSTRUCTION = "Reconstruction"
+DISPLAY = "Holographic display"
 
 COMMANDS: Mapping[str, Command] = {
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
@@ -38,5 +39,16 @@ COMMANDS: Mapping[str, Command] = {
     ),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"
+    ),
+    "hologram": Command(
+        DISPLAY, "compute the SLM phase that shows a picture through the mask", "instrument.cli.hologram"
+    ),
+    "table7.1": Command(
+        DISPLAY,
+        "the dissertation's comparison of methods, also without aliasing",
+        "instrument.cli.table71",
+    ),
+    "etendue": Command(
+        DISPLAY, "field of view, eyebox and resolution of a holographic display", "instrument.cli.etendue"
     ),
 }

@@ -1,6 +1,12 @@
-"""The progress bar of long commands: on stderr, with the time left, silent where stderr is no terminal."""
+"""Long commands: a progress bar on stderr with the time left (silent where it is no terminal), and Ctrl-C."""
 
 from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 from rich.console import Console
 from rich.progress import (
@@ -28,3 +34,20 @@ def progress_bar() -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+@contextmanager
+def first_interrupt_cancels() -> Iterator[threading.Event]:
+    """Give an event that the first Ctrl-C sets; the second raises KeyboardInterrupt as ever."""
+    cancel = threading.Event()
+
+    def on_interrupt(_number: int, _frame: FrameType | None) -> None:
+        if cancel.is_set():
+            raise KeyboardInterrupt
+        cancel.set()
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield cancel
+    finally:
+        signal.signal(signal.SIGINT, before)

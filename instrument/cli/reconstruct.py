@@ -5,18 +5,13 @@ from __future__ import annotations
 import enum
 import math
 import re
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
 
 from instrument.cli.app import command_app, examples, saying_what_is_left
-from instrument.cli.progress import progress_bar
+from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.erasures import Choice
 from instrument.errors import BenchError
 from instrument.preparation import Crop
@@ -279,7 +274,7 @@ def _solve(
         raise BenchError("wiener is one shot: --iterations, --time and --tolerance do not apply to it.")
     chosen = prior or (PriorName.NONE if one_shot else PriorName.TV)
     limit = iterations if iterations is not None or time_s is not None else DEFAULT_ITERATIONS
-    with progress_bar() as bar, _first_interrupt_cancels() as cancel:
+    with progress_bar() as bar, first_interrupt_cancels() as cancel:
         # Whichever of count and time is nearer to its end drives the bar.
         task = bar.add_task(str(method), total=limit if limit is not None else 1000, note="")
 
@@ -304,23 +299,6 @@ def _solve(
             callback=show,
             cancel=cancel,
         )
-
-
-@contextmanager
-def _first_interrupt_cancels() -> Iterator[threading.Event]:
-    """Give an event that the first Ctrl-C sets; the second raises KeyboardInterrupt as ever."""
-    cancel = threading.Event()
-
-    def on_interrupt(_number: int, _frame: FrameType | None) -> None:
-        if cancel.is_set():
-            raise KeyboardInterrupt
-        cancel.set()
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield cancel
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _write(outputs: Outputs, result: Reconstruction, job: Job) -> None:

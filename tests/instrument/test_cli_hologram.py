@@ -1,0 +1,193 @@
+"""``diffuserbench hologram``, ``table7.1`` and ``etendue``: files, figures, and mistakes in words."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from instrument.cli import main
+from instrument.config_file import default_text, parse_config
+from instrument.display_setup import bench_display
+from instrument.errors import BenchError, FileError
+from instrument.hologram_job import prepare_target
+from instrument.images import read_image, write_image
+from instrument.sample_images import SAMPLES, load_sample
+from instrument.slm_image import levels_phase, phase_levels, read_slm_image
+from recon.holography import HologramModel
+from recon.holography.judge import compare
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DIFFUSERBENCH_DEBUG", raising=False)
+    small = default_text().replace("shape = [1080, 1920]", "shape = [96, 128]")
+    assert small != default_text()
+    Path("bench.toml").write_text(small.replace("expansion = 16 ", "expansion = 4 "))
+    y, x = np.mgrid[:80, :120]
+    picture = np.where((y - 40) ** 2 + (x - 60) ** 2 < 500, 220, 60 + x // 2)
+    write_image("picture.png", picture.astype(np.uint8))
+    return tmp_path
+
+
+def bench():
+    config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
+    return bench_display(config, ((96, 128), 8.0))
+
+
+@pytest.mark.usefixtures("here")
+def test_the_pattern_file_shows_the_picture(capsys):
+    assert main(["hologram", "picture.png", "--iterations", "40"]) == 0
+    said = capsys.readouterr().out
+    assert "alias-free grid, envelope shade, 1 frame(s)" in said
+    levels, facts = read_slm_image("slm.png")
+    assert levels.shape == (96, 128)
+    assert (levels[::2, ::2] == levels[1::2, 1::2]).all()
+    assert facts["metrics_computed_for"] == {
+        "grid": "alias_free", "envelope": "shade", "frames": 1, "phase_levels": "continuous",
+    }  # fmt: skip
+    display = bench()
+    target = prepare_target(read_image("picture.png").pixels, display)
+    slm = np.exp(1j * levels_phase(levels, facts["binning"]))[None]
+    model = HologramModel(display, [target])
+    found = compare(model.seen(slm), model.wanted(), model.peaks[0]).psnr_db
+    assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.3)
+    assert found > 20
+    assert read_image("slm-preview.png").is_colour
+
+
+def test_eight_bits_and_binning_survive_the_file():
+    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (5, 6))
+    levels = phase_levels(phase, 3)
+    assert levels.shape == (15, 18)
+    back = levels_phase(levels, 3)
+    assert np.abs(np.angle(np.exp(1j * (back - phase)))).max() <= np.pi / 256 + 1e-9
+
+
+@pytest.mark.usefixtures("here")
+def test_frames_colours_planes_and_video_have_files_of_their_own(capsys):
+    short = ["--iterations", "3"]
+    assert main(["hologram", "picture.png", "--frames", "2", *short]) == 0
+    assert Path("slm-frame1.png").exists()
+    assert Path("slm-frame2.png").exists()
+    grey = read_image("picture.png").pixels
+    write_image("colour.png", np.stack([grey, grey // 2, 255 - grey], axis=-1))
+    assert main(["hologram", "colour.png", "--color", "--out", "c.png", *short]) == 0
+    nm = [json.loads(Path(f"c-{c}.json").read_text())["wavelength_nm"] for c in ("red", "green", "blue")]
+    assert nm == [638.0, 520.0, 450.0]
+    planes = ["picture.png", "picture.png", "--z-mm", "0", "--z-mm", "60", "--out", "p.png"]
+    assert main(["hologram", *planes, *short]) == 0
+    assert len(json.loads(Path("p.json").read_text())["metrics"]) == 2
+    Path("film").mkdir()
+    for number in range(2):
+        write_image(f"film/{number}.png", np.roll(grey, number, axis=1))
+    capsys.readouterr()
+    assert main(["hologram", "film", "--video", "--out", "v.png", *short]) == 0
+    first, second = (json.loads(Path(f"v-000{n}.json").read_text())["metrics"][0]["psnr_db"] for n in (1, 2))
+    assert second > first + 1  # six iterations in all, the second frame started warm
+
+
+@pytest.mark.usefixtures("here")
+def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
+    assert main(["hologram", "picture.png", "--psnr", "15"]) == 0
+    assert "the requested PSNR is reached" in capsys.readouterr().out
+    assert main(["hologram", "picture.png"]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere.png"], "no such file"),
+        (["picture.png", "--expansion", "5"], "must be a square"),
+        (["picture.png", "--out", "slm.tif"], "written as .png"),
+        (["picture.png", "--complex"], "written as .npy"),
+        (["picture.png", "--weights", "picture.png"], "needs --loss spatial"),
+        (["picture.png", "--loss", "spatial", "--centre", "2"], "write Y,X"),
+        (["picture.png", "picture.png"], "Give --z-mm once for each"),
+        (["picture.png", "--color"], "needs a colour picture"),
+        (["picture.png", "--z-mm", "100000"], "too far"),
+    ],
+)
+def test_mistakes_end_in_a_sentence(capsys, arguments, words):
+    assert main(["hologram", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert "Traceback" not in error
+
+
+@pytest.mark.usefixtures("here")
+def test_a_mask_file_must_fit():
+    config = parse_config(
+        Path("bench.toml").read_text().replace('# mask_file = "mask.png"', 'mask_file = "m.png"'),
+        Path("bench.toml"),
+    )
+    bits = np.random.default_rng(1).integers(0, 2, (96, 128)).astype(np.uint8)
+    write_image("m.png", bits * 255)
+    display = bench_display(config, ((96, 128), 8.0))
+    np.testing.assert_array_equal(display.mask.levels, bits)
+    write_image("m.png", bits[:50])
+    with pytest.raises(FileError, match="SLM and expansion need"):
+        bench_display(config, ((96, 128), 8.0))
+    with pytest.raises(BenchError, match="cannot be binned"):
+        bench_display(config, ((95, 128), 8.0))
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("fit", ["cover", "contain", "stretch"])
+def test_a_wide_picture_keeps_its_shape_unless_stretched(fit):
+    image = np.zeros((100, 200), np.uint8)
+    image[25:75, 75:125] = 255  # a square
+    target = prepare_target(image, bench(), fit=fit, envelope="ignore").image > 0.5
+    rows, columns = target.any(axis=1).mean(), target.any(axis=0).mean()
+    expected = {"cover": (0.5, 0.5), "contain": (0.25, 0.25), "stretch": (0.5, 0.25)}[fit]
+    assert (rows, columns) == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("name", list(SAMPLES))
+def test_samples_are_pictures(name):
+    image = load_sample(name, (64, 100))
+    assert image.shape == (64, 100)
+    assert image.min() >= 0
+    assert image.max() <= 1
+    assert image.std() > 0.05
+
+
+@pytest.mark.usefixtures("here")
+def test_table_7_1_keeps_the_dissertations_order_on_both_grids(capsys):
+    small = ["--slm", "48x64", "--iterations", "40", "--pictures", "leaves", "-q", "4", "-q", "16"]
+    assert main(["table7.1", *small, "--out", "t"]) == 0
+    assert "leaves: drawn here" in capsys.readouterr().out
+    with Path("t.csv").open() as file:
+        lines = [line for line in csv.DictReader(file) if line["picture"] == "leaves"]
+    assert len(lines) == 2 * 4 * 3
+    for q in ("4", "16"):
+        for optimised, judged in (("dissertation", "dissertation"), ("alias_free", "alias_free")):
+            whole, crop = (
+                {
+                    line["method"]: float(line[column])
+                    for line in lines
+                    if (line["expansion"], line["optimised_on"], line["judged_on"]) == (q, optimised, judged)
+                }
+                for column in ("psnr_db", "crop_psnr_db")
+            )
+            assert whole["one-step"] < whole["none"] < whole["frequency"]
+            assert whole["spatial"] < whole["frequency"]
+            assert crop["one-step"] < crop["none"] < crop["frequency"] < crop["spatial"]
+    assert read_image("t.png").is_colour
+    assert main(["table7.1", "--pictures", "cat"]) == 2
+    assert "no sample picture 'cat'" in capsys.readouterr().err
+
+
+def test_etendue_prints_the_dissertations_example(capsys):
+    gaea = ["--slm", "2464x4160", "--pitch-um", "3.74", "--wavelength-nm", "532", "-q", "1"]
+    assert main(["etendue", *gaea, "--fov", "120", "--eyebox-mm", "10"]) == 0
+    said = capsys.readouterr().out
+    assert "paraxial 1.06 mm" in said
+    assert "leaves 12.7 degrees" in said
+    assert main(["etendue", "--slm", "big"]) == 2
