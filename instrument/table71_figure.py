@@ -85,7 +85,7 @@ def write_chart(path: Path, cells: Sequence[Cell], note: str) -> None:
             ax.set_title(f"{q}x expansion, {'middle quarter' if crop else 'whole field'}", loc="left")
             if column == 0:
                 ax.set_ylabel("PSNR of the low-passed image, dB")
-    axes[0][0].legend(loc="upper left", fontsize=9)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.suptitle(f"Table 7.1 (computed). {note}", x=0.01, ha="left", fontsize=11)
     with whole_file(path) as temporary:
         figure.savefig(temporary)
