@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class InputError(ValueError):
     """Unusable input: the text says what was found, what was expected and what to do."""
+
+
+class StructureError(InputError, TypeError):
+    """A solver has no way for this kind of operator or prior; the text says which solver may."""

@@ -1,17 +1,19 @@
 """The methods that :func:`recon.reconstruct` offers by name.
 
 A method takes a :class:`Problem` and returns an :class:`~recon.solvers.Outcome`. New ones register with
-:func:`register`.
+:func:`register`. Each solver looks for the structure that it needs in operator and prior, and refuses others
+with a sentence.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from recon.operators.base import Array, LinearOperator
 from recon.priors.base import Prior
+from recon.priors.simple import Separable
 from recon.solvers.admm import Admm
 from recon.solvers.base import Callback, Outcome
 from recon.solvers.fista import Fista
@@ -29,6 +31,8 @@ class Problem:
     operator: LinearOperator
     data: Array
     prior: Prior
+    tau: float | None
+    """The prior's relative weight as the caller gave it; None for the default that ``prior`` already has."""
     initial: Array | None
     rules: StoppingRules
     callback: Callback | None
@@ -65,7 +69,12 @@ def _fista(p: Problem) -> Outcome:
 
 
 def _wiener(p: Problem) -> Outcome:
-    return wiener(p.operator, p.data)
+    """Wiener's penalty takes the place of the prior; only the prior's bounds are kept, by clipping."""
+    outcome = wiener(p.operator, p.data, p.tau)
+    for term in p.prior.terms():
+        if isinstance(term, Separable):
+            outcome = replace(outcome, solution=term.prox(outcome.solution, 0.0))
+    return outcome
 
 
 register("admm", _admm)

@@ -74,10 +74,11 @@ def reconstruct(
         A name from :func:`recon.methods.method_names`: ``"admm"``, ``"fista"``, ``"wiener"``.
     prior : str or Prior
         A name from :data:`PRIORS` (all but ``"none"`` include non-negativity), or a prior for the scaled
-        problem of :func:`recon.preparation.prepare`. ``"wiener"`` has its own.
+        problem of :func:`recon.preparation.prepare`. Of these, ``"wiener"`` keeps only the bounds.
     tau : float, optional
         Weight of the prior relative to ``max |A^H b|``: the same number works at any exposure and size, and
-        for l1 a tau of 1 leaves nothing. Default: from the measurement's noise.
+        for l1 a tau of 1 leaves nothing. Default: from the measurement's noise. For ``"wiener"``: its
+        regularisation (see :func:`recon.solvers.wiener`), by default cross-validated.
     iterations, time_s, tolerance : optional
         When to stop: count, wall seconds, relative change an iteration, whichever comes first. Without
         ``iterations`` and ``time_s``: 200 iterations.
@@ -106,7 +107,8 @@ def reconstruct(
     Raises
     ------
     InputError
-        When the input is unusable; the text says what was found, what was expected and what to do.
+        When the input is unusable, or the method has no way for the prior; the text says what was found, what
+        was expected and what to do.
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
@@ -115,6 +117,7 @@ def reconstruct(
     )
     problem.grid(field, z_um)
     peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
+    given_tau = tau
     tau = max(NOISE_WEIGHT / peak if peak > 0 else 0.0, LEAST_TAU) if tau is None else float(tau)
     if not tau >= 0:
         raise InputError(f"tau must not be negative; got {tau}.")
@@ -138,6 +141,7 @@ def reconstruct(
             operator=problem.operator,
             data=problem.data,
             prior=penalty,
+            tau=given_tau,
             initial=None if initial is None else _start(initial, problem),
             rules=rules,
             callback=None if callback is None else tell,

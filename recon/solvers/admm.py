@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from recon import fft
+from recon.errors import StructureError
 from recon.operators.base import Array, LinearOperator
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
@@ -234,7 +235,7 @@ def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
     tv = others[0]
     if len(others) > 1 or not isinstance(tv, TotalVariation) or tv.axis_weights != (1.0, 1.0):
         names = ", ".join(type(t).__name__ for t in others)
-        raise TypeError(f"This ADMM takes one TotalVariation in two dimensions, not {names}. Fista may.")
+        raise StructureError(f"ADMM takes one TotalVariation in two dimensions, not {names}; fista may.")
     assert isinstance(separable, Separable)
     return tv, separable
 

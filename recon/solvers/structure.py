@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recon.errors import StructureError
 from recon.operators.base import Array, Composition, LinearOperator
 from recon.operators.convolution import PadCropConvolution
 from recon.operators.erasures import Erasures
@@ -31,7 +32,7 @@ def as_cropped_convolution(operator: LinearOperator) -> CroppedConvolution:
 
     Raises
     ------
-    TypeError
+    StructureError
         When it is something else.
     """
     weight = np.ones(operator.range_shape, operator.dtype)
@@ -41,7 +42,7 @@ def as_cropped_convolution(operator: LinearOperator) -> CroppedConvolution:
         inner = inner.inner
     if isinstance(inner, PadCropConvolution):
         return CroppedConvolution(inner, weight)
-    raise TypeError(
+    raise StructureError(
         f"This solver needs a PadCropConvolution, with or without Erasures; got {type(inner).__name__}. "
         "Fista takes any operator."
     )

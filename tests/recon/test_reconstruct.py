@@ -129,6 +129,17 @@ def test_continues_from_an_earlier_result(shot):
     assert psnr(warm.image, shot.truth) > psnr(cold.image, shot.truth) + 3
 
 
+def test_wiener_s_regularisation_is_chosen_and_can_be_given(shot):
+    def error(**options):
+        return psnr(reconstruct(shot.measurement, shot.psf, method="wiener", **options).image, shot.truth)
+
+    chosen = error()
+    assert chosen > max(error(tau=10.0**e) for e in range(-6, 3)) - 1.0
+    assert error(tau=1e-6) < chosen
+    assert reconstruct(shot.measurement, shot.psf, method="wiener").image.min() == 0
+    assert reconstruct(shot.measurement, shot.psf, method="wiener", prior="none").image.min() < 0
+
+
 def test_grid_tells_where_pixels_lie(shot):
     geometry = Geometry(pixel_pitch_um=10.0, diffuser_distance_mm=5.0)
     calibration = Calibration(
@@ -168,6 +179,7 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
         (GOOD, GOOD, {"background": np.ones((3, 3))}, "background has 3 x 3 pixels"),
         (GOOD, GOOD, {"method": "adm"}, "'adm' is not known. .* Did you mean 'admm'"),
         (GOOD, GOOD, {"prior": "tb"}, "'tb' is not known"),
+        (GOOD, GOOD, {"prior": "tv-haar"}, "not HaarTotalVariation; fista may"),
         (GOOD, GOOD, {"tau": -1.0}, "tau must not be negative"),
         (GOOD, GOOD, {"noise": -1.0}, "must not be negative"),
         (GOOD, GOOD, {"field": "half"}, 'must be "sensor" or "full"'),
