@@ -1,0 +1,246 @@
+"""Kill a running acquisition with ``kill -9`` again and again, resume it, and look for what was lost.
+
+    python benchmarks/crash_test.py --kills 200
+
+Each trial runs a plan on the simulated bench in a process of its own, kills it at a random moment (while the
+run's folder is made, while frames are taken and written, while the run is finished), maybe kills the resumed
+one too, and resumes it to the end. What the killed process had been promised to be on the disk (it reports
+every frame whose ``write`` has returned) must be there; no frame may be taken twice once its line is in the
+log; every run must open and verify. Exit status 1 when any of it fails.
+
+``kill -9`` ends the process, not the kernel: that everything is also synced in the right order, so that a
+power cut costs no more, is held by tests/instrument/test_store_order.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from instrument.acquire import prepare
+from instrument.bench import open_bench
+from instrument.config_file import parse_config
+from instrument.plan import Part, Plan
+from instrument.resume import prepare_resume
+from instrument.store import Run, RunCondition, RunWriter
+from instrument.store.durable import read_lines
+from instrument.verification import verify
+
+BENCH = """
+[bench]
+name = "crash test"
+[camera]
+driver = "simulated"
+roi = [0, 0, 64, 96]
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0.05
+"""
+PLAN = Plan(
+    label="crash test",
+    parts=(
+        Part(label="dark", exposures_ms=(2.0,), repeats=5),
+        Part(label="psf", light=("source", "off"), exposures_ms=(1.0, 3.0), repeats=8),
+        Part(label="scene", scene_lit=True, exposures_ms=(2.0,), average=2, repeats=5),
+    ),
+)
+
+
+@dataclass
+class Tally:
+    """What all trials together came to."""
+
+    kills: int = 0
+    trials: int = 0
+    stored_at_kill: list[int] = field(default_factory=list)
+    moments: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    repeated: int = 0
+    unreadable: int = 0
+    torn: int = 0
+    unlogged: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def acquire(folder: Path, promised: Connection) -> None:
+    """Run the plan in ``folder``, or go on with the run that is there; in a process of its own."""
+    write = RunWriter.write
+
+    def reporting(self: RunWriter, frames) -> None:  # type: ignore[no-untyped-def]
+        write(self, frames)
+        for frame in frames:
+            promised.send(frame.index)
+
+    RunWriter.write = reporting  # type: ignore[method-assign]
+    runs = runs_in(folder)
+    with open_bench(parse_config(BENCH, None)) as bench:
+        promised.send("ready")
+        if runs:
+            prepare_resume(bench, runs[0])[0].execute()
+        else:
+            prepare(bench, PLAN, folder).execute()
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """Return the run folders in a folder: the one, or none yet."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
+def attempt(folder: Path, delay_s: float | None) -> tuple[set[int], bool, float]:
+    """Let a process acquire and kill it ``delay_s`` after it is ready (None: let it finish).
+
+    Returns the frames it was promised, whether it was killed, and the seconds from ready to its end.
+    """
+    receive, send = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("spawn").Process(target=acquire, args=(folder, send))
+    process.start()
+    send.close()
+    promised: set[int] = set()
+    if receive.recv() != "ready":
+        raise AssertionError("the process must report that it is ready first")
+    began_s = time.monotonic()
+    if delay_s is not None:
+        time.sleep(delay_s)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.pid or 0, signal.SIGKILL)
+    with contextlib.suppress(EOFError):
+        while True:
+            promised.add(receive.recv())
+    process.join()
+    if process.exitcode not in (0, -signal.SIGKILL):
+        raise SystemExit(f"The acquisition itself failed (exit status {process.exitcode}); see above.")
+    return promised, process.exitcode == -signal.SIGKILL, time.monotonic() - began_s
+
+
+def trial(folder: Path, choose_delay: Callable[[], float | None], tally: Tally) -> None:
+    """Kill and resume one run until it is complete, and judge it."""
+    tally.trials += 1
+    promised: set[int] = set()
+    kept: dict[int, bytes] = {}
+    delay_s = choose_delay()
+    while True:
+        reported, killed, _ = attempt(folder, delay_s)
+        promised |= reported
+        runs = runs_in(folder)
+        if killed:
+            tally.kills += 1
+            look(runs, promised, kept, tally)
+        elif delay_s is None or (runs and Run.open(runs[0]).condition is RunCondition.COMPLETED):
+            break
+        # A run that was killed once is let finish, or killed again with half the probability.
+        delay_s = choose_delay() if random.random() < 0.5 else None
+    judge(runs_in(folder), kept, tally)
+
+
+def look(runs: list[Path], promised: set[int], kept: dict[int, bytes], tally: Tally) -> None:
+    """After a kill: what was promised must be there, and what is there must stay."""
+    if not runs:
+        tally.moments["before the folder had its name"] += 1
+        if promised:
+            tally.lost += len(promised)
+        return
+    try:
+        run = Run.open(runs[0])
+    except Exception as error:  # noqa: BLE001 - whatever it is, the run cannot be read
+        tally.unreadable += 1
+        tally.problems.append(f"{runs[0]}: {error!r}")
+        return
+    tally.moments[str(run.condition)] += 1
+    tally.torn += run.torn_bytes > 0
+    tally.stored_at_kill.append(len(run.records))
+    lost = promised - set(run.records)
+    damaged = [index for index in run.records if run.verify(index) is not None]
+    if lost or damaged:
+        tally.lost += len(lost) + len(damaged)
+        tally.problems.append(f"{run.path}: promised {sorted(lost)} not there, damaged {damaged}")
+    for index in run.records:
+        data = run.array.chunk_path(index).read_bytes()
+        if kept.setdefault(index, data) != data:
+            tally.repeated += 1
+            tally.problems.append(f"{run.path}: frame {index} was taken again")
+
+
+def judge(runs: list[Path], kept: dict[int, bytes], tally: Tally) -> None:
+    """At the end: complete, sound, every frame logged once, and the early ones as they were."""
+    if len(runs) != 1:
+        tally.unreadable += 1
+        tally.problems.append(f"{len(runs)} runs where one should be: {runs}")
+        return
+    run = Run.open(runs[0])
+    found = verify(run)
+    if run.condition is not RunCondition.COMPLETED or run.missing() or not found.is_sound:
+        tally.lost += max(1, len(run.missing()))
+        tally.problems.append(f"{run!r} {found}")
+    lines, _ = read_lines(run.path / "log.jsonl")
+    logged = Counter(line["index"] for line in lines if line["kind"] == "frame")
+    twice = [index for index, times in logged.items() if times > 1]
+    changed = [i for i, data in kept.items() if run.array.chunk_path(i).read_bytes() != data]
+    tally.repeated += len(twice) + len(changed)
+    if twice or changed:
+        tally.problems.append(f"{run.path}: logged twice {twice}, changed {changed}")
+    text = next((str(e["text"]) for e in run.events if e["kind"] == "found" and "without" in e["text"]), "")
+    tally.unlogged += bool(text)
+
+
+def main() -> int:
+    """Run the crash test as the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keep", action="store_true", help="keep the runs (their folder is printed)")
+    options = parser.parse_args()
+    random.seed(options.seed)
+    parent = Path(tempfile.mkdtemp(prefix="crash-test-"))
+    tally = Tally()
+    began_s = time.monotonic()
+    (parent / "whole").mkdir()
+    _, _, whole_s = attempt(parent / "whole", None)
+    print(f"{len(PLAN)} frames take {whole_s:.2f} s unharmed; runs in {parent}")
+
+    def choose_delay() -> float | None:
+        if tally.kills >= options.kills:
+            return None
+        return random.uniform(0.0, 1.05 * whole_s)
+
+    while tally.kills < options.kills:
+        folder = parent / f"{tally.trials:04d}"
+        folder.mkdir()
+        trial(folder, choose_delay, tally)
+        if not options.keep:
+            shutil.rmtree(folder)
+        print(f"\r{tally.kills} kills", end="", flush=True)
+    stored = sorted(tally.stored_at_kill)
+    print(f"\r{tally.kills} kills in {tally.trials} runs, {time.monotonic() - began_s:.0f} s")
+    print(f"found after a kill: {dict(tally.moments)}")
+    if stored:
+        print(f"frames stored at the kill: {stored[0]} to {stored[-1]}, median {stored[len(stored) // 2]}")
+    print(f"half lines in the log: {tally.torn}; runs with images without a line: {tally.unlogged}")
+    print(f"frames lost {tally.lost}, repeated {tally.repeated}, unreadable runs {tally.unreadable}")
+    for problem in tally.problems:
+        print(problem)
+    if not options.keep:
+        shutil.rmtree(parent)
+    return 1 if tally.lost or tally.repeated or tally.unreadable else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
