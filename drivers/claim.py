@@ -42,7 +42,7 @@ class Claim:
 
     def __init__(self, resource: str, device: str) -> None:
         self.resource = resource
-        path = _folder() / f"{hashlib.sha256(resource.encode()).hexdigest()[:24]}.lock"
+        path = _path(resource)
         self._handle = _open(path)
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -68,6 +68,26 @@ class Claim:
         if self._handle >= 0:
             handle, self._handle = self._handle, -1
             os.close(handle)
+
+
+def holder_of(resource: str) -> str | None:
+    """Return who has a claim, in words; None when nobody has."""
+    path = _path(resource)
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _holder(path)
+    finally:
+        os.close(handle)
+    return None
+
+
+def _path(resource: str) -> Path:
+    return _folder() / f"{hashlib.sha256(resource.encode()).hexdigest()[:24]}.lock"
 
 
 def _folder() -> Path:
