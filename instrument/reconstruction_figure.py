@@ -13,8 +13,10 @@ from instrument.reconstruction_job import Job
 from recon.result import Reconstruction
 
 
-def write_figure(path: Path, result: Reconstruction, job: Job) -> None:
+def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> None:
     """Draw the figure and write it whole or not at all, in the format of the suffix.
+
+    ``rotate_deg``, a multiple of 90, turns the picture counter-clockwise.
 
     Raises
     ------
@@ -22,16 +24,17 @@ def write_figure(path: Path, result: Reconstruction, job: Job) -> None:
         When it cannot be written.
     """
     with whole_file(path) as temporary:
-        save_figure(summary_figure(_summary(result, job)), temporary)
+        save_figure(summary_figure(_summary(result, job, rotate_deg)), temporary)
 
 
-def _summary(result: Reconstruction, job: Job) -> Summary:
+def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
     psf = np.moveaxis(job.calibration.psfs[0], 0, -1)
-    height, width = result.image.shape[:2]
+    image = np.rot90(result.image, rotate_deg // 90)
+    height, width = image.shape[:2]
     panels = (
         Panel("PSF", _shown(psf[..., 0] if psf.shape[-1] == 1 else psf), gamma=0.5, caption="square root"),
         Panel("Photograph", _shown(job.measurement), caption="dark level subtracted"),
-        Panel("Reconstruction", _shown(result.image), caption=f"{height} x {width}"),
+        Panel("Reconstruction", _shown(image), caption=f"{height} x {width}"),
     )
     facts = [("method", result.method), ("prior", result.prior)]
     if result.tau is not None:

@@ -71,19 +71,23 @@ class Outputs:
                 raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
 
 
-def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job) -> None:
+def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> None:
     """Write image, preview and record, each whole or not at all.
+
+    ``rotate_deg``, a multiple of 90, turns the written picture counter-clockwise.
 
     Raises
     ------
     FileError, OSError
         When a file cannot be written (a full disk), naming it.
     """
-    write_image(outputs.image, result.image)
-    pixels, white = preview(result.image)
+    image = np.rot90(result.image, rotate_deg // 90)
+    write_image(outputs.image, image)
+    pixels, white = preview(image)
     write_image(outputs.preview, pixels)
     record = reconstruction_record(result, job) | {
-        "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0}
+        "rotated_deg": rotate_deg,
+        "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
     write_text(outputs.record, json.dumps(record, indent=1, allow_nan=False) + "\n")
 

@@ -46,13 +46,22 @@ class PriorName(enum.StrEnum):
     NONE = "none"
 
 
+class Rotation(enum.StrEnum):
+    """By how much the written picture is turned, degrees counter-clockwise."""
+
+    NONE = "0"
+    QUARTER = "90"
+    HALF = "180"
+    THREE_QUARTERS = "270"
+
+
 @app.command(
     epilog=examples(
         "diffuserbench reconstruct --psf psf.tif --image raw.tif",
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --dark dark.tif --bin 4 --out hand.tif",
         "diffuserbench reconstruct --psf psf.npy --image raw.npy --method fista --prior l1 --time 30",
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --method wiener --tau 0.01",
-        "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30",
+        "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
     )
 )
 def reconstruct(
@@ -149,6 +158,10 @@ def reconstruct(
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FILE", help="float32 TIFF; .png and .json go beside it.")
     ] = Path("reconstruction.tif"),
+    rotate: Annotated[
+        Rotation,
+        typer.Option("--rotate", help="Turn the picture counter-clockwise, degrees; 180 if upside down."),
+    ] = Rotation.NONE,
     figure: Annotated[
         Path | None,
         typer.Option(
@@ -190,7 +203,7 @@ def reconstruct(
             typer.echo(f"Warning: {warning}", err=True)
         result = _solve(job, method, prior, tau, iterations, time_s, tolerance, z_mm)
         _tell(result)
-        _write(outputs, result, job)
+        _write(outputs, result, job, int(rotate))
     if result.stop_reason is StopReason.CANCELLED:
         count = len(result.history)
         typer.echo(f"Interrupted after {count} iterations: this is the picture so far.", err=True)
@@ -301,12 +314,12 @@ def _solve(
         )
 
 
-def _write(outputs: Outputs, result: Reconstruction, job: Job) -> None:
-    write_reconstruction(outputs, result, job)
+def _write(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) -> None:
+    write_reconstruction(outputs, result, job, rotate_deg=rotate_deg)
     if outputs.figure is not None:
         from instrument.reconstruction_figure import write_figure  # matplotlib, only where it is wanted
 
-        write_figure(outputs.figure, result, job)
+        write_figure(outputs.figure, result, job, rotate_deg=rotate_deg)
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
 
 

@@ -121,8 +121,6 @@ def _light(bench: Bench, light: Light) -> None:
 
 
 def _photograph(bench: Bench, average: int) -> Snapshot:
-    if average == 1:
-        return bench.snap()
     with progress_bar() as bar:
         task = bar.add_task("Frames", total=average, note="")
         return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))

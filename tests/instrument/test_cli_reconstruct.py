@@ -168,6 +168,25 @@ def test_saturated_pixels_do_not_spoil_the_picture(here: Path, capsys: pytest.Ca
         assert used[source] < 0.5 * truth
 
 
+def test_the_written_picture_can_be_turned(here: Path) -> None:
+    words = [
+        "reconstruct",
+        "--psf",
+        "psf.tif",
+        "--image",
+        "raw.tif",
+        "--iterations",
+        "5",
+        "--figure",
+        "fig.png",
+    ]
+    assert main([*words, "--out", "a.tif"]) == 0
+    assert main([*words, "--out", "b.tif", "--rotate", "90", "--force"]) == 0
+    np.testing.assert_array_equal(tifffile.imread(here / "b.tif"), np.rot90(tifffile.imread(here / "a.tif")))
+    assert json.loads((here / "b.json").read_text())["rotated_deg"] == 90
+    assert cv2.imread(str(here / "b.png"), cv2.IMREAD_UNCHANGED).shape == SHAPE[::-1]
+
+
 def test_a_random_share_of_the_pixels_is_enough(here: Path) -> None:
     words = [
         "reconstruct",
