@@ -5,13 +5,23 @@ from recon.operators.base import Composition, LinearOperator, estimate_norm
 from recon.operators.convolution import PadCropConvolution
 from recon.operators.convolution3d import Convolution3D
 from recon.operators.erasures import Erasures
+from recon.operators.local_convolution import FieldOfPsfs, local_convolution
+from recon.operators.low_rank import PrincipalPsfs, low_rank, principal_psfs
+from recon.operators.spatially_varying import Group, SpatiallyVarying
 
 __all__ = [
     "BackgroundRemoval",
     "Composition",
     "Convolution3D",
     "Erasures",
+    "FieldOfPsfs",
+    "Group",
     "LinearOperator",
     "PadCropConvolution",
+    "PrincipalPsfs",
+    "SpatiallyVarying",
     "estimate_norm",
+    "local_convolution",
+    "low_rank",
+    "principal_psfs",
 ]

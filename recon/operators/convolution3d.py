@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -31,6 +32,8 @@ class Convolution3D(LinearOperator):
         Number of channels of object and data when one PSF serves all; default as many as ``psfs`` has.
     dtype : dtype
         float32 or float64.
+    allocate : callable
+        ``allocate(shape, dtype)`` returns an array for the transfer functions, e.g. one on disk.
 
     Attributes
     ----------
@@ -49,6 +52,7 @@ class Convolution3D(LinearOperator):
         *,
         n_channels: int | None = None,
         dtype: npt.DTypeLike = np.float32,
+        allocate: Callable[[tuple[int, ...], npt.DTypeLike], Array] = np.empty,
     ) -> None:
         if psfs.ndim != 4:
             raise InputError(f"psfs must be (n_z, n_channels, height, width), not {psfs.shape}.")
@@ -72,6 +76,7 @@ class Convolution3D(LinearOperator):
         n_z = len(psfs)
         super().__init__((n_channels, n_z, *self.grid_shape), (n_channels, *self.sensor_shape), dtype)
         self._psfs = psfs
+        self._allocate = allocate
         self.groups = PlaneGroups(n_z)
         self._work = np.empty(self.grid_shape, self.dtype)
 
@@ -86,7 +91,7 @@ class Convolution3D(LinearOperator):
     def spectrum(self) -> Array:
         """Transfer functions of all depths; computed when first needed and then kept."""
         n_z, channels = self._psfs.shape[:2]
-        spectrum = np.empty(
+        spectrum = self._allocate(
             (channels, n_z, *fft.spectrum_shape(self.grid_shape)), fft.complex_dtype(self.dtype)
         )
         for channel in range(channels):

@@ -26,6 +26,7 @@ from recon.operators.convolution3d import Convolution3D
 from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord
 from recon.volume.balance import is_due
+from recon.volume.memory import Storage
 from recon.volume.scale import expected_height
 from recon.volume.sensor_system import SensorSystem, residual_norm
 
@@ -58,6 +59,8 @@ class DouglasRachford(Solver):
         multiplier.
     keep_state : bool
         False lets the result take the state's place when :meth:`run` ends.
+    storage : Storage, optional
+        Where the state lives; default memory. (The transfer functions are the operator's.)
     """
 
     state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma")
@@ -76,6 +79,7 @@ class DouglasRachford(Solver):
         relaxation: float = 1.7,
         balance: bool = True,
         keep_state: bool = True,
+        storage: Storage | None = None,
     ) -> None:
         super().__init__()
         if operator.domain_shape[0] != 1:
@@ -94,7 +98,8 @@ class DouglasRachford(Solver):
             operator.grid_shape, operator.sensor_window, valid, background, dtype=dtype
         )
         self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
-        self.z = np.zeros(operator.domain_shape[1:], dtype)
+        self._storage = storage or Storage()
+        self.z = self._storage.zeros(operator.domain_shape[1:], dtype)
         if initial is not None:
             self.z[...] = np.reshape(initial, self.z.shape)
         self._power = operator.power()

@@ -35,6 +35,7 @@ from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord
 from recon.threads import get_threads, in_blocks
 from recon.volume.balance import is_due
+from recon.volume.memory import Storage
 from recon.volume.sensor_system import SensorSystem, residual_norm
 
 _TILE = 256
@@ -93,6 +94,7 @@ class LeanTotalVariation(Solver):
         relaxation: float = 1.7,
         balance: bool = True,
         keep_state: bool = True,
+        storage: Storage | None = None,
     ) -> None:
         super().__init__()
         if operator.domain_shape[0] != 1:
@@ -113,13 +115,15 @@ class LeanTotalVariation(Solver):
         self.system = SensorSystem((ny, nx), operator.sensor_window, valid, background, dtype=dtype)
         self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
 
-        self.g = np.empty((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
+        storage = storage or Storage()
+        self.g = storage.zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
         self._dy2 = (4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype)
         self._dx2 = (4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype)
         self._q = np.empty(self.g.shape[1:], dtype)
         self._prepare_transfer()
-        self.X = np.zeros_like(self.g)
-        self.S = np.zeros((nz, ny, 4, nx), dtype)
+        self.X = storage.zeros(self.g.shape, self.g.dtype)
+        self.S = storage.zeros((nz, ny, 4, nx), dtype)
+        self._storage = storage
         self.e = self.data.copy()
         self._totals = np.empty((operator.groups.count, *self.g.shape[1:]), self.g.dtype)
         self._statistics = np.zeros((nz, _tv_kernels.STATISTICS))

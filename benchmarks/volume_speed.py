@@ -1,0 +1,127 @@
+"""Seconds per iteration and peak memory of the volume solvers, 512 x 512 x 128 voxels unless told otherwise.
+
+    python benchmarks/volume_speed.py [--sensor 256] [--depths 128] [--iterations 6] [--threads 2] [--rounds
+    2]
+
+Each method runs in a process of its own (its peak memory is the process's), in rounds, one after the other,
+so that a busy machine is unjust to none. The best of the rounds' medians counts. ``naive`` is the
+dissertation's algorithm as it stands in NumPy (:class:`recon.volume.LiteralAdmm`), ``fused`` the same written
+well (``benchmarks/literal_fused.py``), both with three-dimensional FFTs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+METHODS = ("lean TV", "l1 (Douglas-Rachford)", "literal TV, fused", "literal l1, fused", "literal TV, naive")
+
+
+def problem(sensor: int, depths: int):
+    """Return an operator with random microlens-like PSFs that grow with nearness, and a measurement."""
+    import numpy as np
+
+    from recon.operators import Convolution3D
+
+    rng = np.random.default_rng(0)
+    lenses = rng.uniform(-0.36, 0.36, (400, 2)) * sensor
+    psfs = np.zeros((depths, 1, sensor, sensor), np.float32)
+    for z in range(depths):
+        rows, columns = np.round(lenses * (1 + 0.3 * z / depths) + sensor / 2).astype(int).T
+        np.add.at(psfs[z, 0], (rows % sensor, columns % sensor), 0.05)
+    operator = Convolution3D(psfs, (sensor, sensor))
+    data = rng.poisson(100, (1, sensor, sensor)).astype(np.float32)
+    return operator, data
+
+
+def solver(method: str, operator, data):
+    """Return a solver by its name in METHODS."""
+    from recon.volume import DouglasRachford, LeanTotalVariation, LiteralAdmm
+
+    if method == "lean TV":
+        return LeanTotalVariation(operator, data, 10.0)
+    if method == "l1 (Douglas-Rachford)":
+        return DouglasRachford(operator, data, 10.0)
+    if method == "literal TV, naive":
+        return LiteralAdmm(operator, data, 10.0, penalties=(1.0, 1.0, 1.0))
+    from literal_fused import FusedLiteralAdmm
+
+    return FusedLiteralAdmm(operator, data, 10.0, tv="TV" in method, penalties=(1.0, 1.0, 1.0))
+
+
+def measure(method: str, sensor: int, depths: int, iterations: int, threads: int) -> dict[str, float]:
+    """Run one method in this process."""
+    import os
+
+    from recon.threads import set_threads
+
+    set_threads(threads)
+    sys.path.insert(0, str(Path(__file__).resolve().parent))
+    solver(method, *problem(16, 4)).step()  # compile
+    began = time.perf_counter()
+    s = solver(method, *problem(sensor, depths))
+    prepared = time.perf_counter() - began
+    wall, cpu = [], []
+    for i in range(iterations + 1):
+        before = sum(os.times()[:2])
+        began = time.perf_counter()
+        s.step()
+        if i:  # the first touches fresh memory
+            wall.append(time.perf_counter() - began)
+            cpu.append(sum(os.times()[:2]) - before)
+        if hasattr(s, "iteration"):
+            s.iteration += 1
+    wall.sort()
+    cpu.sort()
+    return {
+        "seconds": wall[len(wall) // 2],
+        "best_seconds": wall[0],
+        "cpu_seconds": cpu[len(cpu) // 2],
+        "setup_seconds": prepared,
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+
+
+def main() -> None:
+    """Measure all methods and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--sensor", type=int, default=256)
+    parser.add_argument("--depths", type=int, default=128)
+    parser.add_argument("--iterations", type=int, default=6)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    a = parser.parse_args()
+    if a.one:
+        print(json.dumps(measure(a.one, a.sensor, a.depths, a.iterations, a.threads)))
+        return
+    results: dict[str, dict[str, float]] = {}
+    for _ in range(a.rounds):
+        for method in a.methods:
+            command = [sys.executable, __file__, "--one", method]
+            for name in ("sensor", "depths", "iterations", "threads"):
+                command += [f"--{name}", str(getattr(a, name))]
+            answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            found = json.loads(answer.splitlines()[-1])
+            old = results.setdefault(method, found)
+            results[method] = {k: min(v, old[k]) for k, v in found.items()}
+    grid = 2 * a.sensor
+    print(f"{grid} x {grid} x {a.depths} voxels (sensor {a.sensor}), {a.threads} threads")
+    print("| method | s per iteration (median) | best | setup s | peak GiB |\n|---|---|---|---|---|")
+    for method, r in results.items():
+        print(
+            f"| {method} | {r['seconds']:.2f} | {r['best_seconds']:.2f} "
+            f"| {r['setup_seconds']:.1f} | {r['peak_gib']:.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""How much memory a volume takes, said before it is taken; and where it goes when there is not enough."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.operators.planes import GROUPS
+from recon.threads import get_threads
+
+GIB = 2**30
+VOLUMES = {"tv": 6, "l1": 2}
+"""Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
+KEPT_FREE = 0.1
+"""Share of the available memory that is left to everybody else."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What a reconstruction will take, in bytes.
+
+    Attributes
+    ----------
+    state : int
+        The solver's volumes: what may go to disk.
+    work : int
+        Planes, PSFs and the result: what must be in memory.
+    available : int
+        Memory that the machine can give now.
+    """
+
+    state: int
+    work: int
+    available: int
+
+    @property
+    def total(self) -> int:
+        """All of it."""
+        return self.state + self.work
+
+    @property
+    def fits(self) -> bool:
+        """Whether everything fits into memory, with a margin."""
+        return self.total <= (1 - KEPT_FREE) * self.available
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        return (
+            f"{self.total / GIB:.2f} GiB ({self.state / GIB:.2f} GiB solver state, {self.work / GIB:.2f} GiB "
+            f"PSFs, planes and result) of {self.available / GIB:.2f} GiB available"
+        )
+
+
+def plan(
+    kind: str,
+    domain_shape: tuple[int, ...],
+    psf_values: int,
+    result_values: int,
+    *,
+    itemsize: int = 4,
+    available: int | None = None,
+) -> MemoryPlan:
+    """Work out what a solver will need.
+
+    Parameters
+    ----------
+    kind : str
+        A key of :data:`VOLUMES`.
+    domain_shape : tuple of int
+        ``(1, n_z, grid_height, grid_width)``: channels are reconstructed one after the other.
+    psf_values, result_values : int
+        Numbers kept of the PSFs and of the result.
+    itemsize : int
+        Bytes a number.
+    available : int, optional
+        Bytes; default what the operating system says.
+    """
+    _, n_z, height, width = domain_shape
+    spectrum = n_z * height * (width // 2 + 1) * 2 * itemsize
+    real = n_z * height * width * itemsize
+    volumes = 2 * spectrum + 4 * real if kind == "tv" else spectrum + real
+    plane = height * (width // 2 + 1) * 2 * itemsize
+    work = (psf_values + result_values) * itemsize + plane * (GROUPS + 6 * get_threads() + 8)
+    return MemoryPlan(volumes, work, available_bytes() if available is None else available)
+
+
+def available_bytes() -> int:
+    """Memory that this process may still take: what is free, within its control group's limit."""
+    free = []
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                free.append(int(line.split()[1]) * 1024)
+    group = Path("/sys/fs/cgroup")
+    limit, used = group / "memory.max", group / "memory.current"
+    if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
+        free.append(int(limit.read_text()) - int(used.read_text()))
+    return min(free, default=2**62)
+
+
+class Storage:
+    """Where a solver's volumes live: in memory, or as files in a scratch folder that the system pages.
+
+    Parameters
+    ----------
+    scratch : path, optional
+        Folder for the files (a fast disk); they are removed when the storage is. Default: memory.
+    """
+
+    def __init__(self, scratch: Path | str | None = None) -> None:
+        self._folder: Path | None = None
+        if scratch is not None:
+            self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._count = 0
+
+    def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """Return an array of zeros.
+
+        Raises
+        ------
+        InputError
+            When the scratch folder's disk has no room for it.
+        """
+        if self._folder is None:
+            return np.zeros(shape, dtype)
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        free = shutil.disk_usage(self._folder).free
+        if size > free:
+            raise InputError(
+                f"The scratch folder {self._folder.parent} has {free / GIB:.2f} GiB free; "
+                f"{size / GIB:.2f} GiB more are needed. Name a folder on another disk."
+            )
+        self._count += 1
+        path = self._folder / f"{self._count}.dat"
+        return np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
