@@ -17,12 +17,13 @@ from scipy import fft
 
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import PixelGrid
+from recon.optics.propagator import Propagator
 from recon.optics.scene import Layer, Scene
 from recon.optics.spectrum import mixed_spectrum
-from recon.optics.wave import WavePropagator
 
 Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
+FFT_WORKERS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ def render(
     scene: Scene,
     weights: Weights,
     grid: PixelGrid,
-    propagator: WavePropagator,
+    propagator: Propagator,
     fall_off: FallOff,
     *,
     layer_photons: float,
@@ -97,7 +98,7 @@ def _render_layer(
     layer: Layer,
     weights: Weights,
     grid: PixelGrid,
-    propagator: WavePropagator,
+    propagator: Propagator,
     fall_off: FallOff,
     settings: RenderSettings,
 ) -> Image:
@@ -127,7 +128,7 @@ class _LayerRenderer:
         pick: Weights,
         spectral_weights: Weights,
         grid: PixelGrid,
-        propagator: WavePropagator,
+        propagator: Propagator,
         fall_off: FallOff,
         settings: RenderSettings,
     ) -> None:
@@ -230,7 +231,7 @@ class _LayerRenderer:
         shape = tuple(
             fft.next_fast_len(a + b - 1, real=True) for a, b in zip(patch.shape, kernel.shape, strict=True)
         )
-        workers = self.propagator.workers
+        workers = FFT_WORKERS
         spectrum = fft.rfft2(kernel, shape, workers=workers)
         spectrum *= fft.rfft2(patch, shape, workers=workers)
         light = fft.irfft2(spectrum, shape, workers=workers, overwrite_x=True)

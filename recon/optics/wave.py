@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -27,11 +26,9 @@ from scipy import fft
 
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import FloatArray, PixelGrid, resample_energy
+from recon.optics.propagator import Emission, Propagator, Source, check_source
 from recon.optics.spectrum import Spectrum
 from recon.optics.wave_kernels import add_intensity, modulate, propagate
-
-Emission = Literal["lambertian", "isotropic"]
-Source = tuple[float, float, float]
 
 # Largest relative error of the stretched distance within one tile. The displacement of light by the relief
 # (some tens of micrometres) is wrong by at most this fraction: well below a pixel.
@@ -74,27 +71,20 @@ class _Tile:
     """Unit vector ``(y, x)`` of the plane of incidence."""
 
 
-class WavePropagator:
-    """Point spread functions of one diffuser at one distance from the sensor.
+class WavePropagator(Propagator):
+    """Caustics by diffraction: :class:`Propagator` with interference.
 
     Parameters
     ----------
-    diffuser : Diffuser
-    distance_um : float
-        From the diffuser's relief to the sensor.
+    diffuser, distance_um
+        As for :class:`Propagator`.
     workers : int
         Threads for the transforms.
     """
 
     def __init__(self, diffuser: Diffuser, distance_um: float, *, workers: int = 2) -> None:
-        if not distance_um > 0:
-            raise ValueError(f"The sensor lies behind the diffuser: distance_um > 0, not {distance_um}.")
-        self.diffuser = diffuser
-        self.distance_um = distance_um
+        super().__init__(diffuser, distance_um)
         self.workers = workers
-        dy, dx = diffuser.slopes()
-        self._typical_slope = float(np.sqrt((dy**2 + dx**2).mean()))
-        self._steepest = float(np.quantile(np.hypot(dy, dx), 0.9995))
 
     def psf(
         self,
@@ -105,28 +95,7 @@ class WavePropagator:
         diameter_um: float = 0.0,
         emission: Emission = "lambertian",
     ) -> npt.NDArray[np.float32]:
-        """Light of a point source (or small disc) on the pixels of a sensor grid.
-
-        Parameters
-        ----------
-        source_um : tuple of float
-            ``(x, y, z)`` with ``z > 0``, any continuous position.
-        grid : PixelGrid
-            The sensor's pixels.
-        spectrum : Spectrum
-            Wavelengths that the source sends out, each with a weight; intensities add up.
-        diameter_um : float
-            Diameter of a uniformly bright disc parallel to the sensor (0: a point).
-        emission : {"lambertian", "isotropic"}
-            A pinhole or screen that faces the sensor, or a fluorescent bead.
-
-        Returns
-        -------
-        ndarray, float32, ``grid.shape``
-            Solid angle in steradians that feeds each pixel (times the cosine of emission for a Lambertian
-            source): multiplied by the source's intensity along the axis, the light on the pixel. The angular
-            response of the pixels is not included (:mod:`recon.optics.fall_off`).
-        """
+        """Light of a point source on the pixels of a sensor grid."""
         return self.caustic(source_um, grid, spectrum, diameter_um=diameter_um, emission=emission).on(grid)
 
     def caustic(
@@ -140,15 +109,14 @@ class WavePropagator:
     ) -> Caustic:
         """As :meth:`psf`, before integration over pixels; covers at least what falls on the grid."""
         x, y, z = source_um
-        if not z > 0:
-            raise ValueError(f"A source lies in front of the diffuser: z_um > 0, not {z}.")
+        check_source(source_um)
         pitch = self.diffuser.pitch_um
         magnification = self.distance_um / z
         scale = 1 + magnification
         rho = self.distance_um / scale
         blur = diameter_um * magnification / scale / pitch
         n_rows, n_columns = self.diffuser.heights_um.shape
-        margin = self._margin(source_um, max(w for w, _ in spectrum))
+        margin = int(np.ceil(self._spread_um(source_um, max(w for w, _ in spectrum)) / pitch))
         reach = margin + int(np.ceil(blur))
         rows = _needed(grid.y_edges_um, n_rows, y, magnification, pitch, reach)
         columns = _needed(grid.x_edges_um, n_columns, x, magnification, pitch, reach)
@@ -162,34 +130,6 @@ class WavePropagator:
         y_edges = (np.arange(rows.start, rows.stop + 1) - n_rows / 2) * pitch * scale - magnification * y
         x_edges = (np.arange(columns.start, columns.stop + 1) - n_columns / 2) * pitch * scale
         return Caustic(energy.astype(np.float32, copy=False), y_edges, x_edges - magnification * x)
-
-    def displacement_um(self, z_um: float) -> float:
-        """Return how far the relief typically displaces light on the sensor (root mean square, on axis)."""
-        contrast = self.diffuser.glass.index - self.diffuser.ambient.index
-        return self._typical_slope * contrast * self.distance_um / (1 + self.distance_um / z_um)
-
-    def half_extent_um(self, z_um: float) -> tuple[float, float]:
-        """Half height and width on the sensor that hold all light of a source at a distance, off axis too."""
-        # 35 degrees off the axis; beyond, the little light that strays farther is cut off.
-        spread = self._margin((0.7 * z_um, 0.0, z_um), 650.0) * self.diffuser.pitch_um
-        scale = 1 + self.distance_um / z_um
-        height, width = self.diffuser.aperture_um
-        return (height / 2 + spread) * scale, (width / 2 + spread) * scale
-
-    def _margin(self, source_um: Source, wavelength_nm: float) -> int:
-        """Return by how many samples light may leave its straight ray at the worst angle."""
-        x, y, z = source_um
-        half_height, half_width = (side / 2 for side in self.diffuser.aperture_um)
-        tangent = np.hypot(abs(x) + half_width, abs(y) + half_height) / z
-        cos = 1 / np.sqrt(1 + tangent**2)
-        sin_squared = 1 - cos**2
-        contrast = np.sqrt(self.diffuser.glass.at(wavelength_nm) ** 2 - sin_squared) - np.sqrt(
-            self.diffuser.ambient.at(wavelength_nm) ** 2 - sin_squared
-        )
-        stretched = self.distance_um / (1 + self.distance_um / z) / cos**3
-        refracted = self._steepest * contrast * stretched
-        diffracted = 4 * np.sqrt(wavelength_nm * 1e-3 * stretched)
-        return int(np.ceil((refracted + diffracted) / self.diffuser.pitch_um))
 
     def _tiles(self, rows: range, columns: range, source_um: Source) -> list[_Tile]:
         """Cut the plane of straight rays until the direction of incidence hardly varies within a tile."""
