@@ -71,8 +71,13 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
         else:
             continue
         break
+    if not best.size:
+        return 0.0
     # A Gaussian's median magnitude is 0.6745 deviations.
-    return float(np.median(np.abs(best))) / 0.6745 if best.size else 0.0
+    median = float(np.median(np.abs(best))) / 0.6745
+    if median == 0 and np.array_equal(m[v], np.round(m[v])):
+        return float(np.sqrt(np.mean(best**2)))  # single photons: most stencils are empty
+    return median
 
 
 def _apply(

@@ -70,6 +70,12 @@ def test_noise_is_estimated_through_holes(shoot, kept):
     assert estimate_deviation(frame, valid) == pytest.approx(shot.noise, rel=0.25)
 
 
+@pytest.mark.parametrize("mean", [0.02, 0.3, 5.0, 1000.0])
+def test_noise_of_photon_counts(mean):
+    counts = np.random.default_rng(0).poisson(mean, (100, 120))
+    assert estimate_deviation(counts) == pytest.approx(np.sqrt(mean), rel=0.25)
+
+
 def test_noise_of_nothing_is_nothing():
     assert estimate_deviation(np.ones((1, 1))) == 0
     assert estimate_deviation(np.ones((50, 50))) == 0
