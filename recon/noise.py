@@ -37,16 +37,24 @@ _PLANE: Stencil = tuple((i, j, _LINE[i] * _LINE[j]) for i in range(3) for j in r
 _ROW: Stencil = tuple((0, j, _LINE[j]) for j in range(3))
 _PAIR: Stencil = ((0, 0, 1.0), (0, 1, -1.0))
 ENOUGH = 256
-"""Samples from which a median is trusted."""
+"""Stencils from which a median is trusted."""
+
+TILE = 16
+"""Side of the tiles within which noise is taken for even, pixels."""
+
+GROUPS = 10
+"""Groups of tiles of like brightness."""
 
 
 def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> float:
-    """Estimate the standard deviation of white noise from one image (Immerkær 1996, with a median).
+    """Estimate the root mean square of white and photon noise from one image.
 
-    The stencil ``[1, -2, 1] x [1, -2, 1]`` removes what is locally planar; the median of its magnitude is
-    little moved by the sharp lines of a caustic. Where erased pixels leave too few whole stencils, sparser
-    ones (every second pixel as in a Bayer mosaic, three in a row, pairs) take its place. Biased upwards when
-    the image has structure in most pixels.
+    The stencil ``[1, -2, 1] x [1, -2, 1]`` (Immerkær 1996) removes what is locally planar; the median of its
+    magnitude over a tile is little moved by the sharp lines of a caustic. Photon noise makes the variance
+    grow in proportion to brightness: a line is laid through the dimmest tiles and, of groups of like
+    brightness, those with the least variance for their brightness, because structure only ever adds to it.
+    Where erased pixels leave too few whole stencils, sparser ones (every second pixel as in a Bayer mosaic,
+    three in a row, pairs) take its place.
 
     Parameters
     ----------
@@ -61,38 +69,73 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
     """
     m = np.asarray(measurement, np.float64)
     v = np.ones(m.shape, bool) if valid is None else valid
-    best = np.empty(0)
-    for stencil in (_PLANE, _ROW, _PAIR):
-        for stride in (1, 2):
-            samples = _apply(stencil, stride, m, v)
-            best = samples if samples.size > best.size else best
-            if best.size >= min(ENOUGH, m.size // 4):
-                break
-        else:
-            continue
-        break
-    if not best.size:
+    best, count = np.full((1, 1), np.nan), 0
+    for stencil, stride in ((s, n) for s in (_PLANE, _ROW, _PAIR) for n in (1, 2)):
+        samples = np.abs(_apply(stencil, stride, m, v))
+        found = int(np.count_nonzero(~np.isnan(samples)))
+        if found > count:
+            best, count = samples, found
+        if count >= min(ENOUGH, m.size // 4):
+            break
+    if count == 0:
         return 0.0
     # A Gaussian's median magnitude is 0.6745 deviations.
-    median = float(np.median(np.abs(best))) / 0.6745
-    if median == 0 and np.array_equal(m[v], np.round(m[v])):
-        return float(np.sqrt(np.mean(best**2)))  # single photons: most stencils are empty
-    return median
+    overall = float(np.nanmedian(best)) / 0.6745
+    if overall == 0 and np.array_equal(m[v], np.round(m[v])):
+        return float(np.sqrt(np.nanmean(best**2)))  # single photons: most stencils are empty
+    brightness, variance = _tiles(np.where(v, m, np.nan), best)
+    if len(brightness) < 4 * GROUPS:
+        return overall
+    return float(np.sqrt(_mean_variance(brightness, variance)))
+
+
+def _mean_variance(brightness: npt.NDArray[np.float64], variance: npt.NDArray[np.float64]) -> float:
+    """Return the mean over tiles of the variance that brightness alone explains."""
+    order = np.argsort(brightness)
+    groups = np.array_split(order, GROUPS)
+    level = np.array([np.mean(brightness[g]) for g in groups])
+    least = np.array([np.quantile(variance[g], 0.4) for g in groups])
+    dark, rise = level[0], level - level[0]
+    lit = rise > 0.2 * rise[-1]
+    if not lit.any():
+        return float(np.median(variance))
+    slope = max(float(np.quantile((least[lit] - least[0]) / rise[lit], 0.25)), 0.0)
+    return float(least[0] + slope * (np.mean(brightness) - dark))
+
+
+def _tiles(
+    m: npt.NDArray[np.float64], magnitude: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return mean brightness and noise variance of the tiles at least half covered by stencils."""
+    rows, columns = (n // TILE for n in magnitude.shape)
+
+    def cut(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        tiles = image[: rows * TILE, : columns * TILE].reshape(rows, TILE, columns, TILE)
+        return tiles.transpose(0, 2, 1, 3).reshape(rows * columns, TILE * TILE)
+
+    m, magnitude = cut(m), cut(magnitude)
+    known = np.count_nonzero(~np.isnan(magnitude), axis=1)
+    whole = known > min(TILE * TILE // 8, int(known.max(initial=0)) // 2)
+    if not whole.any():
+        return np.empty(0), np.empty(0)
+    m, magnitude = m[whole], magnitude[whole]
+    median = np.nanmedian if np.isnan(magnitude).any() else np.median
+    return np.nanmean(m, axis=1), (median(magnitude, axis=1) / 0.6745) ** 2
 
 
 def _apply(
     stencil: Stencil, stride: int, m: npt.NDArray[np.float64], valid: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float64]:
-    """Return a stencil's values wherever all its pixels are valid, scaled to unit gain for white noise."""
+    """Return a stencil's values, of unit gain for white noise; NaN where it touches a pixel not valid."""
     height = m.shape[0] - stride * max(i for i, _, _ in stencil)
     width = m.shape[1] - stride * max(j for _, j, _ in stencil)
     if height < 1 or width < 1:
-        return np.empty(0)
+        return np.full((1, 1), np.nan)
     total, whole = np.zeros((height, width)), np.ones((height, width), bool)
     for i, j, coefficient in stencil:
         part = (slice(i * stride, i * stride + height), slice(j * stride, j * stride + width))
         total += coefficient * m[part]
         whole &= valid[part]
-    gain = np.sqrt(sum(c * c for _, _, c in stencil))
-    result: npt.NDArray[np.float64] = total[whole] / gain
-    return result
+    total /= np.sqrt(sum(c * c for _, _, c in stencil))
+    total[~whole] = np.nan
+    return total
