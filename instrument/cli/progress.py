@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -51,3 +51,19 @@ def first_interrupt_cancels() -> Iterator[threading.Event]:
         yield cancel
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+Advance = Callable[[float, float], None]
+"""Takes how much is done, and how much there is to do."""
+
+
+@contextmanager
+def one_task(description: str) -> Iterator[Advance]:
+    """Show the bar of a single task while the block runs; gives what advances it."""
+    with progress_bar() as bar:
+        task = bar.add_task(description, total=None, note="")
+
+        def advance(done: float, total: float) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield advance

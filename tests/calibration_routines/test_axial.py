@@ -1,0 +1,194 @@
+"""An axial sweep on the simulated bench: good PSFs, bad ones found and taken again, clear refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines import (
+    AxialSweep,
+    CalibrationError,
+    axial_plan,
+    calibrate_axial,
+    expose_sweep,
+    planes_needed,
+)
+from drivers.simulated.world import SimulatedWorld
+from instrument.bench import Bench, open_bench
+from instrument.calibration_file import load_calibration
+from instrument.config_file import parse_config
+from instrument.errors import BenchError
+from instrument.plan import PlanError
+from instrument.runner import RunStatus
+from instrument.store import RunCondition
+from recon.types import Geometry
+
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+"""
+SWEEP = AxialSweep(60e3, 150e3, 5, average=2, dark_frames=2)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with open_bench(parse_config(TINY, None)) as opened:
+        assert opened.stage is not None
+        opened.stage.home()
+        yield opened
+
+
+def world_of(bench: Bench) -> SimulatedWorld:
+    world = bench.shared["simulated"]
+    assert isinstance(world, SimulatedWorld)
+    return world
+
+
+def slip_at(bench: Bench, z_um: float, shift_um: float) -> Callable[[RunStatus], None]:
+    """Return a progress callback that shifts the source sideways while a plane is first taken."""
+    world = world_of(bench)
+    carrier = world._carrier
+    slipped: list[bool] = []
+
+    def watch(status: RunStatus) -> None:
+        here = (
+            status.step is not None and status.step.source_um is not None and status.step.source_um[2] == z_um
+        )
+        if here and not slipped:
+            world.carry_source(lambda: (shift_um, 0.0, z_um))
+            slipped.append(True)
+        elif slipped and not here:
+            world.carry_source(carrier)
+
+    return watch
+
+
+def test_a_sweep_gives_good_psfs_that_scale_with_depth_and_survive_the_disk(
+    bench: Bench, tmp_path: Path
+) -> None:
+    done = calibrate_axial(bench, SWEEP, tmp_path)
+    assert done.findings == ()
+    assert [run.condition for run in done.runs] == [RunCondition.COMPLETED]
+    assert done.calibration.psfs.shape == (5, 1, 240, 320)
+    assert all(q.saturated_pixels == 0 for q in done.quality)
+    radii = [q.radius_px for q in done.quality]
+    d_um = 8900.0
+    assert radii[0] / radii[-1] == pytest.approx((1 + d_um / 60e3) / (1 + d_um / 150e3), rel=0.01)
+    inverse_z = 1 / done.calibration.source_positions_um[:, 2]
+    assert np.diff(inverse_z) == pytest.approx(np.full(4, (1 / 150e3 - 1 / 60e3) / 4))
+    # counts of one exposure: the light through the aperture falls off with the square of the distance
+    light = done.calibration.psfs.sum(axis=(1, 2, 3))
+    assert light[0] / light[-1] == pytest.approx((150 / 60) ** 2, rel=0.05)
+    loaded = load_calibration(done.path)
+    assert np.array_equal(loaded.psfs, done.calibration.psfs)
+    assert loaded.provenance["simulated"] is True
+    assert loaded.provenance["runs"] == [done.runs[0].path.name]
+    assert loaded.quality["good"] is True
+    assert bench.led_array is not None
+    assert bench.led_array.pattern.is_dark
+
+
+def test_psfs_match_the_light_that_fell_on_the_sensor(bench: Bench, tmp_path: Path) -> None:
+    sweep = AxialSweep(80e3, 80e3, average=4)
+    psf = calibrate_axial(bench, sweep, tmp_path).calibration.psfs[0, 0]
+    truth = world_of(bench).psf((0.0, 0.0, 80e3), (0.0, 1.0, 0.0))
+    assert np.corrcoef(psf.ravel(), truth.ravel())[0, 1] > 0.995
+
+
+def test_a_source_that_slipped_is_found_and_the_plane_taken_again(bench: Bench, tmp_path: Path) -> None:
+    done = calibrate_axial(bench, SWEEP, tmp_path, on_progress=slip_at(bench, SWEEP.z_um[2], 1000.0))
+    assert [len(run.steps("psf")) for run in done.runs] == [10, 2]
+    assert done.findings == ()
+
+
+def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> None:
+    watch = slip_at(bench, SWEEP.z_um[2], 1000.0)
+    done = calibrate_axial(bench, replace(SWEEP, retakes=0), tmp_path, on_progress=watch)
+    assert len(done.findings) == 1
+    assert "z = 85.71 mm: the pattern lies" in done.findings[0]
+    assert load_calibration(done.path).quality["good"] is False
+
+
+def test_a_plane_that_saturates_is_taken_again_with_a_shorter_exposure(bench: Bench, tmp_path: Path) -> None:
+    found = expose_sweep(bench, SWEEP)
+    too_long = [1.3 * e if i == 1 else e for i, e in enumerate(found.exposures_ms)]
+    done = calibrate_axial(bench, SWEEP, tmp_path, exposures=replace(found, exposures_ms=tuple(too_long)))
+    assert len(done.runs) == 2
+    assert done.exposures.exposures_ms[1] == pytest.approx(0.7 * too_long[1])
+    assert done.findings == ()
+    assert done.quality[1].saturated_pixels == 0
+
+
+def test_a_source_too_weak_for_the_camera_is_refused_in_words(tmp_path: Path) -> None:
+    weak = TINY + "source_brightness = 1e-7\n"
+    with open_bench(parse_config(weak, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        with pytest.raises(CalibrationError, match=r"too dark.*longest exposure"):
+            calibrate_axial(bench, SWEEP, tmp_path)
+        assert bench.led_array is not None
+        assert bench.led_array.pattern.is_dark
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp_path: Path) -> None:
+    before = bench.source_position_um
+    with pytest.raises(PlanError, match="outside the stage's limits"):
+        calibrate_axial(bench, AxialSweep(60e3, 900e3, 3), tmp_path)
+    assert bench.source_position_um == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bench_without_a_stage_takes_one_psf_by_hand(tmp_path: Path) -> None:
+    text = TINY.replace('[stage]\ndriver = "simulated"\n', "")
+    with open_bench(parse_config(text, None)) as bench:
+        done = calibrate_axial(bench, AxialSweep(100e3, 100e3, by_hand=True), tmp_path)
+    assert done.findings == ()
+    assert done.calibration.source_positions_um.tolist() == [[0.0, 0.0, 100e3]]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"z_min_um": 0.0}, "0 < z min"),
+        ({"z_min_um": 200e3}, "0 < z min <= z max"),
+        ({"planes": 1}, "one plane needs z min = z max"),
+        ({"average": 0}, "average must be at least 1"),
+        ({"target": 1.0}, "target must lie between"),
+        ({"by_hand": True}, "5 planes need a stage"),
+    ],
+)
+def test_senseless_sweeps_are_refused(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(BenchError, match=message):
+        replace(SWEEP, **wrong)
+
+
+def test_the_plan_counts_its_frames() -> None:
+    plan = axial_plan(SWEEP, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert len(plan) == 5 * 2 + 2 * 2
+    assert len(axial_plan(SWEEP, [2.0] * 5)) == 5 * 2 + 2  # one exposure: one set of dark frames
+    with pytest.raises(ValueError, match="as many exposures"):
+        axial_plan(SWEEP, [1.0])
+
+
+def test_the_number_of_planes_follows_from_the_optics() -> None:
+    pco = Geometry(13.0, 8.9, (5.5, 7.5))
+    # the shadow's edge moves by 7.5/2 mm * 8.9 mm * (1/100 - 1/300) / mm = 222 um = 17.1 pixels: 9 steps of 2
+    assert planes_needed(100e3, 300e3, pco) == 10
+    with pytest.raises(BenchError, match="aperture_mm"):
+        planes_needed(100e3, 300e3, Geometry(13.0, 8.9))
