@@ -1,0 +1,67 @@
+"""Ctrl-C is noticed even where its exception is swallowed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from instrument.interrupt import CtrlC
+
+
+def in_context(work: Callable[[CtrlC], None]) -> None:
+    with CtrlC() as ctrl_c:
+        work(ctrl_c)
+
+
+def swallow(_: CtrlC) -> None:
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_it_interrupts_at_once_and_puts_the_handler_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    done: list[str] = []
+
+    def work(_: CtrlC) -> None:
+        signal.raise_signal(signal.SIGINT)
+        done.append("went on")
+
+    with pytest.raises(KeyboardInterrupt):
+        in_context(work)
+    assert not done
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_swallowed_interrupt_is_raised_again_by_the_next_check() -> None:
+    done: list[str] = []
+
+    def work(ctrl_c: CtrlC) -> None:
+        swallow(ctrl_c)
+        done.append("went on")
+        ctrl_c.check()
+        done.append("went on after the check")
+
+    with pytest.raises(KeyboardInterrupt):
+        in_context(work)
+    assert done == ["went on"]
+
+
+def test_a_swallowed_interrupt_is_raised_at_the_latest_at_the_end() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        in_context(swallow)
+
+
+def test_without_ctrl_c_and_in_other_threads_nothing_happens() -> None:
+    in_context(CtrlC.check)
+    before = signal.getsignal(signal.SIGINT)
+    during: list[object] = []
+    thread = threading.Thread(
+        target=in_context, args=(lambda _: during.append(signal.getsignal(signal.SIGINT)),)
+    )
+    thread.start()
+    thread.join()
+    assert during == [before]
