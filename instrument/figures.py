@@ -57,6 +57,7 @@ class Summary:
     panels: Sequence[Panel]
     convergence: Convergence
     sweep: Sequence[Panel] = ()
+    sweep_title: str = ""
     lines: Sequence[tuple[str, str]] = field(default_factory=tuple)
     """Facts listed beside the plot: name and value."""
     simulated: bool = False
@@ -75,11 +76,11 @@ def summary_figure(summary: Summary) -> Figure:
     from matplotlib.figure import Figure
 
     rows = 3 if summary.sweep else 2
-    heights = [3.1, 1.15, 2.5] if summary.sweep else [3.1, 2.5]
+    heights = [2.75, 1.1, 2.4] if summary.sweep else [2.75, 2.4]
     figure = Figure(figsize=(14.0, sum(heights) + 1.5), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     outer = figure.add_gridspec(
-        rows, 1, height_ratios=heights, hspace=0.34, left=0.035, right=0.985, top=0.885, bottom=0.075
+        rows, 1, height_ratios=heights, hspace=0.42, left=0.035, right=0.985, top=0.885, bottom=0.075
     )
     pictures = outer[0].subgridspec(1, len(summary.panels), wspace=0.06)
     for column, panel in enumerate(summary.panels):
@@ -88,6 +89,8 @@ def summary_figure(summary: Summary) -> Figure:
         strip = outer[1].subgridspec(1, len(summary.sweep), wspace=0.05)
         for column, panel in enumerate(summary.sweep):
             _draw_panel(figure.add_subplot(strip[0, column]), panel, small=True)
+        top = outer[1].get_position(figure).y1
+        figure.text(0.035, top + 0.028, summary.sweep_title, fontsize=13, color=_INK, va="bottom")
     bottom = outer[rows - 1].subgridspec(1, 2, width_ratios=[1.25, 1.0], wspace=0.12)
     _draw_convergence(figure.add_subplot(bottom[0, 0]), summary.convergence)
     _draw_facts(figure.add_subplot(bottom[0, 1]), summary.lines)
@@ -118,6 +121,7 @@ def _draw_panel(axes: Axes, panel: Panel, *, small: bool = False) -> None:
     white = panel.white if panel.white is not None else float(np.percentile(panel.image, 99.8))
     shown = np.clip(panel.image / max(white, 1e-12), 0.0, 1.0) ** panel.gamma
     axes.imshow(shown, cmap="gray", vmin=0.0, vmax=1.0, interpolation="antialiased")
+    axes.set_anchor("NW")
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -161,6 +165,7 @@ def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
             weight="bold",
         )
         axes.margins(x=0.02, y=0.18)
+        axes.set_xlim(left=0.0)
     axes.set_xlabel(convergence.x_label, fontsize=10, color=_INK)
     axes.set_title(convergence.label, fontsize=13, color=_INK, loc="left", pad=5)
     axes.grid(True, color="#e3e8ec", linewidth=0.8)

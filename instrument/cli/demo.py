@@ -1,0 +1,90 @@
+"""``diffuserbench demo``: the main job, start to end, on the simulated bench."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from calibration_routines import AxialCalibration, SweepExposures
+from calibration_routines.demo import Advance, DemoResult, run_demo
+from calibration_routines.demo_settings import DemoSettings
+from instrument.bench import Bench
+from instrument.cli.app import command_app, examples
+from instrument.cli.calibrate import describe_exposures, describe_plan, describe_quality
+from instrument.cli.progress import one_task
+
+app = command_app()
+
+
+@app.command(epilog=examples("diffuserbench demo", "diffuserbench demo --out /tmp/demos"))
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where the demo's folder is made.")
+    ] = Path("runs"),
+    reconstruction_s: Annotated[
+        float, typer.Option("--reconstruction-s", metavar="S", min=0.1, help="Time for the reconstruction.")
+    ] = DemoSettings().reconstruction_s,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated diffuser, sensor and noise.")] = 0,
+) -> None:
+    """Calibrate a SIMULATED lensless camera, photograph a scene with it, reconstruct and judge the picture.
+
+    Homes the stage, places the point source, exposes without saturating, takes dark frames, sweeps the source
+    along the axis, checks the PSFs, photographs a picture on a screen, reconstructs it, compares it with the
+    ground truth, and writes everything into one folder. Ctrl-C stops it at any moment, the bench safe.
+    """
+    audience = _Terminal(Console(highlight=False))
+    result = run_demo(out, audience, DemoSettings(reconstruction_s=reconstruction_s, seed=seed))
+    audience.verdict(result)
+
+
+class _Terminal:
+    """Tells the terminal what the demo does."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Advance]:
+        with one_task(name[0].upper() + name[1:]) as advance:
+            yield advance
+
+    def on_bench(self, bench: Bench, folder: Path) -> None:
+        self._say(f"Bench: {bench.label}")
+        self._say(f"Everything goes to {folder}")
+
+    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
+        describe_exposures(self._console, exposures)
+        describe_plan(self._console, bench, settings.sweep, exposures, None)
+
+    def on_sweep(self, done: AxialCalibration) -> None:
+        describe_quality(self._console, done)
+
+    def verdict(self, result: DemoResult) -> None:
+        self._console.print("\nSeconds")
+        for name, seconds in result.seconds.items():
+            self._console.print(f"  {seconds:6.1f}  {name}")
+        self._console.print(f"  {sum(result.seconds.values()):6.1f}  in all")
+        self._console.print("\nFiles (SIMULATED data)")
+        for name, path in result.files.items():
+            self._say(f"  {name:<30} {path}")
+        solved, comparison = result.reconstruction, result.comparison
+        self._say(
+            f"\nReconstruction: {solved.method} with {solved.prior}, {len(solved.history)} iterations in "
+            f"{solved.seconds:.1f} s; stopped because {solved.stop_reason}."
+        )
+        for warning in solved.warnings:
+            self._say(f"Note: {warning}")
+        self._say(
+            f"PSNR {comparison.psnr_db:.2f} dB, SSIM {comparison.ssim:.3f} against the ground truth: inside "
+            "the screen, in linear light, after one least-squares scale factor, brightness over the field "
+            "corrected by the measured response."
+        )
+
+    def _say(self, text: str) -> None:
+        self._console.print(escape(text), soft_wrap=True)
