@@ -7,74 +7,32 @@ import hashlib
 import logging
 import weakref
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self, cast, runtime_checkable
+from typing import Self, cast
 
-import numpy as np
-import numpy.typing as npt
-
-from drivers.camera import Camera, Roi
+from drivers.camera import Camera
 from drivers.claim import Claim
 from drivers.device import Device, SharedPart
+from drivers.errors import LimitError
 from drivers.frame import FrameMetadata
-from drivers.led_array import LedArray, LedPattern
+from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
+from instrument.camera_settings import apply_table
 from instrument.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.config_file import load_config
-from instrument.errors import BenchError, OperatorNeededError
-from instrument.safety import StepsFailedError, try_all
+from instrument.errors import BenchError
+from instrument.known_optics import known_geometry
+from instrument.lights import Ask, Lights, SceneSwitch
+from instrument.photograph import Snapshot, photograph
+from instrument.safety import Step, StepsFailedError, safe_steps, try_all
+from instrument.source_mount import Position, SourceMount
 from recon.types import Geometry
-
-Ask = Callable[[str], None]
-"""Asks the operator to do something by hand and returns when it is done."""
 
 _log = logging.getLogger(__name__)
 _open_benches: weakref.WeakSet[Bench] = weakref.WeakSet()
-
-
-@runtime_checkable
-class SceneSwitch(Protocol):
-    """A shared part that can light and darken the scene: the simulated world."""
-
-    scene_lit: bool
-
-
-@runtime_checkable
-class KnownOptics(Protocol):
-    """A shared part that knows the optics between scene and sensor: the simulated world."""
-
-    distance_um: float
-    """From the diffuser to the sensor."""
-    aperture_mm: tuple[float, float]
-    """``(height, width)``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """One photograph: a frame, or the mean of several.
-
-    Attributes
-    ----------
-    image : ndarray
-        ``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for
-        a single frame, float32 for a mean.
-    metadata : FrameMetadata
-        Of the last frame; ``dropped_before`` is summed and ``saturated_fraction`` the largest of all frames.
-    average : int
-        Number of frames averaged.
-    """
-
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
-    metadata: FrameMetadata
-    average: int
-
-    @property
-    def full_scale(self) -> int:
-        """The largest count that the camera can report at its present bit depth."""
-        return (1 << self.metadata.significant_bits) - 1
 
 
 class Bench:
@@ -93,8 +51,6 @@ class Bench:
 
     def __init__(self, config: BenchConfig, ask: Ask | None = None) -> None:
         self.config = config
-        self._ask = ask
-        self._asked: dict[str, bool] = {}
         self._claims: list[Claim] = []
         self.shared: Mapping[str, SharedPart] = {
             name: shared.part(shared.options) for name, shared in config.shared.items()
@@ -105,6 +61,8 @@ class Bench:
             )
             for kind, device in config.devices.items()
         }
+        switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+        self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
 
     # Devices -----------------------------------------------------------------------------------
     @property
@@ -152,7 +110,11 @@ class Bench:
         device = self.devices[kind]
         device.open()
         if kind == "camera":
-            self._apply_camera_settings(cast(CameraTable, self.config.devices[kind].settings))
+            try:
+                apply_table(cast(CameraTable, self.config.devices[kind].settings), self.camera)
+            except LimitError as error:
+                error.add_note(f"The value is from [camera] in {self.config.path}.")
+                raise
         _log.info("%s opened: %s", device.name, device.identity)
         return device
 
@@ -163,21 +125,6 @@ class Bench:
         for resource in device.driver.claims(device.options):
             if resource not in held:
                 self._claims.append(Claim(resource, self.devices[kind].name))
-
-    def _apply_camera_settings(self, wanted: CameraTable) -> None:
-        camera = self.camera
-        if wanted.pixel_format is not None:
-            camera.set_pixel_format(wanted.pixel_format)
-        if wanted.binning is not None:
-            camera.set_binning(wanted.binning)
-        if wanted.roi is not None:
-            camera.set_roi(Roi(*wanted.roi))
-        if wanted.black_level is not None:
-            camera.set_black_level(wanted.black_level)
-        if wanted.gain is not None:
-            camera.set_gain(wanted.gain)
-        if wanted.exposure_ms is not None:
-            camera.set_exposure_ms(wanted.exposure_ms)
 
     # What the bench is -------------------------------------------------------------------------
     @property
@@ -203,16 +150,7 @@ class Bench:
     @property
     def geometry(self) -> Geometry:
         """The optics: as configured, else as the devices know them; the pitch is that of binned pixels."""
-        table = self.config.geometry
-        known = next((part for part in self.shared.values() if isinstance(part, KnownOptics)), None)
-        distance_mm, aperture_mm = (known.distance_um / 1e3, known.aperture_mm) if known else (None, None)
-        pitch_um = table.pixel_pitch_um or self.camera.pixel_pitch_um
-        return Geometry(
-            pixel_pitch_um=pitch_um * self.camera.binning,
-            diffuser_distance_mm=table.diffuser_distance_mm or distance_mm,
-            aperture_mm=table.aperture_mm or aperture_mm,
-            wavelength_nm=table.wavelength_nm,
-        )
+        return known_geometry(self.config.geometry, self.camera, self.shared.values())
 
     # Photographs -------------------------------------------------------------------------------
     def snap(self, average: int = 1, *, on_frame: Callable[[int], None] | None = None) -> Snapshot:
@@ -225,24 +163,8 @@ class Bench:
         DeviceError
             When the camera fails.
         """
-        if average < 1:
-            raise BenchError(f"A photograph is the mean of 1 or more frames, not {average}.")
-        total = np.zeros((), np.float64)
-        dropped, saturated = 0, 0.0
-        for taken in range(1, average + 1):
-            frame = self.camera.snap()
-            dropped += frame.metadata.dropped_before
-            saturated = max(saturated, frame.metadata.saturated_fraction)
-            if average > 1:
-                total = np.add(total, frame.image)
-            if on_frame is not None:
-                on_frame(taken)
-        metadata = replace(frame.metadata, dropped_before=dropped, saturated_fraction=saturated)
-        if average == 1:
-            return Snapshot(frame.image, self.with_surroundings(metadata), average)
-        mean = np.asarray(total / average, np.float32)
-        mean.flags.writeable = False
-        return Snapshot(mean, self.with_surroundings(metadata), average)
+        taken = photograph(self.camera, average, on_frame=on_frame)
+        return replace(taken, metadata=self.with_surroundings(taken.metadata))
 
     def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
         """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""
@@ -259,18 +181,26 @@ class Bench:
 
     # The point source --------------------------------------------------------------------------
     @property
-    def source_position_um(self) -> tuple[float, float, float]:
+    def source_mount(self) -> SourceMount:
+        """The point source on its stage.
+
+        Raises
+        ------
+        BenchError
+            When the bench has no stage.
+        """
+        if self.stage is None:
+            raise BenchError(f"{self.config.label} has no [stage], so the source cannot be placed.")
+        return SourceMount(self.stage, self.config.source.offset_um)
+
+    @property
+    def source_position_um(self) -> Position:
         """Where the point source is now, as the stage reads: x, y, z from the diffuser's centre."""
-        position = self._stage().position()
-        x, y, z = (
-            position.get(axis, 0.0) + offset
-            for axis, offset in zip(("x_um", "y_um", "z_um"), self.config.source.offset_um, strict=True)
-        )
-        return (x, y, z)
+        return self.source_mount.position_um
 
     def place_source(
         self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
-    ) -> tuple[float, float, float]:
+    ) -> Position:
         """Move the point source to a place given from the diffuser's centre; None keeps a coordinate.
 
         Returns
@@ -285,99 +215,42 @@ class Bench:
         BenchError
             When there is no stage, or it lacks the axis; nothing moves.
         """
-        self._stage().move_to(self.stage_target(x_um, y_um, z_um))
-        return self.source_position_um
+        mount = self.source_mount
+        mount.stage.move_to(mount.target(x_um, y_um, z_um))
+        return mount.position_um
 
     def stage_target(
         self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
     ) -> dict[str, float]:
         """Return the stage position that brings the point source to a place; errors as ``place_source``."""
-        axes = {axis.name for axis in self._stage().axes}
-        target = {}
-        wanted = {"x_um": x_um, "y_um": y_um, "z_um": z_um}
-        for (axis, value), offset in zip(wanted.items(), self.config.source.offset_um, strict=True):
-            if value is None:
-                continue
-            if axis in axes:
-                target[axis] = value - offset
-            elif abs(value - offset) > 1e-6:
-                raise BenchError(
-                    f"{self._stage().name} has no axis {axis}, so the source stays at {axis} = {offset:g}; "
-                    f"it cannot go to {value:g}. Axes: {', '.join(sorted(axes))}."
-                )
-        return target
-
-    def _stage(self) -> Stage:
-        if self.stage is None:
-            raise BenchError(f"{self.config.label} has no [stage], so the source cannot be placed.")
-        return self.stage
+        return self.source_mount.target(x_um, y_um, z_um)
 
     def source_on(self) -> None:
         """Light the point source; confirmed when this returns."""
-        if self.led_array is None:
-            self._ask_once("the point source", lit=True)
-            return
-        source = self.config.source
-        leds = ", ".join(map(str, source.leds))
-        self.led_array.set_pattern(
-            LedPattern(
-                f"point source: LED {leds} rgb {source.rgb}", tuple((led, source.rgb) for led in source.leds)
-            )
-        )
+        self._lights.switch_source(lit=True)
 
     def source_off(self) -> None:
         """Darken the point source."""
-        if self.led_array is None:
-            self._ask_once("the point source", lit=False)
-        else:
-            self.led_array.off()
-
-    # The scene ---------------------------------------------------------------------------------
-    def scene_on(self) -> None:
-        """Light the scene: the simulated world does it, or the operator is asked."""
-        self._switch_scene(lit=True)
-
-    def scene_off(self) -> None:
-        """Darken the scene: the simulated world does it, or the operator is asked."""
-        self._switch_scene(lit=False)
-
-    @property
-    def can_switch_scene(self) -> bool:
-        """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
-        if self.config.scene.control == "operator":
-            return self._ask is not None
-        return self._scene_switch() is not None
+        self._lights.switch_source(lit=False)
 
     @property
     def can_switch_source(self) -> bool:
         """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
-        return self.led_array is not None or self._ask is not None
+        return self._lights.can_switch_source
 
-    def _switch_scene(self, *, lit: bool) -> None:
-        if self.config.scene.control == "operator":
-            self._ask_once("the scene", lit=lit)
-            return
-        switch = self._scene_switch()
-        if switch is None:
-            raise BenchError(
-                'bench.toml says [scene] control = "simulated", but no device of this bench is simulated. '
-                'Set it to "operator".'
-            )
-        switch.scene_lit = lit
+    # The scene ---------------------------------------------------------------------------------
+    def scene_on(self) -> None:
+        """Light the scene: the simulated world does it, or the operator is asked."""
+        self._lights.switch_scene(lit=True)
 
-    def _scene_switch(self) -> SceneSwitch | None:
-        return next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+    def scene_off(self) -> None:
+        """Darken the scene: the simulated world does it, or the operator is asked."""
+        self._lights.switch_scene(lit=False)
 
-    def _ask_once(self, what: str, *, lit: bool) -> None:
-        if self._asked.get(what) == lit:
-            return
-        request = f"Please {'light' if lit else 'darken'} {what}."
-        if self._ask is None:
-            raise OperatorNeededError(
-                f"{request} Nobody can be asked here: run it in a terminal or pass ask=."
-            )
-        self._ask(request)
-        self._asked[what] = lit
+    @property
+    def can_switch_scene(self) -> bool:
+        """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
+        return self._lights.can_switch_scene
 
     # Safety ------------------------------------------------------------------------------------
     def stop(self) -> None:
@@ -411,22 +284,11 @@ class Bench:
         finally:
             _open_benches.discard(self)
 
-    def _safe_steps(self) -> list[tuple[str, Callable[[], None]]]:
-        steps: list[tuple[str, Callable[[], None]]] = []
-        if (led_array := self.led_array) is not None:
-            steps.append((f"light off, {led_array.name}", _when_open(led_array, led_array.off)))
-        if (switch := self._scene_switch()) is not None:
-            steps.append(("scene dark, simulated", lambda: setattr(switch, "scene_lit", False)))
-        if (stage := self.stage) is not None:
-            steps.append((f"motion stopped, {stage.name}", _when_open(stage, stage.stop)))
-        steps.append(
-            (f"exposure ended, {self.camera.name}", _when_open(self.camera, self.camera.stop_sequence))
+    def _safe_steps(self) -> list[Step]:
+        blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe
+        return safe_steps(
+            self.led_array, self._lights.scene_switch, self.stage, self.camera, self.slm if blanks else None
         )
-        if (slm := self.slm) is not None and cast(
-            SlmTable, self.config.devices["slm"].settings
-        ).blank_when_safe:
-            steps.append((f"blank, {slm.name}", _when_open(slm, slm.blank)))
-        return steps
 
     def _close_after(self, error: BaseException) -> None:
         """Close on the way out of an error, which stays the error that is raised."""
@@ -477,14 +339,6 @@ def open_bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | Non
     if not isinstance(config, BenchConfig):
         config = load_config(config)
     return Bench(config, ask).open()
-
-
-def _when_open(device: Device, step: Callable[[], None]) -> Callable[[], None]:
-    def run() -> None:
-        if device.is_open:
-            step()
-
-    return run
 
 
 def _close_all() -> None:

@@ -1,4 +1,4 @@
-"""The settings that make a camera's frames comparable, read and brought back."""
+"""A camera's settings: as configured, read, and brought back."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from drivers.camera import Camera, Roi
 from drivers.errors import DeviceError
+from instrument.config import CameraTable
 
 
 def camera_settings(camera: Camera) -> dict[str, Any]:
@@ -53,6 +54,22 @@ def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
             f"does not take the settings that the run began with: {'; '.join(different)}.",
             "Is it the same camera?",
         )
+
+
+def apply_table(wanted: CameraTable, camera: Camera) -> None:
+    """Bring a camera to its configured settings, in the order in which they depend on each other."""
+    if wanted.pixel_format is not None:
+        camera.set_pixel_format(wanted.pixel_format)
+    if wanted.binning is not None:
+        camera.set_binning(wanted.binning)
+    if wanted.roi is not None:
+        camera.set_roi(Roi(*wanted.roi))
+    if wanted.black_level is not None:
+        camera.set_black_level(wanted.black_level)
+    if wanted.gain is not None:
+        camera.set_gain(wanted.gain)
+    if wanted.exposure_ms is not None:
+        camera.set_exposure_ms(wanted.exposure_ms)
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -21,8 +21,9 @@ from enum import StrEnum
 from pathlib import Path
 
 from drivers.errors import StoppedError
-from instrument.bench import Bench, Snapshot
+from instrument.bench import Bench
 from instrument.ending import end_run
+from instrument.photograph import Snapshot
 from instrument.plan import Plan, Step
 from instrument.step_settings import StepSettings
 from instrument.store import FinishReason, FrameToStore, Run, RunWriter

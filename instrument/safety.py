@@ -1,10 +1,19 @@
-"""Trying every step of making something safe, whatever happens to the others."""
+"""Making a bench safe: which steps, in which order, and each tried whatever happens to the others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from drivers.camera import Camera
+from drivers.device import Device
+from drivers.led_array import LedArray
+from drivers.slm import Slm
+from drivers.stage import Stage
 from instrument.errors import BenchError
+from instrument.lights import SceneSwitch
+
+Step = tuple[str, Callable[[], None]]
+"""A step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it."""
 
 
 class StepsFailedError(BenchError):
@@ -24,7 +33,39 @@ class StepsFailedError(BenchError):
         super().__init__(f"The bench may not be safe. Check by eye what could not be done:{listed}")
 
 
-def try_all(steps: Iterable[tuple[str, Callable[[], None]]]) -> None:
+def safe_steps(
+    led_array: LedArray | None,
+    scene: SceneSwitch | None,
+    stage: Stage | None,
+    camera: Camera,
+    slm: Slm | None,
+) -> list[Step]:
+    """Return the steps that make a bench safe: light off, motion stopped, exposure ended, SLM blank.
+
+    Devices that are closed by then are safe already; ``slm`` is left out where it may keep its image.
+    """
+    steps: list[Step] = []
+    if led_array is not None:
+        steps.append((f"light off, {led_array.name}", _when_open(led_array, led_array.off)))
+    if scene is not None:
+        steps.append(("scene dark, simulated", lambda: setattr(scene, "scene_lit", False)))
+    if stage is not None:
+        steps.append((f"motion stopped, {stage.name}", _when_open(stage, stage.stop)))
+    steps.append((f"exposure ended, {camera.name}", _when_open(camera, camera.stop_sequence)))
+    if slm is not None:
+        steps.append((f"blank, {slm.name}", _when_open(slm, slm.blank)))
+    return steps
+
+
+def _when_open(device: Device, step: Callable[[], None]) -> Callable[[], None]:
+    def run() -> None:
+        if device.is_open:
+            step()
+
+    return run
+
+
+def try_all(steps: Iterable[Step]) -> None:
     """Run every step in order, each even if those before it failed or were interrupted.
 
     Parameters

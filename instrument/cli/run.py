@@ -13,7 +13,7 @@ from types import FrameType
 
 import typer
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, LimitError
 from instrument.cli.commands import Command
 from instrument.errors import BenchError, os_reason
 
@@ -66,7 +66,7 @@ def report(error: BaseException) -> int:
         return error.exit_code
     if isinstance(error, DeviceError):
         _say(str(error), error)
-        return 1
+        return 2 if isinstance(error, LimitError) else 1  # a value to put right, not a device that failed
     if isinstance(error, ValueError) and _is_input_error(error):
         _say(str(error), error)
         return 2

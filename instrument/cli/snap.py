@@ -12,11 +12,12 @@ import numpy as np
 import typer
 
 from instrument.atomic import check_writable
-from instrument.bench import Bench, Snapshot
+from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say, saying_what_is_left
 from instrument.cli.progress import progress_bar
 from instrument.errors import FileError
 from instrument.images import check_suffix, side_car, write_image
+from instrument.photograph import Snapshot
 
 app = command_app()
 

@@ -197,6 +197,19 @@ def test_snap_keeps_counts_and_metadata(here: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.usefixtures("mock_drivers")
+def test_a_value_outside_a_devices_limits_is_a_mistake_to_put_right(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH)
+    assert main(["snap", "--exposure-ms", "5000", "--out", "photo.tif"]) == 2
+    assert "5000 ms is outside 0.1 to 1000 ms" in capsys.readouterr().err
+    (here / "bench.toml").write_text(MOCK_BENCH.replace("[stage]", "exposure_ms = 6000\n[stage]", 1))
+    assert main(["snap", "--out", "photo.tif"]) == 2
+    assert "from [camera] in bench.toml" in capsys.readouterr().err
+    assert not (here / "photo.tif").exists()
+
+
+@pytest.mark.usefixtures("mock_drivers")
 @pytest.mark.parametrize(
     ("fault", "status"),
     [('fail = ["snap"]', 1), ('interrupt = ["snap"]', 130), ('fail = ["stop_sequence"]', 1)],
