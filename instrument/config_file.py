@@ -39,6 +39,11 @@ def default_text() -> str:
     return resources.files("instrument").joinpath("default_bench.toml").read_text("utf-8")
 
 
+def display_text() -> str:
+    """Return the configuration of a simulated holographic display."""
+    return resources.files("instrument").joinpath("display_bench.toml").read_text("utf-8")
+
+
 def load_config(path: Path | str | None = None) -> BenchConfig:
     """Read and check a bench configuration without touching any device.
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceNotOpenError
+from drivers.simulated.surroundings import Surroundings
 from drivers.simulated.world import SimulatedWorld
 
 FIRMWARE = "1"
@@ -14,10 +15,10 @@ FIRMWARE = "1"
 class SimulatedDevice(Device):
     """Mix-in for the simulated drivers; the interface's class comes second in the bases."""
 
-    Shared = SimulatedWorld
+    Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     kind: ClassVar[str]
     model: ClassVar[str]
-    world: SimulatedWorld
+    world: Surroundings
     _is_open = False
 
     @classmethod
@@ -26,8 +27,10 @@ class SimulatedDevice(Device):
         return ()
 
     def _connect(self, shared: SharedPart | None) -> None:
-        if not isinstance(shared, SimulatedWorld):
-            raise TypeError(f"{self.name} needs the bench's SimulatedWorld, not {type(shared).__name__}.")
+        if not isinstance(shared, self.Shared):
+            raise TypeError(
+                f"{self.name} needs the bench's {self.Shared.__name__}, not {type(shared).__name__}."
+            )
         self.world = shared
 
     @property

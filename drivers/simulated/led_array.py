@@ -12,6 +12,7 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.world import SimulatedWorld
 from recon.optics.spectrum import BANDS
 
 
@@ -33,6 +34,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     kind = "led_array"
     model = "round LED array"
     Options = LedArrayOptions
+    world: SimulatedWorld
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         if not isinstance(options, LedArrayOptions):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Annotated, Self
 
@@ -13,7 +14,7 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
-from drivers.simulated.presets import Preset
+from drivers.simulated.world import SimulatedWorld
 from drivers.stage import Stage, StageAxis
 
 AXES = ("x_um", "y_um", "z_um", "roll_mrad", "pitch_mrad", "yaw_mrad")
@@ -69,15 +70,13 @@ class StageOptions(DriverOptions):
         return self
 
 
-class SimulatedStage(SimulatedDevice, Stage):
-    """A stage of one to six axes that takes its time, has play, and carries the point source.
+class CarriageStage(SimulatedDevice, Stage):
+    """A stage of one to six axes that takes its time, has play, and carries something.
 
-    Axes that are missing leave the source on the optical axis, at the preset's distance; rotations do not
-    move it. Before homing, moves are refused.
+    What its axes are and what it carries is the subclasses' business. Before homing, moves are refused.
     """
 
     kind = "stage"
-    model = "stepper stage"
     Options = StageOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
@@ -86,8 +85,7 @@ class SimulatedStage(SimulatedDevice, Stage):
         self._connect(shared)
         self.options = options
         specs = tuple(
-            _axis_spec(name, options.axes.get(name, AxisOptions()), self.world.preset)
-            for name in options.axis_names
+            self._axis_spec(name, options.axes.get(name, AxisOptions())) for name in options.axis_names
         )
         self.carriage = Carriage(specs, self.world.clock, self.world.options.seed + 2)
         self._axes = tuple(
@@ -97,17 +95,10 @@ class SimulatedStage(SimulatedDevice, Stage):
         self._lock = threading.RLock()
         self._homed = False
         self._commanded = self.carriage.reported()
-        self.world.carry_source(self.source_position_um)
 
-    def source_position_um(self) -> tuple[float, float, float]:
-        """Where the point source truly is."""
-        true = self.carriage.true()
-        resting = {"x_um": 0.0, "y_um": 0.0, "z_um": 1e3 * self.world.preset.source_distance_mm}
-        x, y, z = (
-            true.get(name, resting[name]) + offset
-            for name, offset in zip(AXES[:3], self.options.mount_offset_um, strict=True)
-        )
-        return x, y, z
+    @abstractmethod
+    def _axis_spec(self, name: str, options: AxisOptions) -> AxisSpec:
+        """Return an axis with what the options leave out filled in."""
 
     # Device ---
     def open(self) -> None:
@@ -260,16 +251,46 @@ class SimulatedStage(SimulatedDevice, Stage):
             raise LimitError(self.name, f"refuses the move: {'; '.join(wrong)}.", "Nothing moved.")
 
 
-def _axis_spec(name: str, options: AxisOptions, preset: Preset) -> AxisSpec:
-    """Fill in what the options leave out: a stepper stage that suits the preset's size."""
-    half_x, half_y, farthest = (1e3 * side for side in preset.travel_mm)
-    if name == "z_um":
-        low, high, home = 1e3 * preset.nearest_z_mm, farthest, 1e3 * preset.source_distance_mm
-    elif name.endswith("_um"):
-        reach = half_x if name == "x_um" else half_y
-        low, high, home = -reach, reach, 0.0
-    else:
-        low, high, home = -50.0, 50.0, 0.0
+class SimulatedStage(CarriageStage):
+    """The stage that carries the point source.
+
+    Axes that are missing leave the source on the optical axis, at the preset's distance; rotations do not
+    move it.
+    """
+
+    model = "stepper stage"
+    world: SimulatedWorld
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        super().__init__(options, shared)
+        self.world.carry_source(self.source_position_um)
+
+    def source_position_um(self) -> tuple[float, float, float]:
+        """Where the point source truly is."""
+        true = self.carriage.true()
+        resting = {"x_um": 0.0, "y_um": 0.0, "z_um": 1e3 * self.world.preset.source_distance_mm}
+        x, y, z = (
+            true.get(name, resting[name]) + offset
+            for name, offset in zip(AXES[:3], self.options.mount_offset_um, strict=True)
+        )
+        return x, y, z
+
+    def _axis_spec(self, name: str, options: AxisOptions) -> AxisSpec:
+        """Fill in what the options leave out: a stepper stage that suits the preset's size."""
+        preset = self.world.preset
+        half_x, half_y, farthest = (1e3 * side for side in preset.travel_mm)
+        if name == "z_um":
+            return axis_spec(
+                name, options, 1e3 * preset.nearest_z_mm, farthest, 1e3 * preset.source_distance_mm
+            )
+        if name.endswith("_um"):
+            reach = half_x if name == "x_um" else half_y
+            return axis_spec(name, options, -reach, reach, 0.0)
+        return axis_spec(name, options, -50.0, 50.0, 0.0)
+
+
+def axis_spec(name: str, options: AxisOptions, low: float, high: float, home: float) -> AxisSpec:
+    """Fill in what the options leave out of an axis: a stepper with the given range."""
     travel = high - low
     linear = name.endswith("_um")
 

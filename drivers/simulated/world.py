@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.device import DriverOptions, SharedPart
-from drivers.errors import DeviceError
+from drivers.device import DriverOptions
 from drivers.simulated.clock import Clock
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.presets import PRESETS, Preset
 from drivers.simulated.scene_choice import make_scene
+from drivers.simulated.surroundings import Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -27,7 +27,7 @@ from recon.optics.fall_off import (
 from recon.optics.grid import PixelGrid
 from recon.optics.render import RenderSettings, render
 from recon.optics.scene import Scene
-from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
+from recon.optics.sensor import SensorSpec
 from recon.optics.spectrum import mixed_spectrum
 from recon.optics.truth import true_scene
 from recon.optics.wave import WavePropagator
@@ -40,7 +40,7 @@ Image = npt.NDArray[np.float32]
 CACHE_BYTES = 256 << 20
 
 
-class SimulatedWorld(SharedPart):
+class SimulatedWorld(Surroundings):
     """A point source on a stage, a scene, a diffuser, a sensor.
 
     The simulated devices act on it and look at it: the stage carries the point source, the LED array lights
@@ -58,7 +58,7 @@ class SimulatedWorld(SharedPart):
     def __init__(self, options: DriverOptions) -> None:
         if not isinstance(options, WorldOptions):
             raise TypeError(f"The simulated world takes WorldOptions, not {type(options).__name__}.")
-        self.options = options
+        self.options: WorldOptions = options
         self.clock = Clock(options.time_scale)
         preset = PRESETS[options.preset]
         self.preset: Preset = preset
@@ -71,11 +71,9 @@ class SimulatedWorld(SharedPart):
         )
         self._lock = threading.RLock()
         self._propagator: WavePropagator | None = None
-        self._pattern: FixedPattern | None = None
         self._cache: OrderedDict[Any, Image] = OrderedDict()
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
-        self._unplugged: set[str] = set()
         self.scene_lit = False
         """Whether the scene glows."""
         self._scene = make_scene(options, preset, self.distance_um)
@@ -115,18 +113,6 @@ class SimulatedWorld(SharedPart):
                     self.distance_um,
                 )
             return self._propagator
-
-    def fixed_pattern(self) -> FixedPattern:
-        """Return the sensor's pixels: response, dark current, offset."""
-        with self._lock:
-            if self._pattern is None:
-                if self.options.fixed_pattern:
-                    self._pattern = fixed_pattern(self.sensor, self.options.seed + 1)
-                else:
-                    ones = np.ones(self.sensor.shape, np.float32)
-                    dark = np.float32(self.sensor.dark_current_e_per_s) * ones
-                    self._pattern = FixedPattern(ones, dark, np.zeros_like(ones))
-            return self._pattern
 
     def sensor_grid(self, binning: int = 1) -> PixelGrid:
         """Return the sensor's pixels after binning; a rest at the lower and right border is left out."""
@@ -293,20 +279,6 @@ class SimulatedWorld(SharedPart):
             while sum(entry.nbytes for entry in self._cache.values()) > CACHE_BYTES and len(self._cache) > 1:
                 self._cache.popitem(last=False)
             return image
-
-    # Faults, for tests ---
-    def unplug(self, kind: str) -> None:
-        """Pull the plug of a device (``"camera"``, ``"stage"``, ``"led_array"``, ``"slm"``)."""
-        self._unplugged.add(kind)
-
-    def plug_in(self, kind: str) -> None:
-        """Plug a device in again."""
-        self._unplugged.discard(kind)
-
-    def check_plugged(self, kind: str, name: str) -> None:
-        """Raise :class:`DeviceError` when the device is unplugged."""
-        if kind in self._unplugged:
-            raise DeviceError(name, "was unplugged.", "Plug it in and open the bench again.")
 
 
 def _product(first: Rgb, second: Rgb) -> Rgb:

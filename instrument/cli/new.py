@@ -9,7 +9,7 @@ import typer
 
 from instrument.atomic import write_text
 from instrument.cli.app import command_app, examples
-from instrument.config_file import DEFAULT_NAME, default_text
+from instrument.config_file import DEFAULT_NAME, default_text, display_text
 from instrument.errors import FileError
 
 app = command_app()
@@ -20,17 +20,20 @@ app = command_app()
         "diffuserbench new",
         "diffuserbench new benches/microscope.toml",
         "diffuserbench new --force          overwrite an existing bench.toml",
+        "diffuserbench new display.toml --display",
     )
 )
 def new(
     file: Annotated[Path, typer.Argument(help="The file to write.")] = Path(DEFAULT_NAME),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
     if file.exists() and not force:
         raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
-    write_text(file, default_text())
-    typer.echo(f"Wrote {file}: a SIMULATED bench, with every key explained.")
+    write_text(file, display_text() if display else default_text())
+    what = "holographic display" if display else "bench, with every key explained"
+    typer.echo(f"Wrote {file}: a SIMULATED {what}.")
     typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")

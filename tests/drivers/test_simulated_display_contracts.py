@@ -1,0 +1,47 @@
+"""The devices of the simulated holographic display keep the contracts that every driver keeps."""
+
+from __future__ import annotations
+
+from drivers.device import Device
+from drivers.simulated.camera import CameraOptions
+from drivers.simulated.display import DisplayCamera, DisplaySlm, DisplayStage, DisplayStageOptions
+from drivers.simulated.display_world import DisplayOptions, DisplayWorld
+from drivers.simulated.slm import SlmOptions
+from instrument.bench import Bench
+from instrument.config_file import display_text, parse_config
+from tests.drivers.contract_camera import CameraContract
+from tests.drivers.contract_slm import SlmContract
+from tests.drivers.contract_stage import StageContract
+
+
+class TestDisplayCamera(CameraContract):
+    def make(self) -> Device:
+        world = DisplayWorld(DisplayOptions(time_scale=0.1))
+        world.scene_lit = True
+        DisplaySlm(SlmOptions(shape=(32, 40)), world)
+        return DisplayCamera(CameraOptions(), world)
+
+
+class TestDisplayStage(StageContract):
+    def make(self) -> Device:
+        return DisplayStage(DisplayStageOptions(), DisplayWorld(DisplayOptions(time_scale=0.02)))
+
+
+class TestDisplaySlm(SlmContract):
+    def make(self) -> Device:
+        return DisplaySlm(SlmOptions(shape=(60, 80)), DisplayWorld(DisplayOptions(time_scale=0.0)))
+
+
+def test_the_laser_is_the_scene_and_the_mask_rides_on_the_stage() -> None:
+    text = display_text().replace("shape = [360, 640]", "shape = [32, 40]")
+    with Bench(parse_config(text, None)).open() as bench:
+        assert bench.stage is not None
+        dark = bench.snap().image.mean()
+        bench.scene_on()
+        lit = bench.snap().image.astype(float)
+        assert lit.mean() > dark + 15
+        bench.stage.home()
+        bench.stage.move_to({"x_um": 40.0, "roll_mrad": 3.0})
+        moved = bench.snap().image.astype(float)
+        assert abs(moved - lit).mean() > 0.2 * lit.mean()
+        assert "SIMULATED" in bench.label

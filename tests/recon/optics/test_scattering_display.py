@@ -1,0 +1,104 @@
+"""The simulated display against what is known in closed form, and against a plain far field."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
+
+SHAPE = (32, 40)  # SLM pixels; four mask pixels each way
+BITS = np.random.default_rng(0).integers(0, 2, (128, 160))
+PHASE = np.random.default_rng(1).uniform(0, 2 * np.pi, SHAPE)
+# The field of view is 5775 um wide; 160 camera pixels cover it.
+SPEC = DisplaySpec(
+    slm_pitch_um=16.0, focal_mm=35.0, sensor_shape=(128, 160), sensor_pitch_um=5775 / 160, oversampling=2
+)
+
+
+def see(spec=SPEC, pose=None, phase=PHASE):
+    return ScatteringDisplay(spec, np.pi * BITS).irradiance(phase, pose or MaskPose())
+
+
+def plain_far_field():
+    """|F{mask x SLM}|^2 with the mask pixels' envelope, eight samples a mask-grid step, by definition."""
+    field = np.repeat(np.repeat(np.exp(1j * PHASE), 4, 0), 4, 1) * np.exp(1j * np.pi * BITS)
+    n = 1280
+    far = np.fft.fftshift(np.abs(np.fft.fft2(field, (n, n))) ** 2) / field.size
+    nu = np.arange(n) / n - 0.5
+    return far * (np.sinc(nu)[:, None] * np.sinc(nu)) ** 2
+
+
+def test_an_aligned_display_shows_the_far_field_of_mask_times_slm():
+    fine = np.pad(plain_far_field(), (0, 1), mode="wrap")  # 1280 samples over the field: 8 a camera pixel
+    seen = see()
+    weights = np.r_[0.5, np.ones(7), 0.5] / 8  # pixel means by the trapezium rule
+    expected = np.zeros((128, 160))
+    for row in range(128):
+        for column in range(160):
+            # Centre of camera pixel c of n: (c - (n - 1) / 2) pixels from the axis, 8 samples each.
+            top, left = int((row - 63.5) * 8 + 640) - 4, int((column - 79.5) * 8 + 640) - 4
+            expected[row, column] = weights @ fine[top : top + 9, left : left + 9] @ weights
+    inner = np.s_[4:-4, 4:-4]
+    assert np.corrcoef(seen[inner].ravel(), expected[inner].ravel())[0, 1] > 0.985
+    assert seen[inner].mean() == pytest.approx(expected[inner].mean(), rel=0.005)
+
+
+def test_light_is_neither_made_nor_lost_but_for_the_envelope():
+    seen = see(replace(SPEC, sensor_shape=(160, 160)))
+    expected = (np.sinc(np.linspace(-0.5, 0.5, 1001)) ** 2).mean() ** 2
+    assert seen.mean() == pytest.approx(expected, rel=0.02)
+
+
+def test_a_mask_shift_of_whole_slm_pixels_is_a_shift_of_the_pattern():
+    phase = np.zeros(SHAPE)
+    phase[8:24, 8:32] = PHASE[8:24, 8:32]
+    moved = np.roll(phase, (-1, 2), axis=(0, 1))
+    a = see(pose=MaskPose(shift_x_um=-32.0, shift_y_um=16.0), phase=phase)
+    b = see(phase=moved)
+    unmoved = see(phase=phase)
+    # The patterns differ only at the border, where one has left the mask.
+    right, wrong = (np.corrcoef(x.ravel(), b.ravel())[0, 1] for x in (a, unmoved))
+    assert right > 0.8 > wrong + 0.3
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        MaskPose(shift_x_um=6.0),
+        MaskPose(roll_mrad=40.0),
+        MaskPose(z_um=600.0),
+        MaskPose(pitch_mrad=500.0),
+        MaskPose(yaw_mrad=500.0),
+    ],
+)
+def test_every_misalignment_changes_what_is_seen(pose):
+    assert np.corrcoef(see(pose=pose).ravel(), see().ravel())[0, 1] < 0.97
+
+
+def test_free_space_keeps_the_energy_and_can_be_undone():
+    optics = ScatteringDisplay(SPEC, np.pi * BITS)
+    here = optics._on_mask(PHASE, MaskPose())
+    there = optics._on_mask(PHASE, MaskPose(z_um=500.0))
+    assert np.sum(np.abs(there) ** 2) == pytest.approx(np.sum(np.abs(here) ** 2), rel=1e-4)
+    back = np.fft.ifft2(np.fft.fft2(there) * np.exp(1j * 0.5 * optics._f2))
+    np.testing.assert_allclose(back, here, atol=1e-3)
+
+
+def test_a_tilt_is_another_distance_at_each_place():
+    optics = ScatteringDisplay(SPEC, np.pi * BITS)
+    tilted = optics._on_mask(PHASE, MaskPose(yaw_mrad=8.0))
+    column = 280
+    z_um = 8e-3 * (column - 159.5) * 2.0
+    straight = optics._on_mask(PHASE, MaskPose(z_um=z_um))
+    flat = optics._on_mask(PHASE, MaskPose())
+    error = np.abs(tilted[20:-20, column] - straight[20:-20, column]).mean()
+    assert error < 0.2 * np.abs(flat[20:-20, column] - straight[20:-20, column]).mean()
+
+
+def test_offset_and_distortion_move_the_picture_on_the_camera():
+    offset = see(replace(SPEC, sensor_offset_um=(0.0, 3 * SPEC.sensor_pitch_um)))
+    np.testing.assert_allclose(offset[:, :-4], see()[:, 3:-1], rtol=1e-2, atol=1e-2)
+    assert np.abs(see(replace(SPEC, lens_distortion=0.05)) - see()).max() > 0.1
