@@ -5,6 +5,8 @@ from recon.noise import NoiseModel
 from recon.picture import reconstruct
 from recon.result import ImageGrid, Reconstruction
 from recon.types import Calibration, Geometry
+from recon.volume.reconstruct import reconstruct_volume
+from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 __all__ = [
     "Calibration",
@@ -13,5 +15,8 @@ __all__ = [
     "InputError",
     "NoiseModel",
     "Reconstruction",
+    "VolumeGrid",
+    "VolumeReconstruction",
     "reconstruct",
+    "reconstruct_volume",
 ]

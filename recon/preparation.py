@@ -98,8 +98,8 @@ def prepare(
     """Check, subtract the background, scale. Parameters as :func:`recon.reconstruct`."""
     data = as_channels(measurement, "measurement")
     if background is not None:
-        data = data - _like(background, data, "background")
-    valid = np.ones(data.shape, bool) if erasures is None else _like(erasures, data, "erasures") == 0
+        data = data - like_data(background, data, "background")
+    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
     if not valid.any(axis=(1, 2)).all():
         raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
 
@@ -128,7 +128,7 @@ def prepare(
                 "Leave them out with erasures, or expose shorter."
             )
 
-    deviation = np.array([_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
+    deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
     energy = np.sqrt(np.sum(psfs.astype(np.float64) ** 2, axis=(1, 2))).astype(np.float32)
     shape = (data.shape[1], data.shape[2])
     camera = PadCropConvolution(psfs / energy[:, None, None], shape, n_channels=len(data))
@@ -147,7 +147,7 @@ def prepare(
     )
 
 
-def _noise(data: Floats, valid: npt.NDArray[np.bool_], noise: NoiseModel | float | None) -> float:
+def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: NoiseModel | float | None) -> float:
     """Return one channel's noise deviation in counts, at least what float32 can tell."""
     if isinstance(noise, NoiseModel):
         deviation = noise.deviation(data[valid])
@@ -161,7 +161,7 @@ def _noise(data: Floats, valid: npt.NDArray[np.bool_], noise: NoiseModel | float
     return max(deviation, LEAST_NOISE * size) or 1.0
 
 
-def _like(image: npt.ArrayLike, data: Floats, name: str) -> Floats:
+def like_data(image: npt.ArrayLike, data: Floats, name: str) -> Floats:
     """Broadcast a number or an image to the data, channels first."""
     if np.ndim(image) == 0:
         return np.full_like(data, float(np.asarray(image)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -161,6 +161,15 @@ class Convolution3D(LinearOperator):
 
             self.groups.run(job)
         return out
+
+    def adjoint_planes(self, y: Array, channel: int = 0) -> Iterator[Array]:
+        """Yield the adjoint of one channel's data plane by plane, without a volume in memory."""
+        self._work[...] = 0
+        self._work[self.sensor_window] = y[channel]
+        E = fft.rfft(self._work)
+        for z in range(self.domain_shape[1]):
+            H = self.transfer_plane(z, channel if self._psfs.shape[1] > 1 else 0)
+            yield fft.irfft(np.conj(H) * E, self.grid_shape[1])
 
     @cached_property
     def norm_bound(self) -> float:

@@ -113,15 +113,20 @@ class Storage:
     Parameters
     ----------
     scratch : path, optional
-        Folder for the files (a fast disk); they are removed when the storage is. Default: memory.
+        Folder for the files (a fast disk); :meth:`close` removes them. Default: memory.
     """
 
     def __init__(self, scratch: Path | str | None = None) -> None:
         self._folder: Path | None = None
         if scratch is not None:
             self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
-            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+            self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._count = 0
+
+    def close(self) -> None:
+        """Remove the files. Arrays in them must not be used any more."""
+        if self._folder is not None:
+            self._remove()
 
     def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         """Return an array of zeros.
@@ -143,3 +148,21 @@ class Storage:
         self._count += 1
         path = self._folder / f"{self._count}.dat"
         return np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
+
+
+def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
+    """Return the scratch folder for a plan that does not fit into memory.
+
+    Raises
+    ------
+    InputError
+        When there is none, or not even the part that must be in memory fits.
+    """
+    if plan.work > (1 - KEPT_FREE) * plan.available:
+        raise InputError(f"This volume needs {plan}. Bin the images or take fewer depths.")
+    if scratch is None:
+        raise InputError(
+            f"This volume needs {plan}. Bin the images, take fewer depths, use the l1 prior (two volumes "
+            "instead of six), or name a scratch folder on a fast disk for the solver's state."
+        )
+    return scratch

@@ -1,0 +1,229 @@
+"""One channel of a volume: its operator, and the solver that fits model and prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.operators import (
+    BackgroundRemoval,
+    Convolution3D,
+    Erasures,
+    FieldOfPsfs,
+    LinearOperator,
+    SpatiallyVarying,
+    local_convolution,
+    low_rank,
+)
+from recon.priors import L1, NonNegativity, TotalVariation
+from recon.solvers import Fista, Solver
+from recon.volume import memory
+from recon.volume.douglas_rachford import DouglasRachford
+from recon.volume.lean_tv import LeanTotalVariation
+from recon.volume.model import LOW_RANK_ERROR, Depths, ModelName
+
+Array = npt.NDArray[Any]
+VolumePrior = Literal["tv", "tv-isotropic", "l1", "nonnegative"]
+PRIORS: tuple[VolumePrior, ...] = ("tv", "tv-isotropic", "l1", "nonnegative")
+
+NOISE_WEIGHT = {"tv": 1.0, "l1": 3.0}
+"""Default weight in units of the noise that the adjoint of a unit-energy PSF passes on: for TV as large, for
+l1 what noise exceeds in few voxels."""
+LEAST_TAU = {"tv": 1e-5, "l1": 1e-2}
+"""Least default weight relative to ``max |A^H b|``: what errors of the model ask for when noise does not."""
+BACKGROUND_FREQUENCIES = (5, 5)
+"""Lowest DCT frequencies that belong to the background (Kuo 2020, sec. 6.2)."""
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A measurement in units of its noise, and a calibration sorted by depth.
+
+    ``energy`` is the root mean energy of the central PSFs; operators are built with PSFs divided by it.
+    """
+
+    data: npt.NDArray[np.float32]
+    valid: npt.NDArray[np.bool_]
+    noise: npt.NDArray[np.float32]
+    energy: float
+    depths: Depths
+    warnings: tuple[str, ...]
+    flat: bool
+
+
+class ChannelProblem:
+    """Operator and solver of one channel.
+
+    Parameters
+    ----------
+    scaled : Scaled
+    channel : int
+    model : str
+        Any of :data:`recon.volume.model.MODELS` but ``"auto"``.
+    smooth : bool
+        Estimate a smooth background as well.
+    prior : str
+    weights : ndarray
+        Axis weights of TV.
+    memory_gib, scratch : optional
+        As :func:`recon.reconstruct_volume`.
+    """
+
+    def __init__(
+        self,
+        scaled: Scaled,
+        channel: int,
+        model: ModelName,
+        *,
+        smooth: bool,
+        prior: VolumePrior,
+        weights: Array,
+        memory_gib: float | None = None,
+        scratch: Path | str | None = None,
+    ) -> None:
+        self.data = scaled.data[channel : channel + 1]
+        self.valid = scaled.valid[channel]
+        self.prior = prior
+        self.weights = weights
+        self._unit = scaled.energy / float(scaled.noise[channel])
+        self._removal = (
+            BackgroundRemoval((1, *self.valid.shape), BACKGROUND_FREQUENCIES, self.valid) if smooth else None
+        )
+        self._limit = None if memory_gib is None else int(memory_gib * memory.GIB)
+        self._storage = memory.Storage()
+        own = slice(channel, channel + 1) if scaled.depths.central.shape[1] > 1 else slice(0, 1)
+        scale = np.float32(1 / scaled.energy)
+        if model == "convolution":
+            self.camera: Convolution3D | SpatiallyVarying = self._convolution(
+                scaled.depths.central[:, own] * scale, scratch
+            )
+        else:
+            fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in scaled.depths.fields]
+            self.camera = self._varying(fields, model)
+
+    def _convolution(self, psfs: Array, scratch: Path | str | None) -> Convolution3D:
+        height, width = self.valid.shape
+        camera = Convolution3D(
+            psfs, (height, width), allocate=lambda shape, dtype: self._storage.zeros(shape, dtype)
+        )
+        kind = "tv" if self.prior.startswith("tv") else "l1"
+        self.plan = memory.plan(
+            kind, camera.domain_shape, psfs.size, len(psfs) * height * width, available=self._limit
+        )
+        if not self.plan.fits:
+            self._storage = memory.Storage(memory.scratch_for(self.plan, scratch))
+        return camera
+
+    def _varying(self, fields: list[FieldOfPsfs], model: ModelName) -> SpatiallyVarying:
+        shape = (self.valid.shape[0], self.valid.shape[1])
+        camera = (
+            local_convolution(fields, shape)
+            if model == "local"
+            else low_rank(fields, shape, error=LOW_RANK_ERROR)
+        )
+        volumes = 12 if self.prior.startswith("tv") else 6
+        size = 4 * int(np.prod(camera.domain_shape))
+        available = memory.available_bytes() if self._limit is None else self._limit
+        self.plan = memory.MemoryPlan(0, volumes * size + 8 * camera.fft_pixels, available)
+        if not self.plan.fits:
+            raise InputError(f"The {model} model needs {self.plan}. Bin the images or take fewer depths.")
+        return camera
+
+    def close(self) -> None:
+        """Remove what the solver kept on disk."""
+        self._storage.close()
+
+    @property
+    def operator(self) -> LinearOperator:
+        """The camera with everything that happens to its data."""
+        operator: LinearOperator = self.camera
+        if not self.valid.all():
+            operator = Erasures(self.valid, self.data.shape) @ operator
+        return operator if self._removal is None else self._removal @ operator
+
+    def start(self, volume: Array, window: tuple[slice, slice]) -> Array:
+        """Place a volume in measurement units on the operator's grid."""
+        _, n_z, height, width = self.camera.domain_shape
+        grid = np.zeros((1, n_z, height, width), np.float32)
+        if grid[0][:, window[0], window[1]].shape != volume.shape:
+            raise InputError(
+                f"The volume to start from is {volume.shape}; this measurement needs "
+                f"{grid[0][:, window[0], window[1]].shape}."
+            )
+        grid[0][:, window[0], window[1]] = volume * np.float32(self._unit)
+        return grid
+
+    def background(self, solution: Array) -> Array:
+        """Return the smooth background that goes with a solution, in units of the noise."""
+        if self._removal is None:
+            raise ValueError("No background was asked for.")
+        rest: Array = self._removal.background(self.data - self.camera.forward(solution))
+        return np.asarray(rest[0])
+
+    def solver(self, tau: float | None, start: Array | None, *, keep_state: bool) -> tuple[Solver, float]:
+        """Return a solver, and the prior's weight relative to ``max |A^H b|``."""
+        data = self.data if self._removal is None else self._removal.forward(self.data)
+        peak = self._peak(data)
+        kind = "tv" if self.prior.startswith("tv") else "l1"
+        if tau is None:
+            tau = max(NOISE_WEIGHT[kind] / peak if peak > 0 else 0.0, LEAST_TAU[kind])
+        if not tau >= 0:
+            raise InputError(f"tau must not be negative; got {tau}.")
+        weight = 0.0 if self.prior == "nonnegative" else tau * peak
+        if isinstance(self.camera, SpatiallyVarying):
+            return self._general(data, weight, start), tau
+        if kind == "l1":
+            return (
+                DouglasRachford(
+                    self.camera,
+                    self.data,
+                    weight,
+                    valid=self.valid,
+                    background=self._removal,
+                    initial=start,
+                    keep_state=keep_state,
+                    storage=self._storage,
+                ),
+                tau,
+            )
+        return (
+            LeanTotalVariation(
+                self.camera,
+                self.data,
+                weight,
+                axis_weights=self.weights,
+                isotropic=self.prior == "tv-isotropic",
+                valid=self.valid,
+                background=self._removal,
+                initial=start,
+                keep_state=keep_state,
+                storage=self._storage,
+            ),
+            tau,
+        )
+
+    def _peak(self, data: Array) -> float:
+        """``max |A^H b|``, plane by plane: no volume for one number."""
+        if isinstance(self.camera, SpatiallyVarying):
+            return float(np.abs(self.camera.adjoint(data)).max())
+        return max(float(np.abs(plane).max()) for plane in self.camera.adjoint_planes(data))
+
+    def _general(self, data: Array, weight: float, start: Array | None) -> Solver:
+        if self.prior.startswith("tv"):
+            z, y, x = (float(w) for w in np.broadcast_to(self.weights, (len(self.weights), 3)).mean(axis=0))
+            tv = TotalVariation(
+                weight,
+                isotropic=self.prior == "tv-isotropic",
+                axis_weights=(z, y, x),
+                wrap=(False, False, False),
+                separable=NonNegativity(),
+                tolerance=1e-4,
+                max_inner=20,
+            )
+            return Fista(self.operator, data, tv, initial=start)
+        return Fista(self.operator, data, L1(weight) + NonNegativity(), initial=start)

@@ -1,0 +1,109 @@
+"""Which camera model a calibration asks for, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.operators.local_convolution import FieldOfPsfs
+from recon.operators.low_rank import principal_psfs
+from recon.registration import displacement, shifted
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+ModelName = Literal["auto", "convolution", "local", "lowrank"]
+MODELS: tuple[ModelName, ...] = ("auto", "convolution", "local", "lowrank")
+
+TOLERATED = 0.05
+"""Relative PSF error over the field below which one PSF a depth will do."""
+LOW_RANK_ERROR = 0.03
+"""Relative PSF error that the low-rank model is built to."""
+
+
+@dataclass(frozen=True)
+class Depths:
+    """A calibration sorted by depth.
+
+    Attributes
+    ----------
+    z_um : ndarray, (n_z,)
+        Nearest last or first as the calibration has it; NaN where not known.
+    central : ndarray, float32, (n_z, n_channels, height, width)
+        The PSF nearest to the axis at each depth.
+    fields : list of FieldOfPsfs
+        All PSFs of each depth, registered to the central one.
+    """
+
+    z_um: npt.NDArray[np.float64]
+    central: npt.NDArray[np.float32]
+    fields: list[FieldOfPsfs]
+
+    @property
+    def varies(self) -> bool:
+        """Whether any depth was calibrated at more than one place."""
+        return any(len(f.points) > 1 for f in self.fields)
+
+    @property
+    def field_error(self) -> float:
+        """Root mean square difference of the registered PSFs from the central one, relative to it."""
+        differences = norms = 0.0
+        for central, field in zip(self.central, self.fields, strict=True):
+            seen = np.stack([shifted(shifted(central, *p), *-p) for p in field.points.astype(int)])
+            differences += float(np.sum((field.psfs - seen).astype(np.float64) ** 2))
+            norms += float(np.sum(seen.astype(np.float64) ** 2))
+        return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
+
+
+def sort_by_depth(calibration: Calibration) -> Depths:
+    """Group a calibration's PSFs by depth and register those of a depth to its central one.
+
+    PSFs whose depths are not known are taken for one depth each, in their order.
+    """
+    psfs, positions = calibration.psfs, calibration.source_positions_um
+    if len(psfs) == 0:
+        raise InputError("The calibration holds no PSF: a volume needs at least one depth.")
+    z = positions[:, 2]
+    if np.isfinite(z).all():
+        depths, first, label = np.unique(z, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        members = [np.flatnonzero(label == k) for k in order]
+        z_um = depths[order]
+    else:
+        members, z_um = [np.array([k]) for k in range(len(psfs))], np.full(len(psfs), np.nan)
+    central, fields = [], []
+    for group in members:
+        off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
+        reference = psfs[group[int(np.argmin(off_axis))]]
+        central.append(reference)
+        points = [displacement(psfs[k].mean(axis=0), reference.mean(axis=0)) for k in group]
+        registered = [shifted(psfs[k], -p[0], -p[1]) for k, p in zip(group, points, strict=True)]
+        fields.append(FieldOfPsfs(np.stack(registered), points))
+    return Depths(z_um, np.stack(central), fields)
+
+
+def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
+    """Return the model to use and the reason in words."""
+    if wanted not in MODELS:
+        raise InputError(f"The model {wanted!r} is not known. Choose one of {', '.join(MODELS)}.")
+    if wanted in ("local", "lowrank") and not depths.varies:
+        raise InputError(
+            f"The {wanted} model needs PSFs from several places of the field; this calibration has one "
+            "a depth. Calibrate on a grid, or use the convolution model."
+        )
+    if wanted != "auto":
+        return wanted, "as asked"
+    if not depths.varies:
+        return "convolution", "one PSF a depth was calibrated"
+    error = depths.field_error
+    if error <= TOLERATED:
+        return "convolution", f"PSFs differ by {error:.1%} over the field, no more than {TOLERATED:.0%}"
+    densest = max(depths.fields, key=lambda f: len(f.points))
+    rank = len(principal_psfs(densest, error=LOW_RANK_ERROR).components)
+    # A whole-frame convolution costs about as much as all cells of the local model together.
+    if rank <= 3 and rank < len(densest.points):
+        return "lowrank", f"PSFs differ by {error:.1%} over the field; {rank} components tell all but 3 %"
+    return "local", f"PSFs differ by {error:.1%} over the field, and it would take {rank} components"

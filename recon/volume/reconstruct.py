@@ -1,0 +1,227 @@
+"""One call from a measurement and a calibration to a volume, with defaults that need no tuning."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.checks import as_channels, check_psf
+from recon.errors import InputError
+from recon.noise import NoiseModel
+from recon.operators.local_convolution import field_of
+from recon.preparation import Field, channel_noise, like_data
+from recon.solvers import Outcome, Solver, StoppingRules
+from recon.solvers.stopping import IterationRecord
+from recon.types import Calibration
+from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
+from recon.volume.model import Depths, ModelName, choose_model, sort_by_depth
+from recon.volume.result import VolumeGrid, VolumeReconstruction
+
+Array = npt.NDArray[Any]
+Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+
+
+def reconstruct_volume(
+    measurement: npt.ArrayLike,
+    calibration: Calibration,
+    *,
+    prior: VolumePrior = "tv",
+    tau: float | None = None,
+    axis_weights: npt.ArrayLike | None = None,
+    model: ModelName = "auto",
+    estimate_background: bool | None = None,
+    background: npt.ArrayLike | None = None,
+    erasures: npt.ArrayLike | None = None,
+    noise: NoiseModel | float | None = None,
+    iterations: int | None = None,
+    time_s: float | None = None,
+    tolerance: float = 1e-3,
+    field: Field = "sensor",
+    initial: VolumeReconstruction | None = None,
+    memory_gib: float | None = None,
+    scratch: Path | str | None = None,
+    callback: Progress | None = None,
+    cancel: threading.Event | None = None,
+) -> VolumeReconstruction:
+    """Reconstruct a volume from one measurement (Kuo 2020, Eq. 4.2; with a background Eq. 6.2).
+
+    Parameters
+    ----------
+    measurement : array, (height, width) or (height, width, n_channels)
+        Any real dtype, any exposure. Background already subtracted, given as ``background``, or estimated.
+    calibration : Calibration
+        One PSF a depth, or several over the field at each depth.
+    prior : str
+        ``"tv"`` for extended objects, ``"tv-isotropic"``, ``"l1"`` for sparse and fluorescent ones,
+        ``"nonnegative"``. All include non-negativity.
+    tau : float, optional
+        Weight of the prior relative to ``max |A^H b|``. Default: from the noise.
+    axis_weights : array, (3,) or (n_z, 3), optional
+        Weights of the z, y and x differences of TV. Default: by the voxels' shape where the geometry is known
+        (:meth:`~recon.volume.result.VolumeGrid.axis_weights`), else 1.
+    model : str
+        ``"auto"``, ``"convolution"``, ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5).
+    estimate_background : bool, optional
+        Estimate a smooth background as well. Default: for ``"l1"``.
+    background, erasures, noise
+        As :func:`recon.reconstruct`.
+    iterations, time_s, tolerance : optional
+        When to stop, whichever comes first. Without ``iterations`` and ``time_s``: 200 iterations. ``time_s``
+        is shared evenly by the channels.
+    field : "sensor" or "full"
+        Return the part opposite to the sensor, or everything that can reach it.
+    initial : VolumeReconstruction, optional
+        Start from this one: same calibration, same ``field``.
+    memory_gib : float, optional
+        How much memory may be taken; default what is free.
+    scratch : path, optional
+        Folder on a fast disk for what does not fit into memory. Without it a volume too large is refused.
+    callback : callable, optional
+        ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one.
+    cancel : threading.Event, optional
+        Set it to stop after the iteration in progress.
+
+    Raises
+    ------
+    InputError
+        When the input is unusable or does not fit into memory; the text says what to do.
+    """
+    if prior not in PRIORS:
+        raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
+    scaled = _prepare(measurement, calibration, background, erasures, noise)
+    name, reason = choose_model(scaled.depths, model)
+    smooth = prior == "l1" if estimate_background is None else estimate_background
+    try:
+        rules = StoppingRules(
+            iterations=200 if iterations is None and time_s is None else iterations,
+            time_s=None if time_s is None else time_s / len(scaled.data),
+            tolerance=tolerance,
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    height, width = scaled.data.shape[1:]
+    psf_shape = scaled.depths.central.shape[2:]
+    window, centre = _window(field, (height, width), (psf_shape[0], psf_shape[1]))
+    grid = _grid(calibration, scaled.depths, window, centre)
+    weights = grid.axis_weights() if axis_weights is None else np.asarray(axis_weights, float)
+    volumes, outcomes, backgrounds, taus = [], [], [], []
+    for channel in range(len(scaled.data)):
+        run = ChannelProblem(
+            scaled,
+            channel,
+            name,
+            smooth=smooth,
+            prior=prior,
+            weights=weights,
+            memory_gib=memory_gib,
+            scratch=scratch,
+        )
+        start = None if initial is None else run.start(_channel(initial.volume, channel), window)
+        solver, relative = run.solver(tau, start, keep_state=callback is not None)
+        scale = float(scaled.noise[channel]) / scaled.energy
+
+        def tell(solver: Solver, record: IterationRecord, scale: float = scale) -> None:
+            if callback is not None:
+                callback(record, lambda: solver.solution[0][:, window[0], window[1]] * np.float32(scale))
+
+        outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
+        volumes.append(outcome.solution[0][:, window[0], window[1]] * np.float32(scale))
+        backgrounds.append(run.background(outcome.solution) * scaled.noise[channel] if smooth else None)
+        outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
+        taus.append(relative)
+        del solver, outcome
+        run.close()
+    volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
+    return VolumeReconstruction(
+        volume=np.ascontiguousarray(volume),
+        grid=grid,
+        model=name,
+        reason=reason,
+        prior=prior,
+        tau=max(taus),
+        background=_stacked(backgrounds, scaled.flat),
+        noise_norm=float(np.sqrt(np.count_nonzero(scaled.valid[0]))),
+        histories=tuple(o.history for o in outcomes),
+        stop_reasons=tuple(o.stop_reason for o in outcomes),
+        seconds=sum(o.seconds for o in outcomes),
+        warnings=scaled.warnings,
+        provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": str(run.plan)},
+    )
+
+
+def _stacked(images: list[Array | None], flat: bool) -> npt.NDArray[np.float32] | None:
+    found = [np.asarray(i, np.float32) for i in images if i is not None]
+    if not found:
+        return None
+    return found[0] if flat else np.stack(found, axis=-1)
+
+
+def _channel(volume: Array, channel: int) -> Array:
+    chosen: Array = volume if volume.ndim == 3 else volume[..., channel]
+    return chosen
+
+
+def _prepare(
+    measurement: npt.ArrayLike,
+    calibration: Calibration,
+    background: npt.ArrayLike | None,
+    erasures: npt.ArrayLike | None,
+    noise: NoiseModel | float | None,
+) -> Scaled:
+    data = as_channels(measurement, "measurement")
+    if background is not None:
+        data = data - like_data(background, data, "background")
+    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
+    if not valid.any(axis=(1, 2)).all():
+        raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
+    depths = sort_by_depth(calibration)
+    psfs = depths.central
+    if psfs.shape[1] not in (1, len(data)):
+        raise InputError(
+            f"The PSFs have {psfs.shape[1]} channels and the measurement {len(data)}: give one PSF for all "
+            "channels or one for each."
+        )
+    warnings = []
+    for z, psf in enumerate(psfs):
+        warnings += [f"Depth {z}: {text}" for text in check_psf(psf)]
+    deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
+    return Scaled(
+        data=np.where(valid, data / deviation[:, None, None], 0).astype(np.float32),
+        valid=valid,
+        noise=deviation,
+        energy=float(np.sqrt(np.mean(np.sum(psfs.astype(np.float64) ** 2, axis=(2, 3))))),
+        depths=depths,
+        warnings=tuple(warnings),
+        flat=np.ndim(measurement) == 2,
+    )
+
+
+def _window(
+    field: Field, sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Part of the operator's grid that a field takes, and where the axis is in it."""
+    (full_height, full_width), (row, column) = field_of(sensor_shape, psf_shape)
+    if field == "full":
+        return (slice(0, full_height), slice(0, full_width)), (row, column)
+    if field != "sensor":
+        raise InputError(f'field must be "sensor" or "full", not {field!r}.')
+    height, width = sensor_shape
+    top, left = max(row - height // 2, 0), max(column - width // 2, 0)
+    window = slice(top, min(top + height, full_height)), slice(left, min(left + width, full_width))
+    return window, (row - top, column - left)
+
+
+def _grid(
+    calibration: Calibration, depths: Depths, window: tuple[slice, slice], centre: tuple[int, int]
+) -> VolumeGrid:
+    pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
+    pitches = np.full(len(depths.z_um), np.nan)
+    if pitch is not None and distance:
+        pitches = pitch * depths.z_um / (1000 * distance)
+    shape = (len(depths.z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return VolumeGrid(shape, centre, depths.z_um, pitches)

@@ -1,0 +1,249 @@
+"""Whole reconstructions of volumes, from measurements not made with the reconstruction's model."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct_volume
+from recon.solvers import StopReason
+from recon.volume import memory
+from recon.volume.model import choose_model, sort_by_depth
+
+SIZE, DEPTHS, SPAN = 40, 8, 0.4
+PITCH_UM, DISTANCE_MM = 10.0, 5.0
+Z_UM = np.linspace(1 / 8, 1 / 25, DEPTHS) ** -1 * 1000
+
+
+def render(points, seed=0, size=SIZE, fall_off_px=None):
+    """Random lenslets cast one Gaussian spot each of points (y, x, depth, light) at continuous positions."""
+    rng = np.random.default_rng(seed)
+    lenses = rng.uniform(-0.3, 0.3, (25, 2)) * size
+    y, x = np.mgrid[:size, :size] - size // 2
+    image = np.zeros((size, size))
+    for row, column, depth, light in points:
+        m = 1 + SPAN * (1 - depth / (DEPTHS - 1))
+        sigma = 0.8 + 0.6 * abs(depth / (DEPTHS - 1) - 0.4)
+        # The sensor's response is centred under the source, which is across the axis from its pattern.
+        response = (
+            1 if fall_off_px is None else np.exp(-((y + row) ** 2 + (x + column) ** 2) / (2 * fall_off_px**2))
+        )
+        for lens in lenses:
+            spot = np.exp(-((y - row - m * lens[0]) ** 2 + (x - column - m * lens[1]) ** 2) / (2 * sigma**2))
+            image += response * light / (2 * np.pi * sigma**2) * spot
+    return image
+
+
+def calibration(channels=1, gain=50.0):
+    psfs = np.stack([render([(0, 0, z, gain)]) for z in range(DEPTHS)])[:, None]
+    psfs = np.repeat(psfs, channels, axis=1).astype(np.float32)
+    positions = np.stack([np.zeros(DEPTHS), np.zeros(DEPTHS), Z_UM], axis=1)
+    return Calibration(psfs, positions, geometry=Geometry(PITCH_UM, DISTANCE_MM))
+
+
+BEADS = [(-9.3, 4.6, 2.2, 900.0), (6.4, -7.7, 5.1, 700.0), (2.1, 9.2, 3.6, 800.0)]
+
+
+def measurement(photons=1.0, seed=1, background=0.0):
+    rng = np.random.default_rng(seed)
+    return rng.poisson(render(BEADS) * 50 * photons + background).astype(np.float64) + rng.normal(
+        0, 2, (SIZE, SIZE)
+    )
+
+
+def where(volume, bead):
+    """Depth, row, column of the brightest voxel near a bead's lateral position."""
+    row, column = round(bead[0]) + SIZE // 2, round(bead[1]) + SIZE // 2
+    near = volume[:, row - 3 : row + 4, column - 3 : column + 4]
+    return np.unravel_index(int(near.argmax()), near.shape)
+
+
+@pytest.mark.parametrize("prior", ["l1", "tv", "tv-isotropic"])
+def test_finds_beads_in_space(prior):
+    result = reconstruct_volume(measurement(), calibration(), prior=prior)
+    assert result.volume.shape == (DEPTHS, SIZE, SIZE)
+    assert result.volume.dtype == np.float32
+    assert result.model == "convolution"
+    for bead in BEADS:
+        depth, row, column = where(result.volume, bead)
+        assert abs(depth - bead[2]) <= 1.2
+        assert abs(row - 3) <= 1
+        assert abs(column - 3) <= 1
+
+
+def test_light_is_kept():
+    """With the PSF as calibrated, a bead's voxels sum up to its light."""
+    result = reconstruct_volume(
+        measurement(), calibration(gain=1.0), prior="l1", tau=1e-3, estimate_background=False
+    )
+    for y, x, _, light in BEADS:
+        row, column = round(y) + SIZE // 2, round(x) + SIZE // 2
+        found = result.volume[:, row - 2 : row + 3, column - 2 : column + 3].sum()
+        assert found == pytest.approx(50 * light, rel=0.15)
+
+
+def test_exposure_does_not_change_the_picture():
+    b = measurement()
+    one = reconstruct_volume(b, calibration(), prior="l1", iterations=60, tolerance=0)
+    other = reconstruct_volume(1000 * b, calibration(gain=0.02), prior="l1", iterations=60, tolerance=0)
+    np.testing.assert_allclose(other.volume * 4e-7, one.volume, atol=1e-3 * one.volume.max())
+
+
+def test_background_is_estimated_for_l1():
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    smooth = 3000 * (1 + 0.5 * np.cos(np.pi * x) * np.cos(np.pi * y))
+    result = reconstruct_volume(measurement(background=smooth), calibration(), prior="l1")
+    assert result.background is not None
+    assert np.linalg.norm(result.background - smooth) < 0.12 * np.linalg.norm(smooth)
+    assert abs(where(result.volume, BEADS[0])[0] - BEADS[0][2]) <= 1.2
+
+
+def test_erasures_of_four_fifths():
+    """Fig. 3.7, in depth: a fifth of the pixels still tells where three beads are."""
+    erased = np.random.default_rng(3).random((SIZE, SIZE)) < 0.8
+    garbled = np.where(erased, 1e6, measurement())
+    result = reconstruct_volume(garbled, calibration(), prior="l1", erasures=erased)
+    for bead in BEADS:
+        assert abs(where(result.volume, bead)[0] - bead[2]) <= 1.5
+
+
+def test_channels():
+    b = measurement()
+    result = reconstruct_volume(
+        np.stack([b, 2 * b, 0.5 * b, b], axis=-1), calibration(), prior="l1", iterations=30, noise=2.0
+    )
+    assert result.volume.shape == (DEPTHS, SIZE, SIZE, 4)
+    single = reconstruct_volume(b, calibration(), prior="l1", iterations=30, noise=2.0)
+    np.testing.assert_allclose(result.volume[..., 0], single.volume, atol=1e-3 * single.volume.max())
+    assert len(result.histories) == len(result.stop_reasons) == 4
+
+
+def test_grid_has_its_own_pitch_at_every_depth():
+    grid = reconstruct_volume(measurement(), calibration(), iterations=2).grid
+    np.testing.assert_allclose(grid.z_um, Z_UM)
+    np.testing.assert_allclose(grid.pitch_um, PITCH_UM * Z_UM / (1000 * DISTANCE_MM))
+    assert grid.centre == (SIZE // 2, SIZE // 2)
+    weights = grid.axis_weights()
+    np.testing.assert_allclose(weights[0, 0], grid.pitch_um[0] / (Z_UM[1] - Z_UM[0]))
+    np.testing.assert_allclose(weights[:, 1:], 1)
+
+
+def test_warm_start_callback_and_cancel():
+    cold = reconstruct_volume(measurement(), calibration(), prior="l1")
+    cancel = threading.Event()
+    seen = []
+
+    def callback(record, volume):
+        seen.append((record.iteration, volume().shape))
+        if record.iteration == 3:
+            cancel.set()
+
+    warm = reconstruct_volume(
+        measurement(), calibration(), prior="l1", initial=cold, callback=callback, cancel=cancel
+    )
+    assert warm.stop_reasons == (StopReason.CANCELLED,)
+    assert seen == [(i, (DEPTHS, SIZE, SIZE)) for i in (1, 2, 3)]
+    assert np.linalg.norm(warm.volume - cold.volume) < 0.3 * np.linalg.norm(cold.volume)
+
+
+def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path):
+    plan = memory.plan("tv", (1, DEPTHS, 80, 80), calibration().psfs.size, DEPTHS * SIZE**2)
+    half = (plan.work + plan.state / 2) / (1 - memory.KEPT_FREE) / memory.GIB
+    with pytest.raises(InputError, match="name a scratch folder"):
+        reconstruct_volume(measurement(), calibration(), memory_gib=half)
+    with pytest.raises(InputError, match="Bin the images or take fewer depths"):
+        reconstruct_volume(measurement(), calibration(), memory_gib=1e-4, scratch=tmp_path)
+    result = reconstruct_volume(measurement(), calibration(), iterations=5, memory_gib=half, scratch=tmp_path)
+    same = reconstruct_volume(measurement(), calibration(), iterations=5)
+    np.testing.assert_array_equal(result.volume, same.volume)
+    assert not list(tmp_path.iterdir()), "scratch files are removed"
+
+
+def test_plan_counts_the_volumes():
+    plan = memory.plan("tv", (1, 128, 512, 512), 0, 0, available=2**30)
+    assert plan.state / 2**20 == pytest.approx(6 * 128, rel=0.01)
+    assert plan.fits
+    assert not memory.plan("tv", (1, 128, 2048, 2048), 0, 0, available=2**33).fits
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"prior": "haar"}, "prior 'haar' is not known"),
+        ({"model": "exact"}, "model 'exact' is not known"),
+        ({"model": "local"}, "several places of the field"),
+        ({"tau": -1.0}, "tau must not be negative"),
+        ({"field": "all"}, "field must be"),
+        ({"erasures": np.ones((SIZE, SIZE), bool)}, "leave no pixel"),
+    ],
+)
+def test_refuses_in_words(change, words):
+    with pytest.raises(InputError, match=words):
+        reconstruct_volume(measurement(), calibration(), iterations=1, **change)
+
+
+def test_refuses_unusable_calibrations():
+    c = calibration()
+    empty = Calibration(c.psfs[:0], c.source_positions_um[:0])
+    with pytest.raises(InputError, match="holds no PSF"):
+        reconstruct_volume(measurement(), empty)
+    constant = Calibration(np.ones_like(c.psfs), c.source_positions_um)
+    with pytest.raises(InputError, match="constant"):
+        reconstruct_volume(measurement(), constant)
+
+
+def field_calibration(fall_off_px):
+    """Sources on a 3 x 3 grid at one depth; the sensor's response falls with the distance (Eq. 5.1)."""
+    psfs, positions = [], []
+    for row in (-10, 0, 10):
+        for column in (-10, 0, 10):
+            psfs.append(render([(row, column, 3, 50.0)], fall_off_px=fall_off_px)[None])
+            scale = -PITCH_UM * Z_UM[3] / (1000 * DISTANCE_MM)
+            positions.append((column * scale, row * scale, Z_UM[3]))
+    return Calibration(np.asarray(psfs, np.float32), np.array(positions))
+
+
+def test_model_is_chosen_by_how_much_psfs_vary():
+    constant = sort_by_depth(field_calibration(None))
+    varying = sort_by_depth(field_calibration(20.0))
+    assert len(constant.fields) == 1
+    assert len(constant.fields[0].points) == 9
+    assert choose_model(constant, "auto")[0] == "convolution"
+    name, reason = choose_model(varying, "auto")
+    assert name in ("local", "lowrank")
+    assert "over the field" in reason
+
+
+def test_sources_are_found_where_they_were():
+    depths = sort_by_depth(field_calibration(20.0))
+    expected = [(r, c) for r in (-10, 0, 10) for c in (-10, 0, 10)]
+    np.testing.assert_allclose(depths.fields[0].points, expected, atol=1)
+
+
+@pytest.mark.slow
+def test_fall_off_needs_the_local_model():
+    """Fig. 5.3: with fall-off, one PSF is not enough; interpolated ones are."""
+    fall_off = 20.0
+    rng = np.random.default_rng(5)
+    beads = [
+        (r + rng.uniform(-2, 2), c + rng.uniform(-2, 2), 3, 900.0) for r in (-9, 0, 9) for c in (-9, 0, 9)
+    ]
+    clean = sum(render([b], fall_off_px=fall_off) for b in beads) * 50
+    b = rng.poisson(clean) + rng.normal(0, 2, clean.shape)
+    c = field_calibration(fall_off)
+    noise = NoiseModel(read_noise=2.0, counts_per_electron=1.0)
+
+    def residual(model):
+        result = reconstruct_volume(
+            b, c, prior="l1", model=model, noise=noise, estimate_background=False, tau=1e-3
+        )
+        light = [
+            result.volume[0][round(r) + 18 : round(r) + 23, round(k) + 18 : round(k) + 23].sum()
+            for r, k, *_ in beads
+        ]
+        return result.histories[0][-1].data_residual, np.std(light) / np.mean(light)
+
+    central, spread_central = residual("convolution")
+    local, spread_local = residual("local")
+    assert local < 0.5 * central
+    assert spread_local < 0.5 * spread_central
