@@ -15,8 +15,6 @@ power cut costs no more, is held by tests/instrument/test_store_order.py.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import multiprocessing
 import os
 import random
 import shutil
@@ -24,18 +22,18 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 from instrument.acquire import prepare
-from instrument.bench import open_bench
+from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
 from instrument.plan import Part, Plan
 from instrument.resume import prepare_resume
-from instrument.store import Run, RunCondition, RunWriter
+from instrument.store import FrameToStore, Run, RunCondition, RunWriter
 from instrument.store.durable import read_lines
 from instrument.verification import verify
 
@@ -60,7 +58,7 @@ PLAN = Plan(
     parts=(
         Part(label="dark", exposures_ms=(2.0,), repeats=5),
         Part(label="psf", light=("source", "off"), exposures_ms=(1.0, 3.0), repeats=8),
-        Part(label="scene", scene_lit=True, exposures_ms=(2.0,), average=2, repeats=5),
+        Part(label="dark again", exposures_ms=(2.0,), average=2, repeats=5),
     ),
 )
 
@@ -81,23 +79,20 @@ class Tally:
     problems: list[str] = field(default_factory=list)
 
 
-def acquire(folder: Path, promised: Connection) -> None:
-    """Run the plan in ``folder``, or go on with the run that is there; in a process of its own."""
+def acquire(bench: Bench, folder: Path, promises: int) -> None:
+    """Run the plan in ``folder``, or go on with the run that is there, reporting what was promised."""
     write = RunWriter.write
 
-    def reporting(self: RunWriter, frames) -> None:  # type: ignore[no-untyped-def]
+    def reporting(self: RunWriter, frames: Sequence[FrameToStore]) -> None:
         write(self, frames)
-        for frame in frames:
-            promised.send(frame.index)
+        os.write(promises, bytes(frame.index for frame in frames))
 
     RunWriter.write = reporting  # type: ignore[method-assign]
     runs = runs_in(folder)
-    with open_bench(parse_config(BENCH, None)) as bench:
-        promised.send("ready")
-        if runs:
-            prepare_resume(bench, runs[0])[0].execute()
-        else:
-            prepare(bench, PLAN, folder).execute()
+    if runs:
+        prepare_resume(bench, runs[0])[0].execute()
+    else:
+        prepare(bench, PLAN, folder).execute()
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -105,40 +100,47 @@ def runs_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
 
 
-def attempt(folder: Path, delay_s: float | None) -> tuple[set[int], bool, float]:
-    """Let a process acquire and kill it ``delay_s`` after it is ready (None: let it finish).
+def attempt(bench: Bench, folder: Path, delay_s: float | None) -> tuple[set[int], bool, float]:
+    """Let a process acquire and kill it after ``delay_s`` (None: let it finish).
 
-    Returns the frames it was promised, whether it was killed, and the seconds from ready to its end.
+    The process is a fork with the bench ready to use: its start is not what is to be killed.
+
+    Returns the frames it was promised, whether it was killed, and how long it lived.
     """
-    receive, send = multiprocessing.Pipe(duplex=False)
-    process = multiprocessing.get_context("spawn").Process(target=acquire, args=(folder, send))
-    process.start()
-    send.close()
-    promised: set[int] = set()
-    if receive.recv() != "ready":
-        raise AssertionError("the process must report that it is ready first")
+    reading, writing = os.pipe()
     began_s = time.monotonic()
+    process = os.fork()
+    if process == 0:
+        status = 1
+        try:
+            os.close(reading)
+            acquire(bench, folder, writing)
+            status = 0
+        except BaseException:  # noqa: BLE001 - shown, and the process ends here whatever it was
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    os.close(writing)
     if delay_s is not None:
         time.sleep(delay_s)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process.pid or 0, signal.SIGKILL)
-    with contextlib.suppress(EOFError):
-        while True:
-            promised.add(receive.recv())
-    process.join()
-    if process.exitcode not in (0, -signal.SIGKILL):
-        raise SystemExit(f"The acquisition itself failed (exit status {process.exitcode}); see above.")
-    return promised, process.exitcode == -signal.SIGKILL, time.monotonic() - began_s
+        os.kill(process, signal.SIGKILL)
+    with os.fdopen(reading, "rb") as pipe:
+        promised = set(pipe.read())
+    _, status = os.waitpid(process, 0)
+    killed = os.WIFSIGNALED(status)
+    if not killed and os.WEXITSTATUS(status) != 0:
+        raise SystemExit("The acquisition itself failed; see above.")
+    return promised, killed, time.monotonic() - began_s
 
 
-def trial(folder: Path, choose_delay: Callable[[], float | None], tally: Tally) -> None:
+def trial(bench: Bench, folder: Path, choose_delay: Callable[[], float | None], tally: Tally) -> None:
     """Kill and resume one run until it is complete, and judge it."""
     tally.trials += 1
     promised: set[int] = set()
     kept: dict[int, bytes] = {}
     delay_s = choose_delay()
     while True:
-        reported, killed, _ = attempt(folder, delay_s)
+        reported, killed, _ = attempt(bench, folder, delay_s)
         promised |= reported
         runs = runs_in(folder)
         if killed:
@@ -212,24 +214,27 @@ def main() -> int:
     parent = Path(tempfile.mkdtemp(prefix="crash-test-"))
     tally = Tally()
     began_s = time.monotonic()
-    (parent / "whole").mkdir()
-    _, _, whole_s = attempt(parent / "whole", None)
-    print(f"{len(PLAN)} frames take {whole_s:.2f} s unharmed; runs in {parent}")
+    with open_bench(parse_config(BENCH, None)) as bench:
+        for name in ("warm", "whole"):
+            (parent / name).mkdir()
+        acquire(bench, parent / "warm", os.open(os.devnull, os.O_WRONLY))
+        _, _, whole_s = attempt(bench, parent / "whole", None)
+        print(f"{len(PLAN)} frames take {whole_s:.2f} s unharmed; runs in {parent}")
 
-    def choose_delay() -> float | None:
-        if tally.kills >= options.kills:
-            return None
-        return random.uniform(0.0, 1.05 * whole_s)
+        def choose_delay() -> float | None:
+            if tally.kills >= options.kills:
+                return None
+            return random.uniform(0.0, 1.05 * whole_s)
 
-    while tally.kills < options.kills:
-        folder = parent / f"{tally.trials:04d}"
-        folder.mkdir()
-        trial(folder, choose_delay, tally)
-        if not options.keep:
-            shutil.rmtree(folder)
-        print(f"\r{tally.kills} kills", end="", flush=True)
-    stored = sorted(tally.stored_at_kill)
+        while tally.kills < options.kills:
+            folder = parent / f"{tally.trials:04d}"
+            folder.mkdir()
+            trial(bench, folder, choose_delay, tally)
+            if not options.keep:
+                shutil.rmtree(folder)
+            print(f"\r{tally.kills} kills", end="", flush=True)
     print(f"\r{tally.kills} kills in {tally.trials} runs, {time.monotonic() - began_s:.0f} s")
+    stored = sorted(tally.stored_at_kill)
     print(f"found after a kill: {dict(tally.moments)}")
     if stored:
         print(f"frames stored at the kill: {stored[0]} to {stored[-1]}, median {stored[len(stored) // 2]}")
