@@ -24,9 +24,9 @@ from instrument.store import FinishReason, FrameToStore, Gap, Run, RunError, Run
 _log = logging.getLogger(__name__)
 _RING_BYTES = 256 * 2**20
 """Memory that waits for a slow disk, unless ``n_buffers`` says otherwise."""
-_MOST_BUFFERS = 512
-_BATCH = 8
-"""Frames synced to the disk together, at most."""
+_FEWEST_BUFFERS, _MOST_BUFFERS = 16, 512
+_BATCH = 32
+"""Frames synced to the disk together, at most; at most a quarter of the ring."""
 _DISK_CHECK_S = 1.0
 
 
@@ -107,7 +107,8 @@ class Recorder:
         self._n_frames = n_frames
         self._seconds = seconds
         frame_bytes = math.prod(bench.camera.frame_shape) * bench.camera.frame_dtype.itemsize
-        self.n_buffers = n_buffers or min(_MOST_BUFFERS, max(2 * _BATCH, _RING_BYTES // frame_bytes))
+        self.n_buffers = n_buffers or min(_MOST_BUFFERS, max(_FEWEST_BUFFERS, _RING_BYTES // frame_bytes))
+        self._batch = min(_BATCH, max(1, self.n_buffers // 4))
         self.on_progress = on_progress
         self._stopping = threading.Event()
         self._surroundings: FrameMetadata | None = None
@@ -158,7 +159,7 @@ class Recorder:
             failure: DeviceError | None = None
             while frame is not None:
                 self._place(frame, reader, batch, gaps)
-                if len(batch) == _BATCH or self._next == self._n_frames:
+                if len(batch) == self._batch or self._next == self._n_frames:
                     break
                 try:
                     frame = reader.next_frame(0.0)

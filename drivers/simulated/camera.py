@@ -22,6 +22,7 @@ from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
 
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 ROI_STEP = 4
 BINNINGS = (1, 2, 4)
 GAIN_LIMITS = (1.0, 16.0)
@@ -39,6 +40,18 @@ class CameraOptions(DriverOptions):
         le=0.3,
         description="Fraction of a band that each of the other colours' filters lets through.",
     )
+    frames_per_s: float | None = Field(
+        None, gt=0, description="Highest frame rate of a sequence; left out: the sensor's."
+    )
+    replay_frames: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description=(
+            "Frames rendered beforehand for each state of light and settings, then shown in turn: the full "
+            "rate on a slow computer. 0: every frame is rendered with noise of its own."
+        ),
+    )
 
 
 class SimulatedCamera(SimulatedDevice, Camera):
@@ -50,6 +63,7 @@ class SimulatedCamera(SimulatedDevice, Camera):
 
     kind = "camera"
     Options = CameraOptions
+    drops_counted_by = "device frame numbers"
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         if not isinstance(options, CameraOptions):
@@ -79,6 +93,7 @@ class SimulatedCamera(SimulatedDevice, Camera):
         self._failure: DeviceError | None = None
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
+        self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
 
     # Device ---
     def _model(self) -> str:
@@ -372,7 +387,8 @@ class SimulatedCamera(SimulatedDevice, Camera):
                         self._lost += 1
                     self._ring.append(frame)
                     self._arrived.notify_all()
-                period = max(1 / self._spec.frames_per_s, self._exposure_ms * 1e-3)
+                rate = self.options.frames_per_s or self._spec.frames_per_s
+                period = max(1 / rate, self._exposure_ms * 1e-3)
                 due = max(due + period * self.world.clock.time_scale, time.monotonic())
                 self._abort.wait(due - time.monotonic())
         except StoppedError:
@@ -404,6 +420,43 @@ class SimulatedCamera(SimulatedDevice, Camera):
         light = self._electrons_per_s()
         if not self.world.clock.wait(half, self._abort):
             raise StoppedError(self.name, "the exposure was stopped.")
+        ended_ns = time.monotonic_ns()
+        image, saturated_fraction = self._read_out(light, exposure_ms, gain, frame_id)
+        return Frame(
+            image,
+            FrameMetadata(
+                frame_id=frame_id,
+                device_time_ns=ended_ns,
+                host_time_ns=time.monotonic_ns(),
+                utc=datetime.now(UTC),
+                exposure_ms=exposure_ms,
+                gain=gain,
+                pixel_format=self._pixel_format,
+                significant_bits=self.significant_bits,
+                black_level=self.black_level,
+                roi=self._roi.as_tuple(),
+                binning=self._binning,
+                saturated_fraction=saturated_fraction,
+            ),
+        )
+
+    def _read_out(
+        self, light: npt.NDArray[np.float32], exposure_ms: float, gain: float, frame_id: int
+    ) -> tuple[Pixels, float]:
+        """Return the counts of an exposure and the fraction of them at full scale."""
+        if self.options.replay_frames == 0:
+            return self._render(light, exposure_ms, gain, frame_id)
+        key = (exposure_ms, gain, self._pixel_format, self.black_level)
+        if self._replay is None or self._replay[0] is not light or self._replay[1] != key:
+            rendered = [
+                self._render(light, exposure_ms, gain, number) for number in range(self.options.replay_frames)
+            ]
+            self._replay = (light, key, rendered)
+        return self._replay[2][frame_id % self.options.replay_frames]
+
+    def _render(
+        self, light: npt.NDArray[np.float32], exposure_ms: float, gain: float, frame_id: int
+    ) -> tuple[Pixels, float]:
         area = self._binning**2
         readout = Readout(
             electrons_per_count=self._spec.full_well_e / self._full_scale,
@@ -416,27 +469,8 @@ class SimulatedCamera(SimulatedDevice, Camera):
         )
         seed = (self.world.options.seed << 40) + (frame_id << 16)
         counts = expose(light, self._pixels(), exposure_ms * 1e-3, readout, seed)
-        image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] = counts
-        if self.significant_bits <= 8:
-            image = counts.astype(np.uint8)
-        now = time.monotonic_ns()
-        return Frame(
-            image,
-            FrameMetadata(
-                frame_id=frame_id,
-                device_time_ns=now,
-                host_time_ns=now,
-                utc=datetime.now(UTC),
-                exposure_ms=exposure_ms,
-                gain=gain,
-                pixel_format=self._pixel_format,
-                significant_bits=self.significant_bits,
-                black_level=self.black_level,
-                roi=self._roi.as_tuple(),
-                binning=self._binning,
-                saturated_fraction=float(np.count_nonzero(counts == self._full_scale) / counts.size),
-            ),
-        )
+        saturated_fraction = float(np.count_nonzero(counts == self._full_scale) / counts.size)
+        return counts.astype(np.uint8) if self.significant_bits <= 8 else counts, saturated_fraction
 
     def _region(self) -> tuple[slice, slice]:
         """Return the binned pixels that the region of interest covers."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import sys
 import termios
@@ -29,7 +30,8 @@ def keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[None]:
             ready, _, _ = select.select([handle], [], [], 0.1)
             if not ready:
                 continue
-            pressed = sys.stdin.read(1).lower()
+            # Past Python's buffer, in which further keys would wait unseen by select.
+            pressed = os.read(handle, 1).decode("latin-1").lower()
             if pressed in actions:
                 actions[pressed]()
 

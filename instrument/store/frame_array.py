@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,14 @@ class StoredChunk:
 
     n_bytes: int
     crc32: int
+
+
+class _Draft(NamedTuple):
+    """A chunk that is written, but not yet surely on the disk nor under its name."""
+
+    handle: int
+    path: Path
+    chunk: StoredChunk
 
 
 class FrameArray:
@@ -116,9 +124,30 @@ class FrameArray:
                     f"Frame {index} is {image.dtype} {image.shape}; "
                     f"the run stores {self.dtype} {self.frame_shape}."
                 )
-        stored = [self._write_chunk(index, image) for index, image in items]
-        sync_folder(self.path / _LEVEL / "c")
-        return stored
+        # All of one kind before any of the next: a journalling file system then commits once for all frames,
+        # where frame by frame it would commit several times for each.
+        drafts: list[_Draft] = []
+        try:
+            for index, image in items:
+                drafts.append(self._write_draft(index, image))
+            for draft in drafts:
+                os.fsync(draft.handle)
+        except BaseException:
+            for draft in drafts:
+                draft.path.unlink(missing_ok=True)
+            raise
+        finally:
+            for draft in drafts:
+                os.close(draft.handle)
+        top = self.path / _LEVEL / "c"
+        folders: dict[Path, None] = {}
+        for (index, _), draft in zip(items, drafts, strict=True):
+            target = self.chunk_path(index)
+            draft.path.replace(target)
+            folders.update(dict.fromkeys(folder for folder in target.parents if folder.is_relative_to(top)))
+        for folder in folders:
+            sync_folder(folder)
+        return [draft.chunk for draft in drafts]
 
     def read(self, index: int) -> Image:
         """Return one frame as it was written.
@@ -164,29 +193,23 @@ class FrameArray:
         """Return the file that holds a frame."""
         return self.path / _LEVEL / "c" / str(index) / "/".join("0" * len(self.frame_shape))
 
-    def _write_chunk(self, index: int, image: Image) -> StoredChunk:
+    def _write_draft(self, index: int, image: Image) -> _Draft:
+        """Write a frame's bytes beside the place they belong to; not synced yet."""
         planes = np.moveaxis(image, -1, 0) if self.is_colour else image
         data = np.ascontiguousarray(planes, dtype=self.dtype.newbyteorder("<")).data.cast("B")
         target = self.chunk_path(index)
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name("part")
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        path = target.with_name("part")
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         try:
             written = 0
             while written < len(data):
                 written += os.write(handle, data[written:])
-            os.fsync(handle)
         except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-        finally:
             os.close(handle)
-        temporary.replace(target)
-        folder = target.parent
-        while folder != self.path / _LEVEL / "c":
-            sync_folder(folder)
-            folder = folder.parent
-        return StoredChunk(len(data), zlib.crc32(data))
+            path.unlink(missing_ok=True)
+            raise
+        return _Draft(handle, path, StoredChunk(len(data), zlib.crc32(data)))
 
 
 def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[str, Any]:
