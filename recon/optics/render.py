@@ -36,7 +36,7 @@ class RenderSettings:
     """Pixels by which the light's displacement by the relief may differ between neighbouring nodes."""
     widest_spacing: float = 0.2
     """Largest difference between neighbouring nodes in the tangent of the angle of view."""
-    fall_off_tolerance: float = 0.02
+    fall_off_tolerance: float = 0.05
     """Error of the pixels' angular response by interpolation between nodes."""
     most_nodes: int = 150
     """Where the tolerance asks for more nodes, they are spread more thinly."""
