@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from collections import deque
@@ -58,7 +59,9 @@ class SimulatedCamera(SimulatedDevice, Camera):
     """A camera whose frames are exposures of what the simulated world throws onto its sensor.
 
     A frame is exposed wholly after it was asked for: it sees the world as it is half way through its
-    exposure. Every frame has its own noise, drawn from the world's seed and the frame's number.
+    exposure. Every frame has its own noise, drawn from the world's seed, the frame's number since the camera
+    was opened, the settings and what stands in front of it: the same session gives the same frames, and no
+    two different photographs share their noise.
     """
 
     kind = "camera"
@@ -467,7 +470,9 @@ class SimulatedCamera(SimulatedDevice, Camera):
             read_noise_e=self._spec.read_noise_e * self._binning,
             noise_scale=self.world.options.noise,
         )
-        seed = (self.world.options.seed << 40) + (frame_id << 16)
+        settings = (exposure_ms, gain, self._pixel_format, self._roi, self._binning)
+        what = repr((self.world.options.seed, frame_id, self.world.light_key(), settings)).encode()
+        seed = int.from_bytes(hashlib.blake2b(what, digest_size=8).digest())
         counts = expose(light, self._pixels(), exposure_ms * 1e-3, readout, seed)
         saturated_fraction = float(np.count_nonzero(counts == self._full_scale) / counts.size)
         return counts.astype(np.uint8) if self.significant_bits <= 8 else counts, saturated_fraction

@@ -77,6 +77,7 @@ class SimulatedWorld(Surroundings):
         self.scene_lit = False
         """Whether the scene glows."""
         self._scene = make_scene(options, preset, self.distance_um)
+        self._scene_number = 0
 
     # What the devices do to the world ---
     def carry_source(self, carrier: Callable[[], Position]) -> None:
@@ -168,7 +169,7 @@ class SimulatedWorld(Surroundings):
         if self.scene_lit and scene is not None:
             seen = _product(self.options.scene_rgb, weights)
             picture = self._cached(
-                ("scene", id(scene), seen, binning), lambda: self._render(scene, seen, binning)
+                ("scene", self._scene_number, seen, binning), lambda: self._render(scene, seen, binning)
             )
             light = picture if light is None else light + picture
         return light
@@ -190,7 +191,7 @@ class SimulatedWorld(Surroundings):
         glow = self.emission
         x, y, z = self.source_position_um
         place = (round(x, 3), round(y, 3), round(z, 3)) if any(glow) else None
-        return (place, glow, id(self._scene) if self.scene_lit else None)
+        return (place, glow, self._scene_number if self.scene_lit else None)
 
     # The scene and the truth about it ---
     @property
@@ -202,6 +203,7 @@ class SimulatedWorld(Surroundings):
         """Put another scene in front of the camera (None: nothing)."""
         with self._lock:
             self._scene = scene
+            self._scene_number += 1
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]
 

@@ -80,6 +80,8 @@ def render(
         image += np.float32(layer_photons) * _render_layer(
             layer, weights, grid, propagator, fall_off, settings
         )
+    # Transforms leave rounding errors around zero where it is dark.
+    np.maximum(image, 0, out=image)
     for place, power, diameter in scene.points():
         source = (float(place[0]), float(place[1]), float(place[2]))
         spectrum = mixed_spectrum(_product(weights, power), settings.spectral_samples)

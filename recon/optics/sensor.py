@@ -17,6 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.optics.jit import compiled
+from recon.optics.noise import (
+    EXPANSION_FROM,
+    advance,
+    normal,
+    poisson_small,
+    stream,
+    uniform_of,
+    word_of,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,49 +187,23 @@ def _expose(
     counts: npt.NDArray[np.uint16],
 ) -> None:
     height, width = counts.shape
-    to_unit = 1.0 / 9007199254740992.0
     for i in range(height):
-        # One stream of SplitMix64 a row, so that a row's noise does not depend on what came before it.
-        state = (seed + np.uint64(i)) * np.uint64(0xD1342543DE82EF95) + np.uint64(0x9E3779B97F4A7C15)
-        state ^= state >> np.uint64(29)
+        # One stream a row, so that a row's noise does not depend on what came before it.
+        state = stream(seed, i)
         for j in range(width):
             mean = (electrons_per_s[i, j] * response[i, j] + dark_e_per_s[i, j]) * exposure_s
-            state += np.uint64(0x9E3779B97F4A7C15)
-            word = state
-            word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            word ^= word >> np.uint64(31)
-            first = (float(word >> np.uint64(11)) + 0.5) * to_unit
-            state += np.uint64(0x9E3779B97F4A7C15)
-            word = state
-            word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            word ^= word >> np.uint64(31)
-            second = (float(word >> np.uint64(11)) + 0.5) * to_unit
-            radius = np.sqrt(-2.0 * np.log(first))
-            read = radius * np.sin(2 * np.pi * second)
+            state = advance(state)
+            word = word_of(state)
+            read, state = normal(word >> np.uint64(32), state)
             if noise_scale != 1.0:
-                shot = radius * np.cos(2 * np.pi * second)
+                shot, state = normal(word, state)
                 charge = mean + noise_scale * np.sqrt(mean) * shot
-            elif mean > 30.0:
-                # Poisson by a Cornish-Fisher expansion: right mean, variance and skewness.
-                shot = radius * np.cos(2 * np.pi * second)
+            elif mean > EXPANSION_FROM:
+                shot, state = normal(word, state)
                 charge = np.floor(mean + np.sqrt(mean) * shot + (shot * shot - 1.0) / 6.0 + 0.5)
             else:
-                # Poisson by inversion with a uniform draw of its own.
-                state += np.uint64(0x9E3779B97F4A7C15)
-                word = state
-                word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-                word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-                word ^= word >> np.uint64(31)
-                uniform = (float(word >> np.uint64(11)) + 0.5) * to_unit
-                term = np.exp(-mean)
-                total = term
-                charge = 0.0
-                while uniform > total and charge < 200.0:
-                    charge += 1.0
-                    term *= mean / charge
-                    total += term
+                state = advance(state)
+                charge = poisson_small(mean, uniform_of(word_of(state)))
             charge = min(max(charge, 0.0), full_well_e)
             value = (charge + offset_e[i, j] + noise_scale * read_noise_e * read) * counts_per_electron
             value = np.floor(value + black_level + 0.5)

@@ -1,0 +1,372 @@
+"""The simulated devices act on each other as real ones on a bench do."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from pydantic import ValidationError
+
+from drivers.camera import Roi
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.simulated.camera import CameraOptions, SimulatedCamera
+from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.slm import SimulatedSlm, SlmOptions
+from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
+from drivers.simulated.world import SimulatedWorld
+
+Z_UM = 100e3
+
+
+class Bench:
+    """All simulated devices of a small bench, open, homed, dark."""
+
+    def __init__(
+        self,
+        camera: CameraOptions | None = None,
+        stage: StageOptions | None = None,
+        **options: object,
+    ) -> None:
+        settings = {"preset": "tiny", "time_scale": 0.0, "noise": 0.0, "fixed_pattern": False} | options
+        self.world = SimulatedWorld(WorldOptions.model_validate(settings))
+        self.camera = SimulatedCamera(camera or CameraOptions(), self.world)
+        self.stage = SimulatedStage(stage or StageOptions(), self.world)
+        self.leds = SimulatedLedArray(LedArrayOptions(), self.world)
+        for device in (self.camera, self.stage, self.leds):
+            device.open()
+        self.stage.home()
+        self.camera.set_exposure_ms(1.0)
+
+    def lit(self, rgb: tuple[int, int, int] = (0, 255, 0)) -> npt.NDArray[np.float64]:
+        """Photograph with LED 0 on; counts above the black level."""
+        self.leds.set_pattern(self.leds.single(0, rgb))
+        return self.counts()
+
+    def counts(self) -> npt.NDArray[np.float64]:
+        return self.camera.snap().image.astype(np.float64) - round(self.camera.black_level)
+
+
+# Light ---
+def test_dark_without_leds_and_without_scene() -> None:
+    bench = Bench()
+    assert bench.counts().max() <= 1
+    assert bench.lit().max() > 100
+    bench.leds.off()
+    assert bench.counts().max() <= 1
+    bench.world.scene_lit = True
+    bench.camera.set_exposure_ms(300.0)
+    assert bench.counts().mean() > 50
+
+
+def test_light_adds_up() -> None:
+    bench = Bench()
+    bench.camera.set_exposure_ms(0.25)
+    bench.camera.set_gain(8.0)
+    half, full = bench.lit((0, 51, 0)), bench.lit((0, 102, 0))
+    # Counts are rounded: one more or less.
+    np.testing.assert_allclose(full, 2 * half, atol=2)
+    red, both = bench.lit((51, 0, 0)), bench.lit((51, 51, 0))
+    np.testing.assert_allclose(both, red + half, atol=2)
+    bench.camera.set_exposure_ms(0.5)
+    np.testing.assert_allclose(bench.lit((0, 51, 0)), full, atol=1)
+    assert 100 < full.max() < 4000
+
+
+def test_outer_leds_light_the_source_less() -> None:
+    bench = Bench()
+    inner = bench.lit().sum()
+    bench.leds.set_pattern(bench.leds.single(256, (0, 255, 0)))
+    assert 0 < bench.counts().sum() < inner
+
+
+# Stage and camera ---
+def test_the_pattern_moves_against_the_stage() -> None:
+    bench = Bench()
+    grid = bench.world.sensor_grid()
+    bench.stage.move_to({"x_um": 0.0, "y_um": 0.0, "z_um": Z_UM})
+
+    def centre(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        return np.array([image.sum(axis=0) @ grid.x_um, image.sum(axis=1) @ grid.y_um]) / image.sum()
+
+    start = centre(bench.lit())
+    bench.stage.move_to({"x_um": 5000.0, "y_um": -4000.0})
+    # The stage is where it says only within its errors; the light knows the true place.
+    true = np.array(bench.world.source_position_um[:2])
+    np.testing.assert_allclose(true, [5000.0, -4000.0], atol=10.0)
+    expected = -true * bench.world.distance_um / Z_UM
+    np.testing.assert_allclose(centre(bench.lit()) - start, expected, atol=8.0)
+
+
+def test_a_frame_sees_the_world_after_it_was_asked_for() -> None:
+    bench = Bench()
+    bench.camera.start_sequence(n_buffers=2)
+    bench.leds.set_pattern(bench.leds.single(0))
+    asked = time.monotonic_ns()
+    # Whatever the ring still holds was exposed before; frames that began later all show the light.
+    for _ in range(50):
+        frame = bench.camera.next_frame(10.0)
+        began = (frame.metadata.device_time_ns or 0) - frame.metadata.exposure_ms * 1e6
+        if began >= asked:
+            assert frame.image.max() > 200
+    bench.camera.stop_sequence()
+    bench.leds.off()
+    assert bench.camera.snap().image.max() < 200
+
+
+def test_without_a_stage_the_source_rests_on_the_axis() -> None:
+    world = SimulatedWorld(WorldOptions(preset="tiny"))
+    assert world.source_position_um == (0.0, 0.0, Z_UM)
+    SimulatedStage(StageOptions(axis_names=("z_um",), mount_offset_um=(10.0, 20.0, 0.0)), world)
+    assert world.source_position_um[:2] == (10.0, 20.0)
+
+
+# The stage's errors ---
+def still(**errors: float) -> StageOptions:
+    """One axis with exactly these errors."""
+    options = {"backlash": 0.0, "repeatability": 0.0} | errors
+    return StageOptions(axis_names=("x_um",), axes={"x_um": AxisOptions.model_validate(options)})
+
+
+def true_x(bench: Bench, target: float) -> float:
+    bench.stage.move_to({"x_um": target})
+    return bench.world.source_position_um[0]
+
+
+def test_play_shows_when_the_direction_turns() -> None:
+    bench = Bench(stage=still(backlash=40.0))
+    assert true_x(bench, 1000.0) == pytest.approx(1000.0)
+    assert true_x(bench, 2000.0) == pytest.approx(2000.0)
+    assert true_x(bench, 1990.0) == pytest.approx(2000.0)
+    assert true_x(bench, 1000.0) == pytest.approx(1040.0)
+    assert true_x(bench, 1010.0) == pytest.approx(1040.0)
+    assert true_x(bench, 2000.0) == pytest.approx(2000.0)
+    assert bench.stage.position()["x_um"] == pytest.approx(2000.0)
+
+
+def test_moves_repeat_within_the_repeatability() -> None:
+    bench = Bench(stage=still(repeatability=2.0))
+    errors = []
+    for _ in range(200):
+        true_x(bench, 0.0)
+        errors.append(true_x(bench, 500.0) - 500.0)
+    assert np.std(errors) == pytest.approx(2.0, rel=0.2)
+    assert abs(np.mean(errors)) < 0.6
+
+
+def test_positions_are_whole_steps() -> None:
+    bench = Bench(stage=still(resolution=2.5))
+    assert bench.stage.move_to({"x_um": 101.0})["x_um"] == 100.0
+
+
+def test_moves_take_their_time_and_pass_through() -> None:
+    bench = Bench(time_scale=0.02)
+    start, target = bench.stage.position(), {"x_um": 40e3}
+    seconds = bench.stage.move_duration_s(start, target) * 0.02
+    began = time.monotonic()
+    bench.stage.move_to(target, wait=False)
+    seen = []
+    while bench.stage.is_moving:
+        seen.append(bench.stage.position()["x_um"])
+        time.sleep(seconds / 20)
+    assert time.monotonic() - began >= 0.9 * seconds
+    assert np.all(np.diff(seen) >= 0)
+    assert any(4e3 < x < 36e3 for x in seen)
+    assert bench.stage.position()["x_um"] == pytest.approx(40e3)
+
+
+def test_without_time_nothing_waits() -> None:
+    bench = Bench()
+    bench.camera.set_exposure_ms(20_000.0)
+    began = time.monotonic()
+    for x in (1e4, -1e4):
+        bench.stage.move_to({"x_um": x})
+        bench.counts()
+    assert time.monotonic() - began < 20
+
+
+# Faults ---
+def test_an_unplugged_camera_says_so_even_while_streaming() -> None:
+    bench = Bench()
+    bench.camera.start_sequence(n_buffers=2)
+    bench.camera.next_frame(10.0)
+    bench.world.unplug("camera")
+    with pytest.raises(DeviceError, match=r"camera .*unplugged"):
+        bench.camera.next_frame(10.0)
+    with pytest.raises(DeviceError, match="unplugged"):
+        bench.camera.snap()
+    bench.camera.close()
+    with pytest.raises(DeviceError, match="unplugged"):
+        bench.camera.open()
+    bench.world.plug_in("camera")
+    bench.camera.open()
+    bench.camera.snap()
+
+
+@pytest.mark.parametrize("kind", ["stage", "led_array"])
+def test_other_devices_say_so_too(kind: str) -> None:
+    bench = Bench()
+    bench.world.unplug(kind)
+    action: Callable[[], object] = bench.stage.stop if kind == "stage" else bench.leds.off
+    with pytest.raises(DeviceError, match=kind):
+        action()
+
+
+def test_a_stuck_axis_is_named() -> None:
+    bench = Bench(time_scale=0.01)
+    bench.stage.carriage.set_jammed("x_um", True)
+    with pytest.raises(DeviceTimeoutError, match="x_um does not move"):
+        bench.stage.move_to({"x_um": 1000.0})
+    assert not bench.stage.is_homed
+    bench.stage.carriage.set_jammed("x_um", False)
+    bench.stage.home()
+    assert bench.stage.move_to({"x_um": 1000.0})["x_um"] == 1000.0
+
+
+def test_lost_steps_end_at_the_limit_switch() -> None:
+    bench = Bench()
+    bench.stage.carriage.slip("x_um", 3000.0)
+    with pytest.raises(DeviceError, match=r"x_um ran into its limit switch"):
+        bench.stage.move_to({"x_um": bench.stage.limits["x_um"][1]})
+    assert not bench.stage.is_homed
+    assert not bench.stage.is_moving
+    bench.stage.home()
+    assert true_x(bench, 100.0) == pytest.approx(100.0, abs=5.0)
+
+
+def test_stop_cuts_a_long_exposure_short() -> None:
+    bench = Bench(time_scale=1.0, stage=StageOptions(axis_names=("x_um",)))
+    bench.camera.set_exposure_ms(20_000.0)
+    threading.Timer(0.1, bench.camera.stop_sequence).start()
+    with pytest.raises(StoppedError):
+        bench.camera.snap()
+
+
+# The camera's electronics ---
+def test_a_region_is_cut_out_of_the_whole_frame() -> None:
+    bench = Bench()
+    whole = bench.lit()
+    roi = bench.camera.set_roi(Roi(40, 60, 100, 120))
+    np.testing.assert_array_equal(bench.counts(), whole[40:140, 60:180])
+    assert roi == Roi(40, 60, 100, 120)
+
+
+def test_binning_sums_light() -> None:
+    bench = Bench()
+    bench.camera.set_exposure_ms(0.2)
+    whole = bench.lit()
+    bench.camera.set_binning(2)
+    binned = bench.counts()
+    summed = whole.reshape(120, 2, 160, 2).sum(axis=(1, 3))
+    np.testing.assert_allclose(binned, summed, atol=4)
+
+
+def test_a_mosaic_separates_colours() -> None:
+    bench = Bench(camera=CameraOptions(color=True, crosstalk=0.1), source_diameter_um=3000.0)
+    assert bench.camera.pixel_formats[0].startswith("BayerRG")
+    bench.camera.set_exposure_ms(60.0)
+    # Blurred by a large source, neighbouring pixels of different colour get the same light.
+    red = bench.lit((255, 0, 0))
+    bright = red[0::2, 0::2] > 300
+    red_pixels, green_pixels, blue_pixels = (
+        plane[bright].mean() for plane in (red[0::2, 0::2], red[0::2, 1::2], red[1::2, 1::2])
+    )
+    assert bright.sum() > 100
+    assert red.max() < 4000
+    assert green_pixels == pytest.approx(0.1 * red_pixels, rel=0.1)
+    assert blue_pixels == pytest.approx(0.1 * red_pixels, rel=0.1)
+    green = bench.lit((0, 255, 0))
+    assert green[0::2, 1::2].sum() > 5 * green[0::2, 0::2].sum()
+
+
+def test_frames_repeat_from_session_to_session_but_not_within() -> None:
+    sessions = []
+    for _ in range(2):
+        bench = Bench(noise=1.0, fixed_pattern=True)
+        bench.lit()
+        sessions.append([bench.camera.snap().image for _ in range(2)])
+    np.testing.assert_array_equal(sessions[0][0], sessions[1][0])
+    np.testing.assert_array_equal(sessions[0][1], sessions[1][1])
+    assert not np.array_equal(sessions[0][0], sessions[0][1])
+    other = Bench(noise=1.0, fixed_pattern=True, seed=1)
+    other.lit()
+    assert not np.array_equal(other.camera.snap().image, sessions[0][0])
+
+
+def test_a_dark_frame_of_the_same_number_has_other_noise() -> None:
+    # Else subtracting it would take away read noise that no real dark frame takes away.
+    noises = []
+    for exposure_ms in (1.0, 2.0):
+        bench = Bench(noise=1.0)
+        bench.camera.set_exposure_ms(exposure_ms)
+        noise = bench.counts()
+        noises.append((noise - noise.mean()).ravel())
+    assert abs(np.corrcoef(*noises)[0, 1]) < 0.02
+
+
+def test_repeated_frames_have_noise_of_their_own() -> None:
+    bench = Bench(camera=CameraOptions(replay_frames=3), noise=1.0)
+    bench.lit()
+    bench.camera.set_exposure_ms(0.5)
+    images = [bench.camera.snap().image for _ in range(6)]
+    assert not np.array_equal(images[0], images[1])
+    np.testing.assert_array_equal(images[0], images[3])
+    bench.leds.off()
+    assert bench.camera.snap().image.max() < images[0].max()
+
+
+# The SLM ---
+def test_grey_levels_become_phase_through_the_table() -> None:
+    world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+    with SimulatedSlm(SlmOptions(shape=(2, 2), lut_gamma=1.5), world) as slm:
+        slm.display(np.array([[0, 255], [128, 64]], np.uint8))
+        full = 2 * np.pi * 255 / 256
+        expected = full * (np.array([[0, 255], [128, 64]]) / 255) ** 1.5
+        np.testing.assert_allclose(slm.phase_rad, expected, rtol=1e-5)
+
+
+# Truth, options ---
+def test_ground_truth_follows_the_scene() -> None:
+    bench = Bench(scene="beads", beads=5, bead_diameter_um=0.0)
+    truth = bench.world.ground_truth((240, 320), 13.0)
+    assert np.count_nonzero(truth) == 5
+    near, far = bench.world.scene.depths_um  # type: ignore[union-attr]
+    volume = bench.world.ground_truth((240, 320), 13.0, np.linspace(near, far, 4))
+    np.testing.assert_allclose(volume.sum(axis=0), truth, rtol=1e-5)
+    assert bench.world.ground_truth((240, 320), 13.0, color=True).shape == (240, 320, 3)
+    dimmer = bench.world.ground_truth((240, 320), 13.0, collected=True)
+    assert 0.5 < dimmer.sum() / truth.sum() < 1
+    bench.world.set_scene(None)
+    with pytest.raises(ValueError, match="no scene"):
+        bench.world.ground_truth((240, 320), 13.0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"preset": "huge"},
+        {"noise": -1},
+        {"fall_off": "table"},
+        {"fall_off": "table", "fall_off_table": [[0, 1], [0, 0.5]]},
+        {"fall_off_table": [[0, 1], [30, 0.5]]},
+        {"aperture_mm": [0, 1]},
+        {"mean_slope_deg": 45},
+        {"typo": 1},
+    ],
+)
+def test_wrong_options_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        WorldOptions.model_validate(wrong)
+
+
+def test_a_fall_off_table_is_what_the_pixels_do() -> None:
+    table = ((0.0, 1.0), (10.0, 0.6), (40.0, 0.0))
+    plain, shaded = Bench(), Bench(fall_off="table", fall_off_table=table)
+    for bench in (plain, shaded):
+        bench.stage.move_to({"x_um": float(np.tan(np.deg2rad(10.0)) * Z_UM)})
+    ratio = shaded.lit().sum() / plain.lit().sum()
+    assert ratio == pytest.approx(0.6, abs=0.03)
