@@ -39,13 +39,23 @@ class Problem:
     cancel: threading.Event | None
 
 
-Method = Callable[[Problem], Outcome]
+Solve = Callable[[Problem], Outcome]
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A way to solve a problem, and the tolerance at which its pictures were seen to have settled."""
+
+    solve: Solve
+    tolerance: float
+
+
 _methods: dict[str, Method] = {}
 
 
-def register(name: str, method: Method) -> None:
+def register(name: str, solve: Solve, *, tolerance: float = 2e-3) -> None:
     """Offer a method under a name."""
-    _methods[name] = method
+    _methods[name] = Method(solve, tolerance)
 
 
 def method_names() -> tuple[str, ...]:
@@ -78,5 +88,5 @@ def _wiener(p: Problem) -> Outcome:
 
 
 register("admm", _admm)
-register("fista", _fista)
+register("fista", _fista, tolerance=5e-4)
 register("wiener", _wiener)

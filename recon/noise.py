@@ -81,8 +81,9 @@ def estimate_deviation(measurement: npt.NDArray[Any], valid: npt.NDArray[np.bool
         return 0.0
     # A Gaussian's median magnitude is 0.6745 deviations.
     overall = float(np.nanmedian(best)) / 0.6745
-    if overall == 0 and np.array_equal(m[v], np.round(m[v])):
-        return float(np.sqrt(np.nanmean(best**2)))  # single photons: most stencils are empty
+    mean = float(np.mean(m[v]))
+    if overall == 0 and 0 < mean < 1 and np.array_equal(m[v], np.round(m[v])):
+        return float(np.sqrt(mean))  # single photons, so few that most stencils are empty
     brightness, variance = _tiles(np.where(v, m, np.nan), best)
     if len(brightness) < 4 * GROUPS:
         return overall

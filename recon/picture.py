@@ -50,7 +50,7 @@ def reconstruct(
     tau: float | None = None,
     iterations: int | None = None,
     time_s: float | None = None,
-    tolerance: float = 1e-3,
+    tolerance: float | None = None,
     stop_at_noise: bool = False,
     noise: NoiseModel | float | None = None,
     background: npt.ArrayLike | None = None,
@@ -80,8 +80,8 @@ def reconstruct(
         for l1 a tau of 1 leaves nothing. Default: from the measurement's noise. For ``"wiener"``: its
         regularisation (see :func:`recon.solvers.wiener`), by default cross-validated.
     iterations, time_s, tolerance : optional
-        When to stop: count, wall seconds, relative change an iteration, whichever comes first. Without
-        ``iterations`` and ``time_s``: 200 iterations.
+        When to stop: count, wall seconds, relative change an iteration, whichever comes first. Default: the
+        method's own tolerance and, without ``time_s``, 200 iterations.
     stop_at_noise : bool
         Also stop as soon as the residual is down to the expected noise.
     noise : NoiseModel or float, optional
@@ -126,7 +126,7 @@ def reconstruct(
         rules = StoppingRules(
             iterations=200 if iterations is None and time_s is None else iterations,
             time_s=time_s,
-            tolerance=tolerance,
+            tolerance=method_named(method).tolerance if tolerance is None else tolerance,
             noise_norm=problem.noise_norm if stop_at_noise else None,
         )
     except ValueError as error:
@@ -136,7 +136,7 @@ def reconstruct(
         if callback is not None:
             callback(record, lambda: problem.picture(solver.solution, field))
 
-    outcome = method_named(method)(
+    outcome = method_named(method).solve(
         Problem(
             operator=problem.operator,
             data=problem.data,

@@ -220,8 +220,10 @@ def _soft_pair(tx: Array, ty: Array, threshold: Any, isotropic: bool) -> tuple[A
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Square root of a ratio of sums of squares; 0 for nothing of nothing."""
-    return float(np.sqrt(part / whole)) if whole > 0 else 0.0 if part == 0 else np.inf
+    """Square root of a ratio of sums of squares: 0 for nothing of nothing, 1 for something of nothing."""
+    if whole == 0:
+        return 0.0 if part == 0 else 1.0
+    return float(np.sqrt(part / whole))
 
 
 def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
