@@ -10,7 +10,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +40,19 @@ class ImageFile:
         One image, or a stack with the images along the first axis; see the module.
     notes : tuple of str
         What reading left out or converted, in sentences without full stop.
+    metadata : mapping
+        What :func:`write_image` kept with the image; empty for images from elsewhere.
     """
 
     path: Path
     pixels: Pixels
     notes: tuple[str, ...] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether its metadata say that no hardware took it."""
+        return bool(self.metadata.get("simulated"))
 
     @property
     def is_colour(self) -> bool:
@@ -70,7 +78,7 @@ def read_image(path: Path | str) -> ImageFile:
     array, notes = _decode(path)
     array, more = _one_image(path, array)
     pixels, converted = _standard_dtype(path, array)
-    return ImageFile(path, pixels, (*notes, *more, *converted))
+    return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
 
 
 def read_stack(path: Path | str) -> ImageFile:
@@ -149,6 +157,20 @@ def check_suffix(path: Path | str) -> None:
     if suffix not in WRITABLE:
         found = f"{suffix!r} is no format to write images in" if suffix else "the name has no suffix"
         raise FileError(path, f"{found}; choose one of {', '.join(WRITABLE)}.")
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    """Return the metadata kept with an image; empty where there are none of ours."""
+    try:
+        if path.suffix.lower() in (".tif", ".tiff"):
+            with tifffile.TiffFile(path) as tiff:
+                text = tiff.pages.first.description
+        else:
+            text = side_car(path).read_text("utf-8")
+        metadata = json.loads(text)
+    except (OSError, ValueError, tifffile.TiffFileError):
+        return {}  # another program's description, or none: the pixels were read all the same
+    return metadata if isinstance(metadata, dict) else {}
 
 
 # Reading -----------------------------------------------------------------------------------------

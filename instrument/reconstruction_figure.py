@@ -28,7 +28,7 @@ def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: in
 
 
 def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
-    psf = np.moveaxis(job.calibration.psfs[0], 0, -1)
+    psf = np.moveaxis(job.calibration.psfs[_used_psf(result, job)], 0, -1)
     image = np.rot90(result.image, rotate_deg // 90)
     height, width = image.shape[:2]
     panels = (
@@ -42,7 +42,13 @@ def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
     if result.stop_reason is not None:
         facts.append(("stopped", str(result.stop_reason)))
     facts.append(("time", f"{result.seconds:.1f} s"))
-    return Summary("Reconstruction", panels, _convergence(result), lines=facts)
+    return Summary("Reconstruction", panels, _convergence(result), lines=facts, simulated=job.simulated)
+
+
+def _used_psf(result: Reconstruction, job: Job) -> int:
+    """Return which of the calibration's PSFs the reconstruction took."""
+    z_um = result.provenance.get("psf_z_um")
+    return 0 if z_um is None else int(np.argmin(np.abs(job.calibration.source_positions_um[:, 2] - z_um)))
 
 
 def _shown(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -82,7 +82,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
         When a file cannot be written (a full disk), naming it.
     """
     image = np.rot90(result.image, rotate_deg // 90)
-    write_image(outputs.image, image)
+    write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
     pixels, white = preview(image)
     write_image(outputs.preview, pixels)
     record = reconstruction_record(result, job) | {
@@ -105,6 +105,7 @@ def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
     record = {
         "program": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "simulated": job.simulated,
         "inputs": job.provenance,
         "method": result.method,
         "prior": result.prior,

@@ -54,6 +54,8 @@ class Job:
     warnings : tuple of str
     provenance : mapping
         Files with checksums and every setting, JSON-compatible.
+    simulated : bool
+        Whether any of the input is known to come from the simulated bench.
     """
 
     measurement: FloatImage
@@ -62,6 +64,7 @@ class Job:
     valid: npt.NDArray[np.bool_] | None = None
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    simulated: bool = False
 
 
 def job_from_files(
@@ -119,6 +122,7 @@ def job_from_files(
             "binning": factor,
             "erased": erased.reason,
         },
+        psf.is_simulated or image.is_simulated,
     )
 
 
@@ -171,6 +175,7 @@ def job_from_calibration(
             "binning": factor,
             "erased": erased.reason,
         },
+        bool(calibration.provenance.get("simulated")) or image.is_simulated,
     )
 
 
@@ -187,7 +192,9 @@ def find_calibration(folder: Path) -> Path:
         raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
     if is_calibration(folder):
         return folder
-    inside = sorted(path.parent for path in folder.glob("*/calibration.json"))
+    # In the folder, in a run in it, or in that run's calibration folder (a demo's).
+    patterns = ("*/calibration.json", "*/*/calibration.json")
+    inside = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
     if len(inside) != 1:
         found = (
             f"{len(inside)} calibrations ({', '.join(p.name for p in inside)})"

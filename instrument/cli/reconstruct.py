@@ -198,6 +198,8 @@ def reconstruct(
         outputs.check(job.measurement.size, overwrite=force)
         for name, text in job.notes.items():
             typer.echo(f"{name:<12}{text}")
+        if job.simulated:
+            typer.echo("SIMULATED   PSF or image come from the simulated bench")
         for warning in job.warnings:
             typer.echo(f"Warning: {warning}", err=True)
         result = _solve(job, method, prior, tau, iterations, time_s, tolerance, z_mm)

@@ -130,6 +130,7 @@ def _photograph(bench: Bench, average: int) -> Snapshot:
 def _metadata(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
     return {
         "bench": bench.label,
+        "simulated": bool(bench.simulated_kinds),
         "camera": str(bench.camera.identity),
         "light": light.value,
         "average": taken.average,

@@ -21,7 +21,7 @@ from scipy.signal import convolve2d
 
 from instrument.calibration_file import save_calibration
 from instrument.cli import main
-from instrument.images import write_image
+from instrument.images import read_image, write_image
 from recon.types import Calibration, Geometry
 
 RNG = np.random.default_rng(3)
@@ -64,6 +64,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+SHARP = ("--iterations", "60", "--tau", "1e-5", "--out", "out.tif")
 QUICK = ("--iterations", "30", "--out", "out.tif")
 
 
@@ -143,17 +144,7 @@ def test_options(here: Path, options: tuple[str, ...]) -> None:
 
 def test_saturated_pixels_do_not_spoil_the_picture(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_image(here / "burnt.tif", np.minimum(counts(photograph(), 20000, "uint16"), 4095))
-    words = [
-        "reconstruct",
-        "--psf",
-        "psf.tif",
-        "--image",
-        "burnt.tif",
-        "--iterations",
-        "60",
-        "--out",
-        "out.tif",
-    ]
+    words = ["reconstruct", "--psf", "psf.tif", "--image", "burnt.tif", *SHARP]
     assert main(words) == 0
     output = capsys.readouterr()
     assert "saturated pixels" in output.out
@@ -166,6 +157,22 @@ def test_saturated_pixels_do_not_spoil_the_picture(here: Path, capsys: pytest.Ca
     for source in SOURCES:
         assert erased[source] == pytest.approx(truth, rel=0.1)
         assert used[source] < 0.5 * truth
+
+
+def test_what_comes_from_the_simulated_bench_stays_labelled(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["reconstruct", "--psf", "psf.tif", "--iterations", "5", "--force"]
+    assert main([*words, "--image", "raw.tif", "--out", "real.tif"]) == 0
+    assert "SIMULATED" not in capsys.readouterr().out
+    assert json.loads((here / "real.json").read_text())["simulated"] is False
+    for name in ("sim.tif", "sim.png"):
+        write_image(here / name, counts(photograph(), 20000, "uint16"), {"simulated": True})
+        assert main([*words, "--image", name, "--out", "out.tif"]) == 0
+        assert "SIMULATED" in capsys.readouterr().out
+        assert json.loads((here / "out.json").read_text())["simulated"] is True
+        assert read_image(here / "out.tif").is_simulated
+        (here / "sim.json").unlink(missing_ok=True)
 
 
 def test_the_written_picture_can_be_turned(here: Path) -> None:
@@ -188,17 +195,7 @@ def test_the_written_picture_can_be_turned(here: Path) -> None:
 
 
 def test_a_random_share_of_the_pixels_is_enough(here: Path) -> None:
-    words = [
-        "reconstruct",
-        "--psf",
-        "psf.tif",
-        "--image",
-        "raw.tif",
-        "--iterations",
-        "60",
-        "--out",
-        "out.tif",
-    ]
+    words = ["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", *SHARP]
     assert main([*words, "--erasures", "0.5"]) == 0
     picture = tifffile.imread(here / "out.tif")
     assert brightest(picture) == set(SOURCES)

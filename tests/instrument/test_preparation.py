@@ -23,7 +23,7 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
-from instrument.reconstruction_job import job_from_calibration, job_from_files
+from instrument.reconstruction_job import find_calibration, job_from_calibration, job_from_files
 from recon.types import Calibration, Geometry
 
 
@@ -184,15 +184,20 @@ def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
     background = np.full((1, 30, 40), 34, np.float32)
     positions = np.array([[0, 0, 1e4], [0, 0, 2e4]], np.float64)
     calibration = Calibration(psfs, positions, background, Geometry(pixel_pitch_um=4.0))
-    save_calibration(calibration, tmp_path / "run" / "calibration")
+    save_calibration(calibration, tmp_path / "demo" / "run" / "calibration")
+    run, demo = tmp_path / "demo" / "run", tmp_path / "demo"
+    assert find_calibration(demo) == find_calibration(run) == find_calibration(run / "calibration")
     write_image(tmp_path / "raw.tif", psf_pixels())
-    job = job_from_calibration(tmp_path / "run", tmp_path / "raw.tif", binning=2)
+    job = job_from_calibration(run, tmp_path / "raw.tif", binning=2)
     assert job.measurement.shape == job.calibration.psfs.shape[-2:] == (15, 20)
     np.testing.assert_allclose(job.measurement, job.calibration.psfs[0, 0], atol=1e-3)
     assert job.calibration.geometry.pixel_pitch_um == 8.0
     write_image(tmp_path / "other.tif", psf_pixels(shape=(50, 80)))
     with pytest.raises(FileError, match="no whole binning"):
-        job_from_calibration(tmp_path / "run", tmp_path / "other.tif")
+        job_from_calibration(run, tmp_path / "other.tif")
+    save_calibration(calibration, tmp_path / "demo" / "second" / "calibration")
+    with pytest.raises(FileError, match="holds 2 calibrations"):
+        find_calibration(demo)
 
 
 @pytest.mark.parametrize(("name", "pattern"), [("absent", "does not exist"), (".", "no calibration")])
