@@ -25,7 +25,7 @@ from typing import Any
 
 from instrument.bench import open_bench
 from instrument.config_file import parse_config
-from instrument.recorder import record
+from instrument.recording import record
 
 SIZES = {"0.3 MP": (480, 640), "1.3 MP": (1024, 1280), "5 MP": (2048, 2560)}
 BENCH = """

@@ -17,10 +17,9 @@ from typing import Any
 
 import serial
 
-from drivers.claim import holder_of
-from drivers.device import port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
 from drivers.framing import Framer, LineFramer, Matcher, Verdict
+from drivers.serial_errors import port_error
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.1
@@ -120,7 +119,7 @@ class SerialTransport:
                     self.port, self._baud_rate, timeout=_POLL_S, write_timeout=self._timeout_s, exclusive=True
                 )
             except (serial.SerialException, OSError, ValueError) as error:
-                raise self._not_opened(error) from error
+                raise port_error(self.device, self.port, error) from error
             self._failure = None
             self.unmatched = 0
             self._in_step = self._settle_s == 0 and self._probe is None
@@ -334,24 +333,6 @@ class SerialTransport:
             "Check its cable and power, then reconnect.",
         )
         return self._failure
-
-    def _not_opened(self, error: Exception) -> DeviceError:
-        text = str(error)
-        if "exclusively lock" in text or "busy" in text.lower():
-            holder = holder_of(port_claim(self.port))
-            owner = f"in use by {holder}" if holder else "in use by another program"
-            return DeviceError(self.device, f"{self.port} is {owner}.", "Close that program.")
-        if "No such file" in text or ("could not open port" in text and "Permission" not in text):
-            return DeviceError(
-                self.device, f"there is no port {self.port}.", "Is it plugged in and switched on?"
-            )
-        if "Permission" in text:
-            return DeviceError(
-                self.device,
-                f"{self.port} may not be used (permission denied).",
-                "Join the group that owns it (Debian: sudo adduser $USER dialout) and log in again.",
-            )
-        return DeviceError(self.device, f"{self.port} cannot be opened: {text}.", "Check port and baud rate.")
 
 
 def _shown(data: bytes, longest: int = 60) -> str:

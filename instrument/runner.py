@@ -25,6 +25,7 @@ from instrument.bench import Bench
 from instrument.ending import end_run
 from instrument.photograph import Snapshot
 from instrument.plan import Plan, Step
+from instrument.safety import StepsFailedError
 from instrument.step_settings import StepSettings
 from instrument.store import FinishReason, FrameToStore, Run, RunWriter
 
@@ -184,15 +185,20 @@ class Runner:
         self._stopping.set()
         with self._condition:
             self._condition.notify_all()
-        self._bench.stop()
-        if self._thread is None or self._thread is threading.current_thread():
-            return
-        # The executing thread may have been about to start a move or an exposure when the stop came: repeat
-        # until it has seen that it must end.
+        failure: StepsFailedError | None = None
         deadline_s = time.monotonic() + _STOP_WAIT_S
-        while not self._finished.wait(_STOP_REPEAT_S) and time.monotonic() < deadline_s:
-            if self.status.state in (RunState.RUNNING, RunState.PAUSED):
-                self._bench.stop()
+        # Once is not enough: the executing thread may have been about to start a move or an exposure.
+        while True:
+            if self.status.state is not RunState.ENDING:
+                try:
+                    self._bench.stop()
+                except StepsFailedError as error:
+                    failure = error
+            executes_here = self._thread in (None, threading.current_thread())
+            if executes_here or self._finished.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
+                break
+        if failure is not None:
+            raise failure
 
     # In one thread -------------------------------------------------------------------------------
     def execute(self) -> Run:
@@ -206,6 +212,8 @@ class Runner:
         KeyboardInterrupt, SystemExit
             After the run was marked as aborted and the bench made safe.
         """
+        if self._thread is not None:
+            raise RuntimeError("A runner executes its plan once; make a new one (or resume the run).")
         self._thread = threading.current_thread()
         self._started_s = time.monotonic()
         self._report(state=RunState.RUNNING)

@@ -12,7 +12,7 @@ from rich.table import Table
 from instrument.cli.app import BenchOption, command_app, examples
 from instrument.config_file import load_config
 from instrument.store import Run, RunError
-from instrument.store.run import STATE
+from instrument.store.layout import STATE
 
 app = command_app()
 

@@ -11,7 +11,8 @@ from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
 from instrument.cli.words import duration, size
-from instrument.recorder import RecordingStatus, prepare_recording
+from instrument.recorder import RecordingStatus
+from instrument.recording import prepare_recording
 from instrument.store import Run
 
 app = command_app()

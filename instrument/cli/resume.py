@@ -12,7 +12,7 @@ from instrument.cli.progress import progress_bar
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.resume import prepare_resume
 from instrument.store import FinishReason, Run, RunCondition, RunWriter
-from instrument.store.run import BENCH_TOML
+from instrument.store.layout import BENCH_TOML
 
 app = command_app()
 

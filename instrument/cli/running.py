@@ -13,6 +13,7 @@ from instrument.cli.progress import progress_bar
 from instrument.cli.words import duration, size
 from instrument.plan import Plan
 from instrument.runner import Runner, RunState, RunStatus
+from instrument.safety import StepsFailedError
 from instrument.store import Run, RunCondition
 
 
@@ -37,8 +38,17 @@ def carry_out(bench: Bench, runner: Runner) -> Run:
             bar.update(task, completed=status.done, note=_note(status, free))
 
         runner.on_progress = report
-        toggle = lambda: runner.resume() if runner.is_pausing else runner.pause()  # noqa: E731
-        with keys({"p": toggle, "q": runner.abort, "s": runner.stop}):
+
+        def toggle() -> None:
+            runner.resume() if runner.is_pausing else runner.pause()
+
+        def stop() -> None:
+            try:
+                runner.stop()
+            except StepsFailedError as failure:
+                typer.echo(str(failure), err=True)
+
+        with keys({"p": toggle, "q": runner.abort, "s": stop}):
             run = runner.execute()
     _last_words(bench, run, runner.status)
     return run

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PositiveFloat, StringConstraints, ValidationError, model_validator
 
 from drivers.led_array import LedPattern
-from instrument.plan.errors import PlanError
+from instrument.plan.errors import PlanError, plan_problems
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^/\x00-\x1f]+$")]
@@ -295,24 +295,3 @@ class Plan(PlanData):
             return cls.model_validate(data)
         except ValidationError as error:
             raise PlanError(name, plan_problems(error)) from None
-
-
-def plan_problems(error: ValidationError) -> tuple[str, ...]:
-    """Return a validation's findings as sentences that name the place."""
-    mistakes = error.errors(include_url=False)
-    places = [found["loc"] for found in mistakes]
-    return tuple(
-        f"{_place(found['loc'])}: {found['msg'].removeprefix('Value error, ')}"
-        + (f" (found {found['input']!r:.80})" if not isinstance(found["input"], Mapping) else "")
-        for found in mistakes
-        # A list whose every item is wrong counts as empty too; its items' own mistakes say it better.
-        if found["type"] != "too_short"
-        or not any(place[: len(found["loc"])] == found["loc"] != place for place in places)
-    )
-
-
-def _place(location: tuple[int | str, ...]) -> str:
-    return (
-        "".join(f"[{item}]" if isinstance(item, int) else f".{item}" for item in location).lstrip(".")
-        or "plan"
-    )

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import hashlib
 import os
-import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,11 +17,11 @@ import numpy.typing as npt
 from drivers.frame import FrameMetadata
 from instrument.atomic import sync_folder, write_bytes
 from instrument.plan import Plan
-from instrument.store.durable import AppendOnlyLog, make_folder, write_json
+from instrument.store.durable import AppendOnlyLog, write_json
+from instrument.store.folder import disk_remedy, free_name, lock_run, plan_with_copies, slug
 from instrument.store.frame_array import FrameArray
 from instrument.store.frame_record import FrameRecord, Gap
-from instrument.store.provenance import provenance
-from instrument.store.run import (
+from instrument.store.layout import (
     BENCH,
     BENCH_TOML,
     FORMAT,
@@ -34,12 +30,11 @@ from instrument.store.run import (
     LOG,
     PLAN,
     PROVENANCE,
-    SLM_IMAGES,
     STATE,
     FinishReason,
-    Run,
-    RunError,
 )
+from instrument.store.provenance import provenance
+from instrument.store.run import Run, RunError
 
 _FIRST_CAPACITY = 256
 """Frames that a recording's array is made for at first; it doubles as needed."""
@@ -118,12 +113,12 @@ class RunWriter:
         now = datetime.now(UTC)
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            path = _free_name(parent, f"{now.astimezone():%Y-%m-%d_%H-%M-%S}_{_slug(label)}")
+            path = free_name(parent, f"{now.astimezone():%Y-%m-%d_%H-%M-%S}_{slug(label)}")
             draft = parent / f".{path.name}.draft"
             draft.mkdir()
             try:
                 if plan is not None:
-                    write_bytes(draft / PLAN, _with_copies(plan, draft).to_json().encode())
+                    write_bytes(draft / PLAN, plan_with_copies(plan, draft).to_json().encode())
                 write_json(draft / BENCH, bench.config)
                 write_bytes(draft / BENCH_TOML, bench.toml.encode())
                 origin = {
@@ -147,14 +142,16 @@ class RunWriter:
                 write_json(draft / STATE, state)
                 write_bytes(draft / LOG, b"")
                 write_bytes(draft / LOCK, b"")
-                lock = _lock(draft)
+                lock = lock_run(draft)
                 draft.rename(path)
             except BaseException:
                 shutil.rmtree(draft, ignore_errors=True)
                 raise
             sync_folder(parent)
         except OSError as error:
-            raise RunError(parent, f"no run can be kept there: {error.strerror}.", _remedy(error)) from error
+            raise RunError(
+                parent, f"no run can be kept there: {error.strerror}.", disk_remedy(error)
+            ) from error
         return cls(path, lock)
 
     @classmethod
@@ -168,12 +165,12 @@ class RunWriter:
         """
         path = Run.open(path).path
         try:
-            writer = cls(path, _lock(path))
+            writer = cls(path, lock_run(path))
             for leftover in path.glob(".*"):  # of a write that a crash cut off
                 if leftover.is_file():
                     leftover.unlink()
         except OSError as error:
-            raise RunError(path, f"cannot be continued: {error.strerror}.", _remedy(error)) from error
+            raise RunError(path, f"cannot be continued: {error.strerror}.", disk_remedy(error)) from error
         return writer
 
     def start(self, **fields: Any) -> None:
@@ -206,7 +203,7 @@ class RunWriter:
         except OSError as error:
             first = frames[0].index
             raise RunError(
-                self.path, f"frame {first} could not be stored: {error.strerror}.", _remedy(error)
+                self.path, f"frame {first} could not be stored: {error.strerror}.", disk_remedy(error)
             ) from error
         except ValueError as error:
             raise RunError(self.path, f"does not take a frame: {error}") from error
@@ -239,7 +236,7 @@ class RunWriter:
             )
         except OSError as failure:
             raise RunError(
-                self.path, f"its array could not be trimmed: {failure.strerror}.", _remedy(failure)
+                self.path, f"its array could not be trimmed: {failure.strerror}.", disk_remedy(failure)
             ) from failure
         finally:
             self.close()
@@ -282,7 +279,7 @@ class RunWriter:
             self._log.append([record])
         except OSError as error:
             raise RunError(
-                self.path, f"its log could not be written: {error.strerror}.", _remedy(error)
+                self.path, f"its log could not be written: {error.strerror}.", disk_remedy(error)
             ) from error
 
     def _set_state(self, **changes: Any) -> None:
@@ -290,49 +287,6 @@ class RunWriter:
             write_json(self.path / STATE, self._state | changes)
         except OSError as error:
             raise RunError(
-                self.path, f"its state could not be written: {error.strerror}.", _remedy(error)
+                self.path, f"its state could not be written: {error.strerror}.", disk_remedy(error)
             ) from error
         self._state.update(changes)
-
-
-def _with_copies(plan: Plan, folder: Path) -> Plan:
-    """Copy a plan's SLM images into a folder, so that the run can be continued and understood later."""
-    if plan.slm_images:
-        make_folder(folder / SLM_IMAGES)
-    copies: dict[Path, Path] = {}
-    for path in plan.slm_images:
-        data = path.read_bytes()
-        copies[path] = Path(SLM_IMAGES) / f"{hashlib.sha256(data).hexdigest()[:16]}{path.suffix}"
-        write_bytes(folder / copies[path], data)
-    return plan.with_slm_images(copies.__getitem__)
-
-
-def _lock(path: Path) -> int:
-    """Return a handle that holds the run's lock until it is closed or the process ends, however it ends."""
-    handle = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise RunError(path, "another program is writing to this run.", "Wait until it ends.") from None
-    return handle
-
-
-def _free_name(parent: Path, name: str) -> Path:
-    path, number = parent / name, 1
-    while path.exists() or (parent / f".{path.name}.draft").exists():
-        number += 1
-        path = parent / f"{name}-{number}"
-    return path
-
-
-def _slug(label: str) -> str:
-    return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"
-
-
-def _remedy(error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "Free some disk space; diffuserbench resume continues the run."
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return "Choose a folder that you may write to."
-    return ""

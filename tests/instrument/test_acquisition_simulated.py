@@ -13,7 +13,7 @@ from instrument.acquire import acquire, prepare
 from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
 from instrument.plan import OFF, SOURCE, Part, Plan, SourceGrid
-from instrument.recorder import record
+from instrument.recording import record
 from instrument.resume import prepare_resume
 from instrument.runner import RunStatus
 from instrument.store import Run, RunCondition

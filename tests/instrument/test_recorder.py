@@ -16,7 +16,8 @@ from drivers.errors import DeviceError
 from instrument.bench import Bench
 from instrument.config_file import parse_config
 from instrument.errors import BenchError
-from instrument.recorder import Recorder, RecordingStatus, prepare_recording, record
+from instrument.recorder import Recorder, RecordingStatus
+from instrument.recording import prepare_recording, record
 from instrument.store import FinishReason, FrameToStore, Run, RunCondition, RunError, RunWriter
 from tests.mocks.devices import MockWorld
 from tests.mocks.free_running import FreeRunningCamera

@@ -15,6 +15,7 @@ from instrument.bench import Bench
 from instrument.config_file import parse_config
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
 from instrument.runner import RunState, RunStatus
+from instrument.safety import StepsFailedError
 from instrument.store import FinishReason, RunCondition
 from tests.mocks.devices import MockDevice, MockWorld
 
@@ -231,3 +232,38 @@ def test_repeats_wait_for_their_interval_dark(tmp_path: Path) -> None:
         assert between[:4] == ["camera.snap", "led_array.off", "led_array.set_pattern", "camera.snap"]
     times = [run.metadata(i).host_time_ns for i in range(2)]
     assert times[1] - times[0] > 0.9 * interval_s * 1e9
+
+
+def test_stop_tries_again_until_the_run_has_ended_and_names_what_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exposing, stopped = threading.Event(), threading.Event()
+    with open_mock_bench() as bench:
+
+        def hang(name: str, count: int) -> None:
+            if name == "camera.snap" and count == 3:
+                exposing.set()
+                assert stopped.wait(10)
+            if name == "camera.stop_sequence" and count == 3:
+                stopped.set()
+            if name == "stage.stop" and count == 1:
+                raise DeviceError("stage (mock)", "did not answer.")
+
+        on_call(monkeypatch, hang)
+        runner = prepare(bench, plan(), tmp_path)
+        thread = threading.Thread(target=runner.execute)
+        thread.start()
+        assert exposing.wait(10)
+        with pytest.raises(StepsFailedError, match="did not answer"):
+            runner.stop()
+        thread.join(10)
+        assert not thread.is_alive()
+    assert runner.status.reason is FinishReason.STOPPED
+
+
+def test_a_runner_executes_once(tmp_path: Path) -> None:
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path)
+        runner.execute()
+        with pytest.raises(RuntimeError, match="once"):
+            runner.execute()
