@@ -14,7 +14,7 @@ def remove_low_frequencies(
 
     The dissertation's microscope does so with ``order=10`` against autofluorescence and unfiltered excitation
     light. It also removes the slowly varying part of the PSF itself: right for a few sharp spots on a large
-    sensor, wrong for a caustic that fills a good part of it (docs/decisions/0020-psf-background.md).
+    sensor, wrong for a caustic that fills a good part of it (docs/decisions/0004-psf-background.md).
 
     Parameters
     ----------

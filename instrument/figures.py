@@ -113,7 +113,8 @@ def summary_figure(summary: Summary) -> Figure:
 def save_figure(figure: Figure, path: Path | str) -> Path:
     """Write a figure as PNG (or what the name's ending says) and return its path."""
     target = Path(path)
-    figure.savefig(target)
+    is_png = target.suffix.lower() == ".png"
+    figure.savefig(target, pil_kwargs={"optimize": True} if is_png else None)
     return target
 
 

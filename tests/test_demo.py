@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,6 +24,7 @@ from calibration_routines.demo_settings import DemoSettings
 from drivers.errors import DeviceError
 from instrument.bench import Bench
 from instrument.calibration_file import load_calibration
+from instrument.cli import main
 from instrument.errors import FileError
 from instrument.store import Run, RunCondition
 
@@ -117,6 +120,25 @@ def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, 
     assert compare(picture[::-1], truth, field).psnr_db < right - 5
     assert compare(picture[:, ::-1], truth, field).psnr_db < right - 5
     assert compare(np.roll(picture, 2, axis=1), truth, field).psnr_db < right - 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_demo_as_it_is_keeps_its_promise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("instrument.cli.demo.DemoSettings", partial(DemoSettings, time_scale=0.0))
+    assert main(["demo", "--out", str(tmp_path), "--reconstruction-s", "30"]) == 0
+    out = capsys.readouterr().out
+    found = re.search(r"PSNR ([0-9.]+) dB, SSIM ([0-9.]+) against the ground truth", out)
+    assert found
+    assert float(found[1]) > 28  # promised: 24
+    assert float(found[2]) > 0.8
+    assert "SIMULATED" in out
+    for stage in ("home the stage", "dark frames and axial sweep", "photograph the scene", "reconstruct"):
+        assert re.search(rf"[0-9.]+  {stage}", out)
+    (folder,) = tmp_path.iterdir()
+    assert (folder / "summary.png").stat().st_size < 400_000
 
 
 STOP, FAIL = KeyboardInterrupt(), DeviceError("camera (simulated)", "was unplugged.")
