@@ -33,7 +33,9 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
     rows = -(-len(indices) // COLUMNS)
     figure = Figure(figsize=(3.2 * COLUMNS, 2.9 * rows + 0.5), layout="constrained")
     mark = "  SIMULATED" if run.is_simulated else ""
-    figure.suptitle(f"{run.path.name}: {run.condition}, {len(stored)} of {run.n_frames} frames{mark}")
+    figure.suptitle(
+        f"{run.path.name}: {run.condition}, {len(stored)} of {run.n_frames} frames{mark}  (red: saturated)"
+    )
     labels = {step.index: step.label for step in run.steps()} if run.plan is not None else {}
     for place, index in enumerate(indices, start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)

@@ -63,7 +63,9 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         facts.append(("saturated", f"{len(saturated)} frames, the first is {saturated[0]}"))
     facts.append(("started", f"{run.state['started_utc']} (UTC)"))
     facts += [(kind, str(device)) for kind, device in origin["devices"].items()]
-    facts.append(("software", f"diffuserbench {origin['packages']['diffuserbench']}, {origin['python']}"))
+    facts.append(
+        ("software", f"diffuserbench {origin['packages']['diffuserbench']}, Python {origin['python']}")
+    )
     if origin["git_commit"]:
         facts.append(("commit", origin["git_commit"]))
     facts.append(("host", origin["host"]))
