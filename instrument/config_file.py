@@ -24,7 +24,7 @@ from instrument.config import (
     SharedConfig,
     Table,
 )
-from instrument.config_mistakes import Mistakes, nearest
+from instrument.config_mistakes import Mistakes, nearest, nearest_name
 from instrument.errors import ConfigError, ConfigProblem, FileError
 from instrument.toml_lines import key_lines
 
@@ -118,46 +118,46 @@ class _Reader:
         if table is None:
             return None
         name = table.pop("driver", None)
+        common = DEVICE_TABLES[kind]
+        settings_table = {key: table[key] for key in table if key in common.model_fields}
+        own = {key: value for key, value in table.items() if key not in common.model_fields}
         driver = self._driver(kind, name)
-        if driver is None:
+        if driver is None:  # the keys that every driver of this kind has can be checked all the same
             self._a_driver_is_unknown = True
+            self._validate(common, settings_table, (kind,), common.model_fields)
             return None
         if driver.Shared is not None:
             self._shared[driver.Shared.table] = driver.Shared
-        common = DEVICE_TABLES[kind]
         known = ["driver", *common.model_fields, *driver.Options.model_fields]
-        own = {key: value for key, value in table.items() if key not in common.model_fields}
-        settings = self._validate(
-            common, {key: table[key] for key in table if key in common.model_fields}, (kind,), known
-        )
+        settings = self._validate(common, settings_table, (kind,), known)
         options = self._validate(driver.Options, own, (kind,), known)
         if settings is None or options is None:
             return None
-        return DeviceConfig(kind, name, driver, options, settings)
+        return DeviceConfig(kind, str(name), driver, options, settings)
 
     def _driver(self, kind: Kind, name: object) -> type[Device] | None:
-        names = driver_names(kind)
-        available = f"Drivers for a {kind.replace('_', ' ')}: {', '.join(names) or 'none'}."
+        """Return the driver; of a misspelt name the nearest one, so that the table's other mistakes show."""
+        where, names = f"[{kind}] driver", driver_names(kind)
+        available = f"Drivers there are: {', '.join(names) or 'none'}."
         if name is None:
-            self.mistakes.add((kind,), f"[{kind}] driver", f"this key is missing. {available}")
-        elif not isinstance(name, str):
-            self.mistakes.add(
-                (kind, "driver"), f"[{kind}] driver", f"must be a text, not {name!r}. {available}"
-            )
-        elif name not in names:
-            self.mistakes.add(
-                (kind, "driver"),
-                f"[{kind}] driver",
-                f"no driver is called {name!r}.{nearest(name, names)} {available}",
-            )
-        else:
-            try:
-                return load_driver(kind, name)
-            except DeviceError as error:
-                self.mistakes.add(
-                    (kind, "driver"), f"[{kind}] driver", f"{error.problem} {error.remedy}".strip()
-                )
-        return None
+            self.mistakes.add((kind,), where, f"this key is missing. {available}")
+            return None
+        if not isinstance(name, str):
+            self.mistakes.add((kind, "driver"), where, f"must be a text, not {name!r}. {available}")
+            return None
+        meant = name
+        if name not in names:
+            hint = nearest(name, names)
+            self.mistakes.add((kind, "driver"), where, f"no driver is called {name!r}.{hint} {available}")
+            close = nearest_name(name, names)
+            if close is None:
+                return None
+            meant = close
+        try:
+            return load_driver(kind, meant)
+        except DeviceError as error:
+            self.mistakes.add((kind, "driver"), where, f"{error.problem} {error.remedy}".strip())
+            return None
 
     def shared_parts(self) -> dict[str, SharedConfig]:
         shared = {}

@@ -69,10 +69,16 @@ class Mistakes:
         return path
 
 
+def nearest_name(name: str, names: Iterable[str]) -> str | None:
+    """Return the name that was probably meant, or None where none is close."""
+    close = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.6)
+    return close[0] if close else None
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """Return ``" Did you mean 'x'?"``, or nothing where no name is close."""
-    close = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.6)
-    return f" Did you mean {close[0]!r}?" if close else ""
+    close = nearest_name(name, names)
+    return f" Did you mean {close!r}?" if close else ""
 
 
 def _sentence(detail: ErrorDetails, names: Sequence[str], model: type[BaseModel] | None) -> str:

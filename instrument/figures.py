@@ -47,6 +47,8 @@ class Convergence:
     reached: str = ""
     """A word or two at the last point, e.g. ``"26.1 dB"``."""
     x_label: str = "seconds of reconstruction"
+    log: bool = False
+    """Whether the values' axis is logarithmic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +169,8 @@ def _draw_convergence(axes: Axes, convergence: Convergence) -> None:
         )
         axes.margins(x=0.02, y=0.18)
         axes.set_xlim(left=0.0)
+    if convergence.log:
+        axes.set_yscale("log")
     axes.set_xlabel(convergence.x_label, fontsize=10, color=_INK)
     axes.set_title(convergence.label, fontsize=13, color=_INK, loc="left", pad=5)
     axes.grid(True, color="#e3e8ec", linewidth=0.8)

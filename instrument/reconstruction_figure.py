@@ -56,8 +56,8 @@ def _shown(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def _convergence(result: Reconstruction) -> Convergence:
-    known = [(r.seconds, float(np.log10(r.change))) for r in result.history if r.change > 0]
+    known = [(r.seconds, r.change) for r in result.history if r.change > 0]
     if not known:
         return Convergence((), (), "one shot: no iterations")
     seconds, changes = zip(*known, strict=True)
-    return Convergence(seconds, changes, "log10 of the relative change per iteration")
+    return Convergence(seconds, changes, "relative change per iteration", log=True)

@@ -91,8 +91,8 @@ EXPECTED = [
     r":8: \[camera\] roi.*top, left, height, width",
     r":9: \[camera\] prot: there is no such key.*'port'\? Keys here: driver, exposure_ms.*fail",
     r":10: \[camera\] speed_mm_s: must be a (valid )?number, not True",
-    r":12: \[stage\] driver: no driver is called 'mokc'.* 'mock'\? Drivers for a stage: .*simulated",
-    r":13: \[led_array\] driver: this key is missing\. Drivers for a led array: .*mock",
+    r":12: \[stage\] driver: no driver is called 'mokc'.* 'mock'\? Drivers there are: .*simulated",
+    r":13: \[led_array\] driver: this key is missing\. Drivers there are: .*mock",
     r":15: \[scene\] control: must be 'simulated' or 'operator', not 'magic'",
     r":17: \[source\] leds\[1\]: must be .*integer.*not 1\.5",
     r":18: \[source\] rgb\[2\]: must be less than or equal to 255, not 256",
@@ -106,6 +106,14 @@ def test_all_mistakes_are_named_at_once_with_line_and_what_is_allowed() -> None:
     assert len(found) == len(EXPECTED)
     for line, pattern in zip(found, EXPECTED, strict=True):
         assert re.search(pattern, line), f"{line!r} does not match {pattern!r}"
+
+
+def test_a_misspelt_driver_does_not_hide_the_other_mistakes_of_its_table() -> None:
+    found = mistakes('[camera]\ndriver = "mokc"\nexposure_s = 0.01\nprot = "usb"\n[mock]\nlevel = -1\n')
+    assert [line.split(":")[1] for line in found] == ["2", "3", "4", "6"]
+    assert "exposure_ms = 10" in found[1]
+    found = mistakes('[camera]\ndriver = "nothing_like_it"\nexposure_ms = "long"\nown_key = 1\n')
+    assert [line.split(":")[1] for line in found] == ["2", "3"]
 
 
 def test_an_unknown_table_is_refused_with_the_nearest_name() -> None:
