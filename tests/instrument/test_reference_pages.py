@@ -14,6 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "reference"
 
 
 def test_the_configuration_reference_is_what_the_models_say() -> None:
+    """Should it fail on a driver missing here: the installation is older than pyproject.toml (run make)."""
     page = (DOCS / "bench-toml.md").read_text("utf-8")
     assert page == reference(), (
         "renew it: python -m instrument.config_reference > docs/reference/bench-toml.md"
