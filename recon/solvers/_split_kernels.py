@@ -44,7 +44,9 @@ def save_strip_neighbours(
     sums = np.zeros(N_SUMS)
     for c in range(n_channels):
         for s in range(edges.size - 1):
-            below[c, s] = y[c, edges[s + 1] % height]
+            # Element by element: assigning whole slices costs seconds of compilation for their error messages.
+            for j in range(width):
+                below[c, s, j] = y[c, edges[s + 1] % height, j]
             before = (edges[s] - 1) % height
             _update_differences(
                 y[c, before], y[c, edges[s]], tx[c, before].copy(), ty[c, before].copy(),
@@ -183,10 +185,12 @@ def sweep(
     ry_above = np.empty(width, y.dtype)
     for strip in range(start, stop):
         c, s = strip // n_strips, strip % n_strips
-        ry_above[:] = above[c, s]
+        for j in range(width):
+            ry_above[j] = above[c, s, j]
         for i in range(edges[s], edges[s + 1]):
             row = sums[c * height + i]
-            row[:] = 0
+            for k in range(N_SUMS):
+                row[k] = 0
             following = below[c, s] if i + 1 == edges[s + 1] else y[c, i + 1]
             out = y[c, i]
             _update_separable(out, t_w[c, i], threshold_w[c], lower, upper, relax, rw, row)
@@ -196,7 +200,7 @@ def sweep(
             out[0] = mu_w[c] * rw[0] + mu_u[c] * (rx[width - 1] - rx[0] + ry_above[0] - ry[0])
             for j in range(1, width):
                 out[j] = mu_w[c] * rw[j] + mu_u[c] * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
-            ry_above[:] = ry
+            ry, ry_above = ry_above, ry
             on_sensor = top <= i < top + data.shape[1]
             k = i - top if on_sensor else 0
             _update_data(my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v[c], relax, row)
