@@ -44,7 +44,7 @@ def save_strip_neighbours(
     sums = np.zeros(N_SUMS)
     for c in range(n_channels):
         for s in range(edges.size - 1):
-            # Element by element: assigning whole slices costs seconds of compilation for their error messages.
+            # By element: assigning slices costs seconds of compilation, for their error messages.
             for j in range(width):
                 below[c, s, j] = y[c, edges[s + 1] % height, j]
             before = (edges[s] - 1) % height

@@ -178,6 +178,27 @@ def test_starts_from_a_given_object():
     assert distance[0] < 0.5 * distance[1]
 
 
+@pytest.mark.parametrize("name", ["tv", "isotropic tv"])
+def test_settling_a_penalty_leaves_split_and_multiplier(name):
+    solver = Admm(*problem(2), PRIORS[name])
+    for _ in range(6):
+        solver.step()
+
+    def split_and_multiplier():
+        t = np.stack([solver._tx, solver._ty])
+        size = np.linalg.norm(t, axis=0) if "iso" in name else np.abs(t)
+        mu = solver._mu[1][:, None, None]
+        u = t * np.maximum(1 - 0.05 / mu / np.maximum(size, 1e-300), 0)
+        return mu.copy(), u, mu * (t - u)
+
+    mu, u, multiplier = split_and_multiplier()
+    solver._settle_differences(0.05)
+    new_mu, new_u, new_multiplier = split_and_multiplier()
+    assert (new_mu != mu).all()
+    assert new_u == pytest.approx(u, abs=1e-12)
+    assert new_multiplier == pytest.approx(multiplier, abs=1e-12)
+
+
 def test_refuses_what_it_has_no_fast_way_for():
     operator, data = problem()
     with pytest.raises(TypeError, match="HaarTotalVariation"):

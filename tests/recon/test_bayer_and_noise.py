@@ -76,6 +76,19 @@ def test_noise_of_photon_counts(mean):
     assert estimate_deviation(counts) == pytest.approx(np.sqrt(mean), rel=0.25)
 
 
+@pytest.mark.parametrize("peak", [20, 200, 2000])
+def test_photon_noise_grows_with_brightness(shoot, peak):
+    """Root mean square over a frame that is dark around and bright in the middle, at 3 counts a photon."""
+    scene = np.pad(shoot(105, 121, snr=1e9).measurement, 60)
+    photons = peak * scene / scene.max()
+    frame = 3.0 * np.random.default_rng(0).poisson(photons) + np.random.default_rng(1).normal(
+        0, 2, scene.shape
+    )
+    truth = np.sqrt(9 * photons.mean() + 4)
+    assert truth > 1.5 * np.sqrt(9 * np.median(photons) + 4)
+    assert estimate_deviation(frame) == pytest.approx(truth, rel=0.2)
+
+
 def test_noise_of_nothing_is_nothing():
     assert estimate_deviation(np.ones((1, 1))) == 0
     assert estimate_deviation(np.ones((50, 50))) == 0
