@@ -52,7 +52,7 @@ def test_a_slow_reader_knows_exactly_what_it_missed(drop: set[int]) -> None:
     with stream:
         frames = []
         while (frame := reader.next_frame(0.5)) is not None:
-            time.sleep(0.011)
+            time.sleep(0.03)
             frames.append(Frame(frame.image.copy(), frame.metadata))
             status = reader.status
             assert status.acquired == status.delivered + status.overwritten + status.waiting

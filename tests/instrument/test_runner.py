@@ -224,7 +224,7 @@ def test_stop_from_the_executing_thread_itself_does_not_wait_for_itself(tmp_path
 
 
 def test_repeats_wait_for_their_interval_dark(tmp_path: Path) -> None:
-    interval_s = 2.0
+    interval_s = 4.0
     lapse = Plan(label="lapse", parts=(Part(label="a", light=(SOURCE,), repeats=2, interval_s=interval_s),))
     with open_mock_bench() as bench:
         run = acquire(bench, lapse, tmp_path)
