@@ -78,6 +78,8 @@ def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     folder = path.parent
     if path.is_dir():
         raise FileError(path, "is a folder; a file name is expected.")
+    if path.exists() and not path.is_file():
+        raise FileError(path, "is a device or pipe, which a file would take the place of.", "Name a file.")
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"
         raise FileError(path, f"its folder {folder} {found}.", "Make it first.")

@@ -24,11 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     if debug:
         words.remove("--debug")
-    if not words or words[0] in ("--help", "-h", "help"):
-        if len(words) < 2 or words[1] not in COMMANDS:
-            sys.stdout.write(overview())
-            return 0
-        words = [words[1], "--help"]
+    if words and words[0] == "help":
+        words = [*words[1:2], "--help"]  # help COMMAND is COMMAND --help
+    if not words or words[0] in ("--help", "-h"):
+        sys.stdout.write(overview())
+        return 0
     if words[0] in ("--version", "-V", "version"):
         from importlib.metadata import version
 

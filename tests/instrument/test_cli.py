@@ -59,6 +59,10 @@ def test_alone_it_says_what_one_can_do(capsys: pytest.CaptureFixture[str]) -> No
     assert "Examples:" in shown
     assert main(["--help"]) == 0
     assert capsys.readouterr().out == shown
+    assert main(["help"]) == 0
+    assert capsys.readouterr().out == shown
+    assert main(["help", "check"]) == 0
+    assert "Usage: diffuserbench check" in capsys.readouterr().out
 
 
 def test_help_imports_nothing_but_the_standard_library() -> None:
@@ -91,6 +95,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["snpa"], "no command 'snpa'. Did you mean 'snap'?"),
         (["--colour"], "no option '--colour'"),
+        (["help", "snpa"], "no command 'snpa'"),
         (["snap", "--averge", "3"], "--average"),
         (["snap", "--average", "many"], "--average"),
         (["snap", "--average", "0"], "--average"),
@@ -124,6 +129,13 @@ def test_new_writes_a_file_that_is_understood_and_spares_an_existing_one(
     assert (here / "bench.toml").read_text() == "mine"
     assert main(["new", "--force"]) == 0
     assert (here / "bench.toml").read_text() != "mine"
+
+
+def test_a_device_or_pipe_is_never_replaced_by_a_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(here / "pipe.toml")
+    assert main(["new", "pipe.toml", "--force"]) == 2
+    assert "device or pipe" in capsys.readouterr().err
+    assert (here / "pipe.toml").is_fifo()
 
 
 def test_drivers_are_listed_by_kind(capsys: pytest.CaptureFixture[str]) -> None:
