@@ -52,7 +52,7 @@ class DemoSettings:
     scene_plane: int = 5
     half_field_deg: float = 18.0
     average: int = 4
-    reconstruction_s: float = 15.0
+    reconstruction_s: float = 12.0
     time_scale: float = 1.0
     seed: int = 0
 

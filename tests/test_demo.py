@@ -20,7 +20,7 @@ import pytest
 from calibration_routines import AxialCalibration, SweepExposures
 from calibration_routines.comparison import compare, scene_field
 from calibration_routines.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo_settings import DemoSettings
+from calibration_routines.demo_settings import DemoSettings, read_picture
 from drivers.errors import DeviceError
 from instrument.bench import Bench
 from instrument.calibration_file import load_calibration
@@ -120,6 +120,15 @@ def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, 
     assert compare(picture[::-1], truth, field).psnr_db < right - 5
     assert compare(picture[:, ::-1], truth, field).psnr_db < right - 5
     assert compare(np.roll(picture, 2, axis=1), truth, field).psnr_db < right - 2
+
+
+def test_pictures_stand_upright(shown: tuple[DemoResult, Listener]) -> None:
+    result, _ = shown
+    original = read_picture()
+    for name in ("picture", "ground truth, linear float32"):
+        image = cv2.imread(str(result.files[name]), cv2.IMREAD_UNCHANGED)[4:-4, 4:-4]  # without the margin
+        expected = cv2.resize(original, image.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.9
 
 
 @pytest.mark.slow

@@ -153,11 +153,17 @@ def describe_quality(console: Console, done: AxialCalibration) -> None:
     """Print the verdict on every plane, or one line when all are good."""
     lowest = min(done.quality, key=lambda plane: plane.snr)
     if not done.findings:
+        count = len(done.quality)
+        verdict = [f"signal at least {lowest.snr:.0f} times the noise"]
+        if count >= 4:  # fewer planes give no line to hold a centroid against
+            verdict.append(
+                f"centroids within {max(q.step_px for q in done.quality):.2f} pixels of their line in 1/z"
+            )
+        if count >= 2:
+            verdict.append(f"support within {max(abs(q.scale_error) for q in done.quality):.1%} of 1 + d/z")
         console.print(
-            f"Quality: all {len(done.quality)} PSFs good. No saturated pixel; signal at least "
-            f"{lowest.snr:.0f} times the noise; centroids within "
-            f"{max(q.step_px for q in done.quality):.2f} pixels of their line; support within "
-            f"{max(abs(q.scale_error) for q in done.quality):.1%} of 1 + d/z.",
+            f"Quality: {'all ' if count > 1 else ''}{count} PSF{'s' if count > 1 else ''} good. "
+            f"No saturated pixel; {'; '.join(verdict)}.",
             soft_wrap=True,
         )
     for finding in done.findings:
@@ -177,6 +183,7 @@ def _number_of_planes(
         )
     console.print(
         f"{needed} planes: the edge of the pattern moves by up to 2 pixels from one to the next "
-        "(Kuo 2020, Eq. 4.7). Choose another number with --planes."
+        "(Kuo 2020, Eq. 4.7). Choose another number with --planes.",
+        soft_wrap=True,
     )
     return max(needed, 2)

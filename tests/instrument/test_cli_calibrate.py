@@ -59,8 +59,11 @@ def test_the_number_of_planes_follows_from_the_optics(
     assert len(load_calibration(path).psfs) == 5
 
 
-def test_one_psf(tmp_path: Path) -> None:
+def test_one_psf_is_not_held_against_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", "axial", "--z-min", "100", "--out", "here", "--average", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "Quality: 1 PSF good" in out
+    assert "centroids" not in out
     (path,) = tmp_path.glob("here/*/calibration")
     assert load_calibration(path).source_positions_um.tolist() == [[0.0, 0.0, 100e3]]
 
