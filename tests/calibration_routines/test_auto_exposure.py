@@ -106,6 +106,19 @@ def test_a_few_bright_pixels_hold_the_exposure_below_saturation() -> None:
     assert_safe(result, camera)
 
 
+def test_the_ceiling_holds_where_the_percentile_alone_would_be_right() -> None:
+    light = caustic()
+    percentile = float(np.percentile(light, 99.9))
+    light[40, 50:53] = 0.95 / 0.7 * percentile  # 95 % of full scale with the percentile at its target
+    camera = LinearCamera(light, 0.7 * (FULL - BLACK) / percentile)
+    result = auto_expose(camera)
+    assert result.usable
+    assert result.trace[0].level == pytest.approx(0.7, rel=0.05)
+    assert result.trace[0].saturated_pixels == 0
+    assert result.trace[-1].brightest <= 0.9
+    assert len(result.trace) > 1
+
+
 def test_known_hot_pixels_do_not_hold_the_exposure() -> None:
     light = caustic()
     dark = np.zeros(SHAPE)
