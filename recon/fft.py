@@ -19,6 +19,7 @@ from recon.threads import get_threads, in_blocks, set_threads
 
 __all__ = [
     "complex_dtype",
+    "ensure_compiled",
     "fast_length",
     "fast_shape",
     "get_threads",
@@ -144,6 +145,16 @@ def multiply(X: ComplexArray, H: ComplexArray, *, conjugate: bool = False) -> No
     """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate."""
     kernel = _kernels().multiply
     in_blocks(lambda a, b: kernel(X, H, conjugate, a, b), X.shape[0] * X.shape[1], grain=64)
+
+
+@cache
+def ensure_compiled(dtype: np.dtype[Any]) -> None:
+    """Transform a few numbers of a precision in every way, so that no later call waits for the compiler."""
+    x = np.ones((1, 2, 2), dtype)
+    X = rfft(x)
+    multiply(X, X)
+    irfft(X, 2)
+    irfft_strip(rfft_strip(x, 0, X), 0, x)
 
 
 def _check(out: npt.NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

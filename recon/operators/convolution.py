@@ -70,6 +70,7 @@ class PadCropConvolution(LinearOperator):
             self.sensor_shape[1] // 2 + psf_shape[1] - 1 - psf_shape[1] // 2,
         )
         super().__init__((n_channels, *self.grid_shape), (n_channels, *self.sensor_shape), dtype)
+        fft.ensure_compiled(self.dtype)
         padded = np.zeros((len(psfs), *self.grid_shape), self.dtype)
         padded[:, : psf_shape[0], : psf_shape[1]] = psfs
         self.spectrum = fft.rfft(padded)

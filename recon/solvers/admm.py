@@ -14,6 +14,7 @@ sides written over ``y`` and ``M y``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from recon import fft
 from recon.errors import StructureError
 from recon.operators.base import Array, LinearOperator
+from recon.operators.convolution import PadCropConvolution
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
 from recon.priors.sums import sum_of
@@ -131,6 +133,10 @@ class Admm(Solver):
             [self._separable.prox(t, 1 / mu) for t, mu in zip(self._t_w, self._mu[2], strict=True)]
         )
 
+    def compile(self) -> None:
+        """Do one step of a tiny problem of the same precision."""
+        _compile(self._y.dtype)
+
     def step(self) -> IterationRecord:
         """Update the splits in one sweep over memory, then solve for ``y`` in Fourier space."""
         if self._settles and self._tv and self.iteration in SETTLING:
@@ -224,6 +230,12 @@ def _ratio(part: float, whole: float) -> float:
     if whole == 0:
         return 0.0 if part == 0 else 1.0
     return float(np.sqrt(part / whole))
+
+
+@cache
+def _compile(dtype: np.dtype[Any]) -> None:
+    tiny = PadCropConvolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
+    Admm(tiny, np.ones((1, 2, 2), dtype), TotalVariation(1.0)).step()
 
 
 def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:

@@ -49,6 +49,9 @@ class Solver(ABC):
     def solution(self) -> Array:
         """The present iterate on the operator's domain. A view or copy: not to be written to."""
 
+    def compile(self) -> None:  # noqa: B027 (a solver without compiled code has nothing to do)
+        """Have compiled code ready: its first use on a machine takes seconds that are no iteration's."""
+
     def run(
         self,
         rules: StoppingRules | None = None,
@@ -66,6 +69,7 @@ class Solver(ABC):
         cancel : threading.Event, optional
             Set from any thread (or from the callback) to end the run after the iteration in progress.
         """
+        self.compile()
         check = StopCheck(rules or StoppingRules())
         history: list[IterationRecord] = []
         reason: StopReason | None = None

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +14,8 @@ import pytest
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
 from recon.metrics import psnr
 from recon.solvers import StopReason
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +61,24 @@ def test_default_holds_over_noise(shoot, snr):
     )
     print(f"snr {snr}: default {default:.2f} dB, tuned {tuned:.2f} dB")
     assert default > tuned - 1.0
+
+
+@pytest.mark.parametrize("method", ["admm", "fista", "wiener"])
+def test_compilation_is_not_counted_as_solving(method, tmp_path):
+    """In a fresh process with an empty cache the first iteration must be about as fast as the next ones."""
+    code = (
+        "import numpy as np, time; from recon import reconstruct\n"
+        "psf = np.random.default_rng(0).random((60, 80)) ** 8\n"
+        "began = time.perf_counter()\n"
+        f"result = reconstruct(psf + 1, psf, iterations=3, tolerance=0, method={method!r})\n"
+        "print(result.seconds, time.perf_counter() - began)"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    solving, whole = map(float, run.stdout.split())
+    assert solving < 0.3 * whole
 
 
 def test_colour_channels_are_solved_each_with_its_psf(shot, shoot):
