@@ -38,6 +38,8 @@ class Preset:
     bead_photons_per_s_sr: float
     source_photons_per_s_sr: float
     """Sent along the axis by the point source, in each band, with the LED behind it at its brightest."""
+    fluorescent: bool = False
+    """Whether source and scene glow green whatever light excites them, the filters keeping the rest out."""
     focal_length_um: float = 1500.0
     lenslet_um: float = 250.0
 
@@ -134,7 +136,8 @@ PRESETS: dict[str, Preset] = {
         diffuser_distance_mm=3.8,
         aperture_mm=(1.0, 1.0),
         diffuser="random_microlens",
-        height_map_pitch_um=1.0,
+        height_map_pitch_um=1.25,
+        fluorescent=True,
         fall_off_sigma_deg=(13.0, 13.0),
         source_diameter_um=15.0,
         source_distance_mm=2.5,

@@ -86,7 +86,7 @@ class SimulatedWorld(Surroundings):
 
     def set_emission(self, rgb: Rgb) -> None:
         """Light the point source; each band relative to one LED at its brightest right behind it."""
-        self._emission = rgb
+        self._emission = self._glow(rgb)
 
     @property
     def source_position_um(self) -> Position:
@@ -97,6 +97,10 @@ class SimulatedWorld(Surroundings):
     def emission(self) -> Rgb:
         """How brightly the point source glows now in red, green and blue."""
         return self._emission
+
+    def _glow(self, light: Rgb) -> Rgb:
+        """Return the light that leaves something under this light: itself, or green fluorescence."""
+        return (0.0, sum(light) / 3, 0.0) if self.preset.fluorescent else light
 
     # What the camera sees ---
     @property
@@ -167,7 +171,7 @@ class SimulatedWorld(Surroundings):
             light = self.psf(self.source_position_um, hue, binning) * np.float32(brightness)
         scene = self._scene
         if self.scene_lit and scene is not None:
-            seen = _product(self.options.scene_rgb, weights)
+            seen = _product(self._glow(self.options.scene_rgb), weights)
             picture = self._cached(
                 ("scene", self._scene_number, seen, binning), lambda: self._render(scene, seen, binning)
             )
@@ -263,7 +267,7 @@ class SimulatedWorld(Surroundings):
             self.distance_um,
             z_um=z_um,
             source_um=source_um or (0.0, 0.0, 1.0),
-            light=self.options.scene_rgb,
+            light=self._glow(self.options.scene_rgb),
             sensitivity=None if color else self.sensor.quantum_efficiency,
             layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
             bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,

@@ -95,7 +95,7 @@ class Propagator(ABC):
         contrast = np.sqrt(glass**2 - (1 - cos**2)) - np.sqrt(ambient**2 - (1 - cos**2))
         stretched = self._reduced_distance_um(z) / cos**3
         refracted = self._steepest * abs(contrast) * stretched
-        diffracted = 4 * np.sqrt(wavelength_nm * 1e-3 * stretched)
+        diffracted = 2.5 * np.sqrt(wavelength_nm * 1e-3 * stretched)
         return float(refracted + diffracted)
 
 

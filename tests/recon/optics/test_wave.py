@@ -235,7 +235,7 @@ def test_colours_add_up_and_hardly_differ(propagator: WavePropagator) -> None:
     white = propagator.psf(source, GRID, mixed_spectrum((1.0, 2.0, 0.0), 1))
     red = propagator.psf(source, GRID, mixed_spectrum((1.0, 0.0, 0.0), 1))
     green = propagator.psf(source, GRID, mixed_spectrum((0.0, 1.0, 0.0), 1))
-    np.testing.assert_allclose(white, red + 2 * green, rtol=1e-4, atol=white.max() * 1e-5)
+    np.testing.assert_allclose(white, red + 2 * green, rtol=1e-4, atol=white.max() * 1e-3)
     # Kuo 2020, A.2: narrowband and broadband caustics are indistinguishable.
     narrow = propagator.psf(source, GRID, mixed_spectrum((0.0, 1.0, 0.0), 5))
     assert similarity(green, narrow) > 0.99
