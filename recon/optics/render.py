@@ -36,7 +36,7 @@ class RenderSettings:
     """Pixels by which the light's displacement by the relief may differ between neighbouring nodes."""
     widest_spacing: float = 0.2
     """Largest difference between neighbouring nodes in the tangent of the angle of view."""
-    fall_off_tolerance: float = 0.05
+    fall_off_tolerance: float = 0.06
     """Error of the pixels' angular response by interpolation between nodes."""
     most_nodes: int = 150
     """Where the tolerance asks for more nodes, they are spread more thinly."""
@@ -273,22 +273,22 @@ def _fall_off_spacing(fall_off: FallOff, tolerance: float) -> float:
 
 def _nodes_between(low: float, high: float, tolerance: float, widest: float) -> npt.NDArray[np.float64]:
     """Positions from ``low`` to ``high``, the steps between them inverse to the distance from the axis."""
-
-    def onward(position: float) -> float:
-        return position + min(widest, tolerance / max(abs(position), 1e-9))
-
     if high - low < 1e-9:
         return np.array([(low + high) / 2])
-    nodes = [low]
-    if low < 0:
-        # Mirror the steps of the far side, so that spacing depends on the angle alone.
-        outward = [0.0]
-        while outward[-1] < -low:
-            outward.append(onward(outward[-1]))
-        nodes = [low] + [-t for t in outward[-2::-1] if low < -t < high]
-    while nodes[-1] < high:
-        nodes.append(min(onward(nodes[-1]), high))
-    return np.array(nodes)
+    if low < 0 < high:
+        downwards = _march(-low, tolerance, widest, 0.0)
+        return np.concatenate([-downwards[:0:-1], _march(high, tolerance, widest, 0.0)])
+    if high <= 0:
+        return -_march(-low, tolerance, widest, -high)[::-1]
+    return _march(high, tolerance, widest, low)
+
+
+def _march(end: float, tolerance: float, widest: float, start: float) -> npt.NDArray[np.float64]:
+    """Step outwards from ``start`` to ``end``; all steps shrink a little so that the last one arrives."""
+    positions = [start]
+    while positions[-1] < end:
+        positions.append(positions[-1] + min(widest, tolerance / max(positions[-1], 1e-9)))
+    return np.asarray(start + (np.array(positions) - start) * (end - start) / (positions[-1] - start))
 
 
 def _hat(nodes: npt.NDArray[np.float64], index: int, cells: range) -> tuple[Image, int]:
