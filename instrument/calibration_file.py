@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.errors import FileError
+from instrument.plain_json import plain
 from recon.types import Calibration, Geometry
 
 FORMAT = "diffuserbench calibration"
@@ -154,8 +155,8 @@ def _write(calibration: Calibration, folder: Path) -> None:
             [None if math.isnan(v) else float(v) for v in row] for row in calibration.source_positions_um
         ],
         "geometry": asdict(calibration.geometry),
-        "quality": _plain(calibration.quality),
-        "provenance": _plain(calibration.provenance),
+        "quality": plain(calibration.quality),
+        "provenance": plain(calibration.provenance),
         "sha256": {name: _sha256(array) for name, array in arrays.items()},
     }
     (folder / _JSON).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -234,19 +235,6 @@ def _replace(partial: Path, target: Path) -> None:
         old.rename(target)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _plain(value: Any) -> Any:
-    """Return the value as JSON can hold it: no NumPy types, no tuples, None for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.generic | np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _sha256(array: npt.NDArray[Any]) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -17,6 +15,7 @@ import numpy.typing as npt
 from instrument.atomic import check_writable, write_text
 from instrument.errors import FileError
 from instrument.images import write_image
+from instrument.plain_json import plain
 from instrument.reconstruction_job import Job
 from recon.result import Reconstruction
 
@@ -119,18 +118,5 @@ def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
         "provenance": result.provenance,
         "history": [asdict(entry) for entry in result.history],
     }
-    plain: dict[str, Any] = _plain(record)
-    return plain
-
-
-def _plain(value: Any) -> Any:
-    """Return the value as JSON can hold it: None for what is not finite, no NumPy types."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.generic | np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    written: dict[str, Any] = plain(record)
+    return written
