@@ -67,7 +67,8 @@ def reconstruct_volume(
     model : str
         ``"auto"``, ``"convolution"``, ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5).
     estimate_background : bool, optional
-        Estimate a smooth background as well. Default: for ``"l1"``.
+        Estimate a smooth background as well (Eq. 6.2). Default: unless ``background`` is given. Stray light
+        that the model cannot explain otherwise ends up as haze in the outermost planes.
     background, erasures, noise
         As :func:`recon.reconstruct`.
     iterations, time_s, tolerance : optional
@@ -95,7 +96,7 @@ def reconstruct_volume(
         raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
     scaled = _prepare(measurement, calibration, background, erasures, noise)
     name, reason = choose_model(scaled.depths, model)
-    smooth = prior == "l1" if estimate_background is None else estimate_background
+    smooth = background is None if estimate_background is None else estimate_background
     try:
         rules = StoppingRules(
             iterations=200 if iterations is None and time_s is None else iterations,
