@@ -6,7 +6,8 @@
 The simulated camera shows frames that were rendered beforehand, so that what is measured is the way from the
 driver to the disk: copy into the ring, checksum, file, sync, log. Each case is a process of its own; its peak
 memory and processor time are the kernel's figures for it. The limit of a size is the highest rate of a
-bisection at which no frame is lost in ``--probe-seconds``.
+bisection at which no frame is lost in ``--probe-seconds`` with half a second of frames in memory (more would
+only put off the loss).
 """
 
 from __future__ import annotations
@@ -44,13 +45,15 @@ preset = "pco"
 """
 
 
-def case(height: int, width: int, rate: float, seconds: float, folder: Path) -> dict[str, Any]:
+def case(
+    height: int, width: int, rate: float, seconds: float, n_buffers: int | None, folder: Path
+) -> dict[str, Any]:
     """Record in this process and return what it cost."""
     with open_bench(parse_config(BENCH.format(height=height, width=width, rate=rate), None)) as bench:
         bench.camera.snap()  # renders what is shown later
         used, began_s = _cpu_s(), time.monotonic()
         base_mb = _rss_mb()
-        run = record(bench, folder, seconds=seconds, label="benchmark")
+        run = record(bench, folder, seconds=seconds, n_buffers=n_buffers, label="benchmark")
         wall_s = time.monotonic() - began_s
     return {
         "frames": run.n_frames,
@@ -73,10 +76,12 @@ def _rss_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
 
-def measured(height: int, width: int, rate: float, seconds: float, parent: Path) -> dict[str, Any]:
+def measured(
+    height: int, width: int, rate: float, seconds: float, parent: Path, n_buffers: int = 0
+) -> dict[str, Any]:
     """Record in a new process; its run is removed afterwards."""
     folder = Path(tempfile.mkdtemp(dir=parent))
-    arguments = [str(x) for x in (height, width, rate, seconds, folder)]
+    arguments = [str(x) for x in (height, width, rate, seconds, n_buffers, folder)]
     answer = subprocess.run(
         [sys.executable, __file__, "--case", *arguments], capture_output=True, text=True, check=False
     )
@@ -92,7 +97,7 @@ def limit(height: int, width: int, seconds: float, parent: Path) -> tuple[float,
     low, high, best = 2.0, 40e9 / (height * width * 2 * 30), None
     while high / low > 1.1:
         rate = (low * high) ** 0.5
-        found = measured(height, width, rate, seconds, parent)
+        found = measured(height, width, rate, seconds, parent, max(16, round(rate / 2)))
         kept = found["by_device"] + found["not_written"] == 0 and found["rate"] > 0.9 * rate
         print(f"    {rate:7.1f} asked, {found['rate']:7.1f} frames/s, {_lost(found)}", flush=True)
         if kept:
@@ -127,11 +132,12 @@ def main() -> None:
     parser.add_argument("--probe-seconds", type=float, default=6.0, help="of each step of the bisection")
     parser.add_argument("--no-limits", action="store_true", help="only the long recording")
     parser.add_argument("--folder", type=Path, default=Path(), help="disk to record to")
-    parser.add_argument("--case", nargs=5, help=argparse.SUPPRESS)
+    parser.add_argument("--case", nargs=6, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.case:
-        height, width, rate, seconds, folder = options.case
-        print(json.dumps(case(int(height), int(width), float(rate), float(seconds), Path(folder))))
+        height, width, rate, seconds, n_buffers, folder = options.case
+        size, buffers = (int(height), int(width)), int(n_buffers) or None
+        print(json.dumps(case(*size, float(rate), float(seconds), buffers, Path(folder))))
         return
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start")
     print(f"disk (dd, fdatasync): {disk_mb_per_s(options.folder):.0f} MB/s")
