@@ -104,6 +104,16 @@ def test_erased_pixels_are_not_looked_at(shot):
     assert result.noise_norm == pytest.approx(np.sqrt(valid.sum()))
 
 
+@pytest.mark.parametrize(("erased", "least_db"), [(0.5, 22), (0.8, 18)])
+def test_survives_many_erasures(shoot, erased, least_db):
+    """Half, or a fifth, of the pixels still give a picture (Kuo 2020, Fig. 3.7)."""
+    shot = shoot(105, 121)
+    gone = np.random.default_rng(0).random(shot.measurement.shape) < erased
+    found = psnr(reconstruct(shot.measurement, shot.psf, erasures=gone).image, shot.truth)
+    print(f"{erased:.0%} erased: {found:.1f} dB")
+    assert found > least_db
+
+
 def test_background_is_subtracted(shot):
     plain = reconstruct(shot.measurement, shot.psf, iterations=10)
     dark = np.full_like(shot.measurement, 500.0)
