@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from rocket_fft import c2c, c2r, r2c
+from rocket_fft import c2c, c2r, dct, r2c
 
 
 @njit(nogil=True, cache=True)
@@ -59,3 +59,9 @@ def inverse(X: Any, out: Any, axes: Any, scale: float, threads: int) -> None:
     if axes.size > 1:
         c2c(X, X, axes[:-1], False, 1.0, threads)
     c2r(X, out, axes[-1:], False, scale, threads)
+
+
+@njit(nogil=True, cache=True)
+def cosine(x: Any, out: Any, axes: Any, kind: int, scale: float, threads: int) -> None:
+    """Orthonormal cosine transform: kind 2, or its inverse 3."""
+    dct(x, out, axes, kind, scale, True, threads)

@@ -19,10 +19,12 @@ from recon.threads import get_threads, in_blocks, set_threads
 
 __all__ = [
     "complex_dtype",
+    "dct",
     "ensure_compiled",
     "fast_length",
     "fast_shape",
     "get_threads",
+    "idct",
     "irfft",
     "irfft_strip",
     "multiply",
@@ -155,6 +157,22 @@ def ensure_compiled(dtype: np.dtype[Any]) -> None:
     multiply(X, X)
     irfft(X, 2)
     irfft_strip(rfft_strip(x, 0, X), 0, x)
+
+
+def dct(x: RealArray, out: RealArray) -> RealArray:
+    """Orthonormal cosine transform (type 2) of an image (height, width), written into ``out``."""
+    return _cosine(x, out, 2)
+
+
+def idct(X: RealArray, out: RealArray) -> RealArray:
+    """Inverse of :func:`dct`."""
+    return _cosine(X, out, 3)
+
+
+def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
+    _check(out, x.shape, x.dtype)
+    _kernels().cosine(x, out, np.array([0, 1]), kind, 0.5 / float(np.sqrt(x.size)), get_threads())
+    return out
 
 
 def _check(out: npt.NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

@@ -17,6 +17,7 @@ from recon.priors.simple import Separable
 from recon.solvers.admm import Admm
 from recon.solvers.base import Callback, Outcome
 from recon.solvers.fista import Fista
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.stopping import StoppingRules
 from recon.solvers.wiener import wiener
 
@@ -73,6 +74,11 @@ def _admm(p: Problem) -> Outcome:
     return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
 
 
+def _sensor_admm(p: Problem) -> Outcome:
+    solver = SensorAdmm(p.operator, p.data, p.prior, initial=p.initial)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+
+
 def _fista(p: Problem) -> Outcome:
     solver = Fista(p.operator, p.data, p.prior, initial=p.initial)
     return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
@@ -88,5 +94,6 @@ def _wiener(p: Problem) -> Outcome:
 
 
 register("admm", _admm)
+register("admm-sensor", _sensor_admm)
 register("fista", _fista, tolerance=5e-4)
 register("wiener", _wiener)

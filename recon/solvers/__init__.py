@@ -4,6 +4,7 @@ from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome, Solver
 from recon.solvers.fista import Fista
 from recon.solvers.literal_admm import LiteralAdmm
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
 from recon.solvers.wiener import wiener
 
@@ -14,6 +15,7 @@ __all__ = [
     "LiteralAdmm",
     "Outcome",
     "Penalties",
+    "SensorAdmm",
     "Solver",
     "StopReason",
     "StoppingRules",

@@ -165,17 +165,15 @@ def _update_separable(
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def sweep(
-    start: int, stop: int, edges: Any, below: Any, above: Any,
-    y: Any, my: Any, t_v: Any, tx: Any, ty: Any, t_w: Any,
-    data: Any, weight: Any, top: int, left: int,
-    mu_v: Any, mu_u: Any, mu_w: Any, threshold_u: Any, threshold_w: Any, lower: Any, upper: Any,
+def sweep_priors(
+    start: int, stop: int, edges: Any, below: Any, above: Any, y: Any, tx: Any, ty: Any, t_w: Any,
+    mu_u: Any, mu_w: Any, threshold_u: Any, threshold_w: Any, lower: Any, upper: Any,
     relax: Any, isotropic: bool, sums: Any,
 ) -> None:  # fmt: skip
-    """Update all split states from ``y`` and ``M y``, and put the next right-hand sides in their place.
+    """Update the priors' split states from ``y``, and put their next right-hand side in its place.
 
-    Does strips ``start`` to ``stop``, counted over all channels. Afterwards ``y`` holds
-    ``mu_u Psi^T R(t_u) + mu_w R(t_w)`` and ``my`` holds ``mu_v R(t_v)``, with ``R(t) = 2 prox(t) - t``.
+    Does strips ``start`` to ``stop``, counted over all channels, and starts their rows of ``sums`` anew.
+    Afterwards ``y`` holds ``mu_u Psi^T R(t_u) + mu_w R(t_w)``, with ``R(t) = 2 prox(t) - t``.
     """
     _, height, width = y.shape
     n_strips = edges.size - 1
@@ -201,9 +199,35 @@ def sweep(
             for j in range(1, width):
                 out[j] = mu_w[c] * rw[j] + mu_u[c] * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
             ry, ry_above = ry_above, ry
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def sweep(
+    start: int, stop: int, edges: Any, below: Any, above: Any,
+    y: Any, my: Any, t_v: Any, tx: Any, ty: Any, t_w: Any,
+    data: Any, weight: Any, top: int, left: int,
+    mu_v: Any, mu_u: Any, mu_w: Any, threshold_u: Any, threshold_w: Any, lower: Any, upper: Any,
+    relax: Any, isotropic: bool, sums: Any,
+) -> None:  # fmt: skip
+    """Update all split states from ``y`` and ``M y``, and put the next right-hand sides in their place.
+
+    As :func:`sweep_priors`; afterwards ``my`` holds ``mu_v R(t_v)``.
+    """
+    sweep_priors(
+        start, stop, edges, below, above, y, tx, ty, t_w,
+        mu_u, mu_w, threshold_u, threshold_w, lower, upper, relax, isotropic, sums,
+    )  # fmt: skip
+    height = y.shape[1]
+    n_strips = edges.size - 1
+    for strip in range(start, stop):
+        c, s = strip // n_strips, strip % n_strips
+        for i in range(edges[s], edges[s + 1]):
             on_sensor = top <= i < top + data.shape[1]
             k = i - top if on_sensor else 0
-            _update_data(my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v[c], relax, row)
+            _update_data(
+                my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v[c], relax,
+                sums[c * height + i],
+            )  # fmt: skip
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)

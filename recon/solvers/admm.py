@@ -20,23 +20,18 @@ from typing import Any, ClassVar
 import numpy as np
 
 from recon import fft
-from recon.errors import StructureError
 from recon.operators.base import Array, LinearOperator
 from recon.operators.convolution import PadCropConvolution
 from recon.priors.base import Prior
-from recon.priors.simple import Separable
-from recon.priors.sums import sum_of
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import Solver
+from recon.solvers.prior_splits import STRIPS, ratio, soft_pair, split_prior
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.structure import as_cropped_convolution
 from recon.threads import in_blocks
 
 SETTLING = (4, 8, 16, 32)
 """Iterations before which the penalty of the differences is set from the object so far."""
-
-STRIPS = 16
-"""Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,13 +186,13 @@ class Admm(Solver):
         objective = 0.5 * s[k.DATA] + self._separable.weight * s[k.L1]
         if self._tv:
             objective += self._tv.weight * s[k.TV]
-        primal = max(_ratio(s[k.PRIMAL_V], s[k.NORM_V]), _ratio(s[k.PRIMAL_W], s[k.NORM_W]))
-        dual = max(_ratio(s[k.CHANGE_V], s[k.MULTIPLIER_V]), _ratio(s[k.CHANGE_W], s[k.MULTIPLIER_W]))
+        primal = max(ratio(s[k.PRIMAL_V], s[k.NORM_V]), ratio(s[k.PRIMAL_W], s[k.NORM_W]))
+        dual = max(ratio(s[k.CHANGE_V], s[k.MULTIPLIER_V]), ratio(s[k.CHANGE_W], s[k.MULTIPLIER_W]))
         if self._tv:
-            primal = max(primal, _ratio(s[k.PRIMAL_U], s[k.NORM_U]))
-            dual = max(dual, _ratio(s[k.CHANGE_U], s[k.MULTIPLIER_U]))
+            primal = max(primal, ratio(s[k.PRIMAL_U], s[k.NORM_U]))
+            dual = max(dual, ratio(s[k.CHANGE_U], s[k.MULTIPLIER_U]))
         return IterationRecord(
-            0, 0.0, float(objective), data, primal, dual, change=_ratio(s[k.CHANGE_W], s[k.NORM_W])
+            0, 0.0, float(objective), data, primal, dual, change=ratio(s[k.CHANGE_W], s[k.NORM_W])
         )
 
     def _settle_differences(self, weight: float) -> None:
@@ -208,7 +203,7 @@ class Admm(Solver):
                 continue
             old, new = float(self._mu[1, c]), 10 * weight / brightness
             tx, ty = self._tx[c], self._ty[c]
-            kept = _soft_pair(tx, ty, self._scalar(weight / old), self._isotropic)
+            kept = soft_pair(tx, ty, self._scalar(weight / old), self._isotropic)
             for t, u in zip((tx, ty), kept, strict=True):
                 t -= u
                 t *= self._scalar(old / new)
@@ -216,42 +211,10 @@ class Admm(Solver):
             self._mu[1, c] = new
 
 
-def _soft_pair(tx: Array, ty: Array, threshold: Any, isotropic: bool) -> tuple[Array, Array]:
-    """Threshold a pair of differences, together or each on its own."""
-    if isotropic:
-        size = np.sqrt(tx * tx + ty * ty)
-        keep = np.maximum(size - threshold, 0) / np.maximum(size, np.finfo(tx.dtype).tiny)
-        return tx * keep, ty * keep
-    return tx - np.clip(tx, -threshold, threshold), ty - np.clip(ty, -threshold, threshold)
-
-
-def _ratio(part: float, whole: float) -> float:
-    """Square root of a ratio of sums of squares: 0 for nothing of nothing, 1 for something of nothing."""
-    if whole == 0:
-        return 0.0 if part == 0 else 1.0
-    return float(np.sqrt(part / whole))
-
-
 @cache
 def _compile(dtype: np.dtype[Any]) -> None:
     tiny = PadCropConvolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
     Admm(tiny, np.ones((1, 2, 2), dtype), TotalVariation(1.0)).step()
-
-
-def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
-    """Take the prior apart into total variation and separable part."""
-    terms = prior.terms()
-    separable = sum_of(*(t for t in terms if isinstance(t, Separable)))
-    others = [t for t in terms if not isinstance(t, Separable)]
-    if not others:
-        assert isinstance(separable, Separable)
-        return None, separable
-    tv = others[0]
-    if len(others) > 1 or not isinstance(tv, TotalVariation) or tv.axis_weights != (1.0, 1.0):
-        names = ", ".join(type(t).__name__ for t in others)
-        raise StructureError(f"ADMM takes one TotalVariation in two dimensions, not {names}; fista may.")
-    assert isinstance(separable, Separable)
-    return tv, separable
 
 
 def _laplace(n: int, dtype: np.dtype[Any]) -> Array:

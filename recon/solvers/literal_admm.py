@@ -12,8 +12,8 @@ import numpy as np
 from recon.operators.base import Array, LinearOperator
 from recon.priors.base import Prior
 from recon.priors.differences import Differences
-from recon.solvers.admm import split_prior
 from recon.solvers.base import Solver
+from recon.solvers.prior_splits import split_prior
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.structure import as_cropped_convolution
 

@@ -1,0 +1,136 @@
+"""A preconditioner for the exact data term on the sensor plane, from its cosine modes.
+
+Cropping makes the sensor's system ``I + C q C^T`` a Toeplitz matrix instead of a circulant one, and a
+diffuser's transfer function carries 10^5 times more power at its lowest frequencies than elsewhere. A Fourier
+preconditioner wraps the image around, which spoils just these frequencies. The cosine transform mirrors it
+instead: the system is nearly diagonal there, and the few modes where "nearly" is not enough are inverted
+exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon import fft
+from recon.operators.base import Array
+
+EXACT_MODES = 18
+"""Lowest cosine modes per axis that are inverted together: their matrix has 324 rows."""
+
+BANDWIDTH = 4
+"""Frequencies up to this multiple of the highest exact mode's are summed for their matrix."""
+
+
+class CosinePreconditioner:
+    """Approximate inverse of ``I + C F^-1 q F C^T`` for one channel, symmetric and positive.
+
+    Here ``q = power / (separable + differences |Psi|^2)`` and ``C`` crops to the sensor. In the sensor's
+    cosine basis the inverse is taken as ``1 / (1 + q)``, diagonal (Chan's optimal diagonal, from the
+    autocorrelation times the overlap of the sensor with itself shifted) but for the block of the lowest
+    modes, which is exact.
+
+    Parameters
+    ----------
+    power : ndarray, (grid_height, grid_width // 2 + 1)
+        ``|H|^2`` of the camera's transfer function.
+    grid_shape, sensor_shape : (int, int)
+    """
+
+    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        dtype = power.dtype
+        self._modes = np.empty(sensor_shape, dtype)
+        self._symbol = _cosine_symbol(power, grid_shape, sensor_shape)
+        rows, columns = (laplacian_eigenvalues(2 * n)[:n] for n in sensor_shape)
+        self._laplacian = (rows[:, None] + columns[None]).astype(dtype)
+        self._low = _LowModes(power, grid_shape, sensor_shape)
+        self._gain = np.ones(sensor_shape, dtype)
+        self._low_gain = np.eye(self._low.size, dtype=dtype)
+
+    def set_penalties(self, differences: float, separable: float) -> None:
+        """Adapt to ``T = separable + differences |Psi|^2``."""
+        dtype = self._gain.dtype
+        np.multiply(self._laplacian, dtype.type(differences), out=self._gain)
+        self._gain += dtype.type(separable)
+        # 1 / (1 + symbol / T)
+        np.divide(self._gain, self._gain + self._symbol, out=self._gain)
+        block = self._low.block(differences, separable)
+        inverse = np.linalg.inv(np.eye(len(block)) + block)
+        self._low_gain = (0.5 * (inverse + inverse.T)).astype(dtype)
+
+    def apply(self, r: Array, out: Array) -> Array:
+        """Write the preconditioned residual into ``out``."""
+        height, width = self._low.counts
+        modes = fft.dct(r, self._modes)
+        low = self._low_gain @ modes[:height, :width].ravel()
+        modes *= self._gain
+        modes[:height, :width] = low.reshape(height, width)
+        return fft.idct(modes, out)
+
+
+def laplacian_eigenvalues(n: int) -> Array:
+    """Eigenvalues of the wrapped second difference over ``n`` pixels: ``4 sin^2(pi k / n)``."""
+    eigenvalues: Array = 4 * np.sin(np.pi * np.arange(n) / n) ** 2
+    return eigenvalues
+
+
+def _cosine_symbol(power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> Array:
+    """Diagonal of ``Phi C F^-1 power F C^T Phi^T`` up to the coupling of mirrored modes."""
+    (grid_height, grid_width), (height, width) = grid_shape, sensor_shape
+    autocorrelation = fft.irfft(power.astype(fft.complex_dtype(power.dtype)), grid_width)
+    overlap = np.zeros((2 * height, 2 * width), power.dtype)
+    rows, row_share = _lags(height, grid_height)
+    columns, column_share = _lags(width, grid_width)
+    shares = np.outer(row_share, column_share).astype(power.dtype)
+    overlap[np.ix_(rows, columns)] = (
+        shares * autocorrelation[np.ix_(rows % grid_height, columns % grid_width)]
+    )
+    symbol = np.maximum(fft.rfft(overlap).real, 0)
+    mirrored = symbol[(-np.arange(height)) % (2 * height)]
+    return np.ascontiguousarray(0.5 * (symbol[:height, :width] + mirrored[:, :width]))
+
+
+def _lags(n: int, grid: int) -> tuple[Array, Array]:
+    """Return shifts of ``n`` pixels against themselves that the grid tells apart, and the share in common."""
+    reach = min(n - 1, (grid - 1) // 2)
+    lags = np.arange(-reach, reach + 1)
+    return lags, 1 - np.abs(lags) / n
+
+
+class _LowModes:
+    """The matrix of ``C q C^T`` between the lowest cosine modes, summed over the frequencies near them."""
+
+    def __init__(self, power: Array, grid_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        self.counts = (min(EXACT_MODES, sensor_shape[0]), min(EXACT_MODES, sensor_shape[1]))
+        self.size = self.counts[0] * self.counts[1]
+        pairs, frequencies = zip(
+            *(_mode_pairs(*args) for args in zip(self.counts, sensor_shape, grid_shape, strict=True)),
+            strict=True,
+        )
+        self._pairs = pairs
+        # The half spectrum holds q(-f) for f in its other half: q is even.
+        fy, fx = frequencies
+        sign = np.where(fx < 0, -1, 1)
+        self._power = power[(sign[None] * fy[:, None]) % grid_shape[0], np.abs(fx)[None]].astype(np.float64)
+        self._laplacian = (
+            laplacian_eigenvalues(grid_shape[0])[fy][:, None] + laplacian_eigenvalues(grid_shape[1])[fx][None]
+        )
+        self._scale = 1.0 / (grid_shape[0] * grid_shape[1])
+
+    def block(self, differences: float, separable: float) -> Array:
+        """Return the matrix, (n_modes, n_modes), float64."""
+        q = self._power / (separable + differences * self._laplacian)
+        (ky, kx), (rows, columns) = self.counts, self._pairs
+        block = (rows @ q @ columns.T).real * self._scale
+        symmetric: Array = block.reshape(ky, ky, kx, kx).transpose(0, 2, 1, 3).reshape(self.size, self.size)
+        return 0.5 * (symmetric + symmetric.T)
+
+
+def _mode_pairs(count: int, n: int, grid: int) -> tuple[Array, Array]:
+    """Return products of the modes' spectra for each pair of modes, and the (signed) frequencies kept."""
+    reach = int(np.ceil(BANDWIDTH * count * grid / (2 * n)))
+    near = np.arange(-reach, reach + 1)
+    frequencies = near if len(near) < grid else np.arange(grid) - (grid - 1) // 2
+    modes = np.cos(np.pi * np.arange(count)[:, None] * (np.arange(n) + 0.5) / n) * np.sqrt(2 / n)
+    modes[0] /= np.sqrt(2)
+    spectra = np.fft.fft(modes, grid, axis=1)[:, frequencies]
+    return (spectra[:, None] * spectra[None].conj()).reshape(count * count, -1), frequencies

@@ -1,0 +1,283 @@
+"""ADMM with the exact data term: for dense scenes on many pixels.
+
+Total variation and the separable prior are split off as in Kuo 2020, A.3, but the convolution is not: its
+split variable lives on the whole grid, most of which no pixel sees, with one penalty for all frequencies,
+while a diffuser's transfer function spans a factor of 10^5 in power. Such a split moves the dim and the
+unseen parts by a hair an iteration. Here the quadratic problem between the priors keeps the data term as it
+is,
+
+``(A^H A + T) y = A^H b + rhs``, ``T = mu_u Psi^T Psi + mu_w``, hence ``y = T^-1 (rhs + A^H e)`` where
+``(I + C q C^T) e = b - A T^-1 rhs``, ``q = |H|^2 / T``,
+
+a system on the sensor's pixels alone. Its solution ``e`` (at the end the residual ``b - A y``) is kept from
+iteration to iteration, and one conjugate gradient step on it suffices with the preconditioner of
+:mod:`recon.solvers.cosine_preconditioner`. An iteration costs four real FFTs, two of them only over the
+sensor's rows, and a pair of cosine transforms of the sensor's size. (Bredies & Sun 2015 show why such a
+splitting converges without exact solves in this place.)
+
+Erased pixels would spoil the preconditioner. They are imputed instead: their data is what the object of the
+iteration before casts there, so that they pull at nothing once converged (a proximal ADMM; the minimiser is
+that of the valid pixels alone).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from recon import fft
+from recon.operators.base import Array, LinearOperator
+from recon.operators.convolution import PadCropConvolution
+from recon.operators.erasures import Erasures
+from recon.priors.base import Prior
+from recon.priors.total_variation import TotalVariation
+from recon.solvers.base import Solver
+from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_eigenvalues
+from recon.solvers.prior_splits import PriorSplits
+from recon.solvers.stopping import IterationRecord
+from recon.solvers.structure import as_cropped_convolution
+from recon.threads import in_blocks
+
+BALANCING = (3, 6, 12, 24, 48, 96, 192)
+"""Iterations before which the penalties are balanced; fixed after the last, so that convergence is sure."""
+
+PIXEL_SHARE = (0.03, 10.0)
+"""Bounds of the pixels' penalty relative to the differences'."""
+
+FIRST_THRESHOLD = 0.3
+"""First guess of total variation's threshold, relative to the object's mean."""
+
+FIRST_PIXEL_SHARE = 0.05
+"""First guess of the pixels' penalty relative to the differences'."""
+
+IMPUTATION = 1.5
+"""Over-relaxation of the erased pixels' imputation, between 1 and 2."""
+
+LEAST_SHARE = 0.05
+"""Share of valid pixels from which a local mean is worth taking."""
+
+FIRST_DATA_STEPS = 4
+"""Conjugate gradient steps of the first iteration, whose start is nowhere near."""
+
+
+class SensorAdmm(Solver):
+    """ADMM that solves the data term on the sensor's pixels, for a (masked) cropped convolution.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        A ``PadCropConvolution``, with or without ``Erasures`` after it.
+    data : ndarray, ``operator.range_shape``
+    prior : Prior
+        At most one (wrapped) :class:`~recon.priors.TotalVariation` plus separable priors.
+    initial : ndarray, optional
+        Starting point on the operator's domain. To go on where a run ended, use :meth:`checkpoint`, which
+        keeps the dual variables too.
+    relax : float
+        Over-relaxation, between 1 and 2.
+    data_steps : int
+        Conjugate gradient steps an iteration.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = ("_y", "_tx", "_ty", "_t_w", "_mu", "_e", "_E", "_data")
+
+    def __init__(
+        self,
+        operator: LinearOperator,
+        data: Array,
+        prior: Prior,
+        *,
+        initial: Array | None = None,
+        relax: float = 1.5,
+        data_steps: int = 1,
+    ) -> None:
+        super().__init__()
+        from recon.solvers import _sensor_kernels
+
+        self._kernels: Any = _sensor_kernels
+        structure = as_cropped_convolution(operator)
+        camera = structure.convolution
+        self._weight = np.ascontiguousarray(structure.weight)
+        self._erased = not np.all(structure.weight)
+        # Imputed on erased pixels, so part of the state.
+        self._data = np.array(data, operator.dtype)
+        if self._erased:
+            for image, weight in zip(self._data, self._weight, strict=True):
+                fill_smoothly(image, weight)
+        self._top, self._left = camera.corner
+        self._spectrum = camera.spectrum
+        self.relax = relax
+        self.data_steps = data_steps
+
+        start = np.zeros(operator.domain_shape, operator.dtype)
+        if initial is not None:
+            start[...] = initial
+        self._splits = splits = PriorSplits(prior, start)
+        self._y, self._tx, self._ty, self._t_w, self._mu = (
+            splits.y,
+            splits.tx,
+            splits.ty,
+            splits.t_w,
+            splits.mu,
+        )
+        # ``e`` and its spectrum: keeping the latter saves a transform an iteration.
+        self._e = np.zeros(operator.range_shape, operator.dtype)
+        self._E = np.zeros(fft.spectrum_shape(start.shape), fft.complex_dtype(operator.dtype))
+        self._Y, self._P = np.empty_like(self._E[0]), np.empty_like(self._E[0])
+        self._band = np.empty((camera.sensor_shape[0], start.shape[2]), operator.dtype)
+        self._residual, self._direction, self._z = (
+            np.empty(camera.sensor_shape, operator.dtype) for _ in range(3)
+        )
+        grid = (start.shape[1], start.shape[2])
+        self._laplace_rows, columns = (laplacian_eigenvalues(n).astype(operator.dtype) for n in grid)
+        self._laplace_columns = columns[: grid[1] // 2 + 1].copy()
+        self._row_sums = np.zeros(grid[0])
+        power = camera.power
+        self._preconditioners = [
+            CosinePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
+        ]
+        splits.set_penalties(self._first_penalties(power))
+        self._adapt()
+        splits.sweep(0)
+
+    @property
+    def solution(self) -> Array:
+        """The split variable that obeys the separable prior."""
+        return self._splits.solution()
+
+    def compile(self) -> None:
+        """Do two data steps of a tiny problem of the same precision."""
+        _compile(self._y.dtype)
+
+    def step(self) -> IterationRecord:
+        """Solve for the object, then update the priors' splits in one sweep over memory.
+
+        ``data_residual`` is that of the object before the data term's correction, ``objective`` its sum with
+        the priors after it: both meet the solution's as the iteration converges.
+        """
+        if self.iteration in BALANCING:
+            self._splits.set_penalties(self._balanced_penalties())
+            self._adapt()
+            self._splits.sweep(0)
+        steps = self.data_steps if self.iteration else max(self.data_steps, FIRST_DATA_STEPS)
+        misfit = sum(self._solve(channel, steps) for channel in range(len(self._y)))
+        self._splits.sweep(self.relax)
+        primal, dual, change = self._splits.residuals()
+        data = float(np.sqrt(misfit)) if np.isfinite(misfit) else np.inf
+        return IterationRecord(0, 0.0, 0.5 * data**2 + self._splits.value(), data, primal, dual, change)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        super().restore(state)
+        self._adapt()
+
+    def _solve(self, channel: int, steps: int) -> float:
+        """Turn a channel's right-hand side into its object; return the squared data residual before.
+
+        Conjugate gradients on ``e``, warm-started.
+        """
+        f = self._y.dtype.type
+        y, e, r, p, band = self._y[channel], self._e[channel], self._residual, self._direction, self._band
+        E, Y, P = self._E[channel], self._Y, self._P
+        H = self._spectrum[channel % len(self._spectrum)]
+        weight = self._weight[channel]
+        T = (self._laplace_rows, self._laplace_columns, *self._mu[:, channel].astype(y.dtype))
+        kernels, columns = self._kernels, slice(self._left, self._left + p.shape[1])
+
+        fft.rfft(y, out=Y)
+        _over_rows(kernels.predict, Y, E, H, *T, P)
+        fft.irfft_strip(P[None], self._top, band[None])
+        sums = self._row_sums[: len(r)]
+        _over_rows(kernels.residual, r, band, self._left, self._data[channel], weight, e, sums)
+        misfit = float(sums.sum())
+        rho_before = 1.0
+        for step in range(steps):
+            rho = float(np.vdot(r, self._preconditioners[channel].apply(r, self._z)))
+            if not rho > 0:
+                break
+            if step:
+                p *= f(rho / rho_before)
+                p += self._z
+            else:
+                p[...] = self._z
+            band[...] = 0
+            band[:, columns] = p
+            fft.rfft_strip(band[None], self._top, P[None])
+            # <p, (I + C q C^T) p> by Parseval: the last step needs no transform back.
+            _over_rows(kernels.curvature, P, H, *T, band.shape[1] % 2 == 0, self._row_sums)
+            bend = float(np.vdot(p, p)) + float(self._row_sums.sum()) / y.size
+            if not bend > 0:
+                break
+            length = f(rho / bend)
+            e += length * p
+            _over_rows(kernels.advance, Y, E, P, H, *T, length)
+            if step < steps - 1:
+                _over_rows(kernels.weigh, P, H, *T)
+                fft.irfft_strip(P[None], self._top, band[None])
+                _over_rows(kernels.reduce_residual, r, p, band, self._left, length)
+            rho_before = rho
+        if self._erased:
+            _over_rows(kernels.impute, self._data[channel], weight, e, f(IMPUTATION))
+        fft.irfft(Y, y.shape[1], out=y)
+        return misfit
+
+    def _adapt(self) -> None:
+        """Tell the preconditioners of new penalties."""
+        for preconditioner, mu in zip(self._preconditioners, self._mu.T, strict=True):
+            preconditioner.set_penalties(*mu)
+
+    def _first_penalties(self, power: Array) -> Array:
+        """Guess penalties from the object's mean, which the data tells through the PSF's sum."""
+        tv, separable = self._splits.tv, self._splits.separable
+        strength = (tv.weight if tv else 0.0) or separable.weight
+        mu = np.zeros_like(self._mu)
+        for c, data in enumerate(self._data):
+            h = power[c % len(power)]
+            mean = float(np.linalg.norm(data)) / float(np.sqrt(data.size * h[0, 0]))
+            threshold = FIRST_THRESHOLD * mean
+            penalty = strength / threshold if strength > 0 and threshold > 0 else float(np.mean(h))
+            mu[1, c] = FIRST_PIXEL_SHARE * penalty
+            if tv and tv.weight > 0:
+                mu[0, c] = penalty
+        return mu
+
+    def _balanced_penalties(self) -> Array:
+        """Balance, within bounds: a step of ten at most, pixels bound to the differences."""
+        mu = np.clip(self._splits.balanced_penalties(), self._mu / 10, self._mu * 10)
+        bound = mu[0] > 0
+        mu[1, bound] = np.clip(mu[1, bound], *(share * mu[0, bound] for share in PIXEL_SHARE))
+        return mu
+
+
+@cache
+def _compile(dtype: np.dtype[Any]) -> None:
+    tiny = PadCropConvolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
+    valid = np.arange(4).reshape(1, 2, 2) > 0
+    masked = Erasures(valid, (1, 2, 2), dtype) @ tiny
+    SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2).step()
+
+
+def _over_rows(kernel: Any, first: Array, *args: Any) -> None:
+    """Run a kernel over the rows of its first array, shared among threads."""
+    in_blocks(lambda start, stop: kernel(start, stop, first, *args), len(first))
+
+
+def fill_smoothly(image: Array, weight: Array) -> None:
+    """Replace, in place, pixels of weight 0 by local means of the others, from the nearest that there are."""
+    found = weight > 0
+    image[~found] = 0
+    known, valid = fft.dct(image, np.empty_like(image)), fft.dct(weight, np.empty_like(weight))
+    frequency = [np.pi * np.arange(n) / n for n in image.shape]
+    total, share = np.empty_like(image), np.empty_like(image)
+    reach = 1.0
+    while not found.all() and reach < max(image.shape):
+        blur = np.outer(*(np.exp(-0.5 * (reach * f) ** 2) for f in frequency)).astype(image.dtype)
+        fft.idct(known * blur, total)
+        fft.idct(valid * blur, share)
+        near = ~found & (share > LEAST_SHARE)
+        image[near] = total[near] / share[near]
+        found |= near
+        reach *= 2
+    image[~found] = known[0, 0] / valid[0, 0]

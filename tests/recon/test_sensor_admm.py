@@ -1,0 +1,284 @@
+"""The ADMM with the exact data term, its preconditioner and the transforms under them."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import scipy.fft
+
+from recon import fft
+from recon.metrics import psnr
+from recon.operators import Convolution3D, Erasures, PadCropConvolution
+from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
+from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
+from recon.solvers.cosine_preconditioner import CosinePreconditioner
+from recon.solvers.prior_splits import PriorSplits
+from recon.solvers.sensor_admm import fill_smoothly
+
+PRIORS = {
+    "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
+    "isotropic tv": TotalVariation(0.05, isotropic=True, tolerance=1e-8) + NonNegativity(),
+    "free tv": TotalVariation(0.05, tolerance=1e-8),
+    "tv and l1": TotalVariation(0.05, tolerance=1e-8) + L1(0.02) + NonNegativity(),
+    "l1": L1(0.05) + NonNegativity(),
+    "nonnegative": NonNegativity(),
+    "box": TotalVariation(0.01, tolerance=1e-8) + Box(0, 0.8),
+}
+
+
+def problem(n_channels=1, *, erased=False, dtype=np.float64, sensor=(9, 10), shared_psf=False):
+    rng = np.random.default_rng(0)
+    psfs = rng.random((1 if shared_psf else n_channels, 7, 8))
+    psfs *= rng.random(psfs.shape) > 0.7
+    psfs[:, 3, 4] += 2
+    camera = PadCropConvolution(psfs, sensor, n_channels=n_channels, dtype=dtype)
+    scene = np.zeros(camera.domain_shape, dtype)
+    scene[:, 5:9, 6:11] = 1
+    data = (camera.forward(scene) + 0.02 * rng.standard_normal(camera.range_shape)).astype(dtype)
+    if not erased:
+        return camera, data
+    valid = rng.random(camera.range_shape) > 0.4
+    return Erasures(valid, camera.range_shape, dtype) @ camera, data * valid
+
+
+def objective(operator, data, prior, x):
+    return 0.5 * float(np.sum((operator.forward(x) - data) ** 2)) + prior.value(x)
+
+
+def run(operator, data, prior, iterations=1000, tolerance=1e-9, **options):
+    solver = SensorAdmm(operator, data, prior, **options)
+    return solver.run(StoppingRules(iterations=iterations, tolerance=tolerance))
+
+
+@pytest.mark.parametrize(("n_channels", "erased"), [(1, False), (1, True), (2, False)])
+@pytest.mark.parametrize("name", PRIORS)
+def test_reaches_the_same_minimum_as_fista(name, n_channels, erased):
+    operator, data = problem(n_channels, erased=erased)
+    prior = PRIORS[name]
+    slow = Fista(operator, data, prior).run(StoppingRules(iterations=1000, tolerance=1e-7))
+    fast = run(operator, data, prior)
+    # Both points are feasible, so that lower is closer to the minimum.
+    ratio = objective(operator, data, prior, fast.solution) / objective(operator, data, prior, slow.solution)
+    assert 1 - 1e-3 < ratio < 1 + 1e-4
+
+
+@pytest.mark.parametrize("erased", [False, True])
+def test_reaches_the_same_minimum_as_the_splitting_admm_on_a_larger_sensor(erased):
+    operator, data = problem(2, erased=erased, sensor=(31, 44), shared_psf=True)
+    prior = PRIORS["tv"]
+    split = Admm(operator, data, prior).run(StoppingRules(iterations=2000, tolerance=0))
+    exact = run(operator, data, prior, 1000, 0)
+    value = objective(operator, data, prior, exact.solution)
+    assert 1 - 1e-3 < value / objective(operator, data, prior, split.solution) < 1 + 1e-4
+    assert exact.history[-1].objective == pytest.approx(value, rel=1e-4)
+    residual = np.linalg.norm(operator.forward(exact.solution) - data)
+    assert exact.history[-1].data_residual == pytest.approx(residual, rel=1e-3)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_relaxation_and_data_steps_change_the_way_not_the_goal(steps):
+    operator, data = problem()
+    prior = PRIORS["tv"]
+    ends = [run(operator, data, prior, 1500, 0, relax=r, data_steps=steps) for r in (1.0, 1.8)]
+    values = [objective(operator, data, prior, e.solution) for e in ends]
+    assert values[0] == pytest.approx(values[1], rel=1e-5)
+
+
+def test_a_dense_scene_converges_in_few_iterations(shoot):
+    # Half of the light comes from outside the sensor's field of view; the PSF has a hundred times more power
+    # at its lowest frequencies than elsewhere.
+    shot = shoot(91, 111, snr=100)
+    energy = float(np.linalg.norm(shot.psf))
+    camera = PadCropConvolution((shot.psf / energy)[None], shot.psf.shape)
+    data = (shot.measurement / shot.noise)[None].astype(np.float32)
+    prior = TotalVariation(0.5) + NonNegativity()
+    (row, column), (height, width) = camera.centre, camera.sensor_shape
+    top, left = row - height // 2, column - width // 2
+    quality = []
+
+    def judge(solver, _):
+        image = solver.solution[0, top : top + height, left : left + width] * (shot.noise / energy)
+        quality.append(psnr(image, shot.truth))
+
+    SensorAdmm(camera, data, prior).run(StoppingRules(iterations=300, tolerance=0), callback=judge)
+    assert quality[-1] > 15
+    assert min(quality[24:]) > quality[-1] - 0.15
+
+
+def test_numbers_do_not_depend_on_units():
+    operator, data = problem()
+    brighter = PadCropConvolution(
+        3 * fft.irfft(operator.spectrum.copy(), operator.grid_shape[1])[:, :7, :8], (9, 10), dtype=np.float64
+    )
+    x = run(operator, data, PRIORS["tv"], 20, 0).solution
+    twice = run(operator, 2 * data, TotalVariation(0.1) + NonNegativity(), 20, 0).solution
+    thrice = run(brighter, 3 * data, TotalVariation(0.45) + NonNegativity(), 20, 0).solution
+    assert twice == pytest.approx(2 * x, abs=1e-9)
+    assert thrice == pytest.approx(x, abs=1e-9)
+
+
+def test_float32_follows_float64():
+    prior = PRIORS["tv"]
+    single, double = (run(*problem(dtype=d), prior, 500, 0).solution for d in (np.float32, np.float64))
+    assert single.dtype == np.float32
+    assert np.linalg.norm(single - double) < 1e-4 * np.linalg.norm(double)
+
+
+def test_does_not_depend_on_threads():
+    before = fft.get_threads()
+    ends = []
+    try:
+        for threads in (1, 3):
+            fft.set_threads(threads)
+            ends.append(run(*problem(2, dtype=np.float32, erased=True), PRIORS["isotropic tv"], 30, 0))
+    finally:
+        fft.set_threads(before)
+    assert np.array_equal(ends[0].solution, ends[1].solution)
+    assert ends[0].history[-1].objective == ends[1].history[-1].objective
+
+
+def test_resumes_from_a_checkpoint_exactly():
+    operator, data = problem()
+    whole = run(operator, data, PRIORS["tv"], 30, 0)
+    first = SensorAdmm(operator, data, PRIORS["tv"])
+    first.run(StoppingRules(iterations=17, tolerance=0))
+    second = SensorAdmm(operator, data, PRIORS["tv"])
+    second.restore(first.checkpoint())
+    assert np.array_equal(second.run(StoppingRules(iterations=30, tolerance=0)).solution, whole.solution)
+
+
+def test_starts_from_a_given_object():
+    operator, data = problem()
+    end = run(operator, data, PRIORS["tv"], 3000, 1e-10).solution
+    warm, cold = (run(operator, data, PRIORS["tv"], 3, 0, initial=start).solution for start in (end, None))
+    assert np.linalg.norm(warm - end) < 0.3 * np.linalg.norm(cold - end)
+
+
+def test_can_be_watched_and_cancelled():
+    stop = threading.Event()
+    seen = []
+
+    def watch(solver, record):
+        seen.append((record.iteration, solver.solution.shape))
+        if record.iteration == 3:
+            stop.set()
+
+    operator, data = problem()
+    out = SensorAdmm(operator, data, PRIORS["tv"]).run(callback=watch, cancel=stop)
+    assert out.stop_reason is StopReason.CANCELLED
+    assert seen == [(i, operator.domain_shape) for i in (1, 2, 3)]
+
+
+def test_stops_on_nan_and_gives_the_start_back():
+    operator, data = problem()
+    start = np.full(operator.domain_shape, 0.5)
+    data[0, 2, 3] = np.nan
+    out = SensorAdmm(operator, data, PRIORS["tv"], initial=start).run()
+    assert out.stop_reason is StopReason.NOT_FINITE
+    assert len(out.history) == 1
+    assert np.array_equal(out.solution, start)
+
+
+def test_zero_data_gives_zero():
+    operator, data = problem()
+    out = SensorAdmm(operator, 0 * data, PRIORS["tv"]).run()
+    assert out.stop_reason is StopReason.CONVERGED
+    assert not out.solution.any()
+
+
+def test_refuses_what_it_has_no_fast_way_for():
+    operator, data = problem()
+    with pytest.raises(TypeError, match="HaarTotalVariation"):
+        SensorAdmm(operator, data, HaarTotalVariation(0.1))
+    volume = Convolution3D(np.ones((2, 1, 3, 3)), (4, 5), dtype=np.float64)
+    with pytest.raises(TypeError, match="ista"):
+        SensorAdmm(volume, np.zeros((1, 4, 5)), Zero())
+
+
+def system_matrix(camera, mu):
+    """``I + A T^-1 A^H``, column by column."""
+    height, width = camera.grid_shape
+    n = height * width
+    eye = np.eye(n).reshape(n, height, width)
+    laplacian = sum(2 * eye - np.roll(eye, 1, axis) - np.roll(eye, -1, axis) for axis in (1, 2))
+    T = mu[0] * laplacian.reshape(n, n) + mu[1] * np.eye(n)
+    A = np.stack([camera.forward(e[None])[0].ravel() for e in eye], axis=1)
+    return np.eye(len(A)) + A @ np.linalg.solve(T, A.T)
+
+
+def preconditioner_matrix(camera, mu):
+    preconditioner = CosinePreconditioner(camera.power[0], camera.grid_shape, camera.sensor_shape)
+    preconditioner.set_penalties(*mu)
+    units = np.eye(np.prod(camera.sensor_shape)).reshape(-1, *camera.sensor_shape)
+    return np.stack([preconditioner.apply(u, np.empty_like(u)).ravel() for u in units], axis=1)
+
+
+def smooth_camera(sensor, psf_shape):
+    rng = np.random.default_rng(1)
+    return PadCropConvolution(1 + rng.random((1, *psf_shape)), sensor, dtype=np.float64)
+
+
+@pytest.mark.parametrize("psf_shape", [(9, 12), (4, 5), (15, 17)])
+def test_preconditioner_is_exact_where_all_modes_are_inverted_together(psf_shape):
+    camera, mu = smooth_camera((9, 12), psf_shape), (2.0, 0.1)
+    product = preconditioner_matrix(camera, mu) @ system_matrix(camera, mu)
+    assert product == pytest.approx(np.eye(len(product)), abs=1e-8)
+
+
+def spread(matrix):
+    values = np.linalg.eigvals(matrix).real
+    values = values[values > 1e-9]
+    return values.max() / values.min()
+
+
+def test_preconditioner_bounds_the_condition_of_what_remains(monkeypatch):
+    monkeypatch.setattr(cosine_preconditioner, "EXACT_MODES", 8)
+    camera, mu = smooth_camera((14, 18), (14, 18)), (2.0, 0.1)
+    system, approximate = system_matrix(camera, mu), preconditioner_matrix(camera, mu)
+    assert approximate == pytest.approx(approximate.T, abs=1e-10)
+    assert np.linalg.eigvalsh(approximate).min() > 0
+    assert spread(system) > 1e3
+    assert spread(approximate @ system) < 10
+
+
+def test_fills_erased_pixels_from_their_neighbours():
+    y, x = np.mgrid[:40, :50]
+    image = 3 + np.sin(y / 20) + x / 25
+    weight = np.ones_like(image)
+    weight[10:14, 20:25] = weight[::7, ::5] = 0
+    filled = np.where(weight > 0, image, np.nan)
+    fill_smoothly(filled, weight)
+    assert np.array_equal(filled[weight > 0], image[weight > 0])
+    assert filled == pytest.approx(image, abs=0.3)
+    lonely = np.zeros((40, 50))
+    lonely[3, 4] = 1
+    filled = 7 * lonely
+    fill_smoothly(filled, lonely)
+    assert filled == pytest.approx(np.full((40, 50), 7.0))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_cosine_transforms(dtype):
+    rng = np.random.default_rng(0)
+    whole = rng.standard_normal((9, 10)).astype(dtype)
+    tolerance = 1e-5 if dtype == np.float32 else 1e-13
+    Y = fft.dct(whole, np.empty_like(whole))
+    assert pytest.approx(scipy.fft.dctn(whole, norm="ortho"), abs=tolerance) == Y
+    assert fft.idct(Y, np.empty_like(Y)) == pytest.approx(whole, abs=tolerance)
+    with pytest.raises(ValueError, match="out must be"):
+        fft.dct(whole, np.empty((3, 3), dtype))
+
+
+def test_new_penalties_keep_split_variables_and_multipliers():
+    rng = np.random.default_rng(0)
+    splits = PriorSplits(PRIORS["tv and l1"], rng.standard_normal((2, 6, 8)))
+    for _ in range(3):
+        splits.y[...] = rng.standard_normal(splits.y.shape)
+        splits.sweep(1.5)
+    before, multipliers = splits.solution(), splits.mu[1][:, None, None] * (splits.t_w - splits.solution())
+    splits.set_penalties(splits.mu * [[3.0, 0.5], [0.2, 7.0]])
+    assert splits.solution() == pytest.approx(before)
+    after = splits.mu[1][:, None, None] * (splits.t_w - splits.solution())
+    assert after == pytest.approx(multipliers)
