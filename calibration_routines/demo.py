@@ -100,6 +100,7 @@ def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | No
     place = new_folder(Path(folder))
     journal = Journal(place)
     try:
+        journal.note(state="running")
         with CtrlC() as ctrl_c:
             return _run(place, audience, settings, journal, ctrl_c)
     except BaseException as error:

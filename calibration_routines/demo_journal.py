@@ -40,7 +40,7 @@ def new_folder(parent: Path) -> Path:
 
 
 class Journal:
-    """The demo's record, ``demo.json`` in its folder.
+    """The demo's record, ``demo.json`` in its folder; written from the first :meth:`note` on.
 
     Attributes
     ----------
@@ -51,8 +51,7 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
         self.seconds: dict[str, float] = {}
-        self._record: dict[str, Any] = {"state": "running"}
-        self._write()
+        self._record: dict[str, Any] = {}
 
     def note(self, **entries: Any) -> None:
         """Add entries (JSON-compatible) and write the file."""
