@@ -16,16 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.optics.jit import compiled
-from recon.optics.noise import (
-    EXPANSION_FROM,
-    advance,
-    normal,
-    poisson_small,
-    stream,
-    uniform_of,
-    word_of,
-)
+from recon.optics.sensor_kernel import expose_pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +143,7 @@ def expose(
         Where to put the counts.
     """
     counts = np.empty(electrons_per_s.shape, np.uint16) if out is None else out
-    _expose(
+    expose_pixels(
         electrons_per_s,
         pattern.response,
         pattern.dark_e_per_s,
@@ -168,43 +159,3 @@ def expose(
         counts,
     )
     return counts
-
-
-@compiled
-def _expose(
-    electrons_per_s: npt.NDArray[np.float32],
-    response: npt.NDArray[np.float32],
-    dark_e_per_s: npt.NDArray[np.float32],
-    offset_e: npt.NDArray[np.float32],
-    exposure_s: float,
-    counts_per_electron: float,
-    black_level: float,
-    full_scale: int,
-    full_well_e: float,
-    read_noise_e: float,
-    noise_scale: float,
-    seed: np.uint64,
-    counts: npt.NDArray[np.uint16],
-) -> None:
-    height, width = counts.shape
-    for i in range(height):
-        # One stream a row, so that a row's noise does not depend on what came before it.
-        state = stream(seed, i)
-        for j in range(width):
-            mean = (electrons_per_s[i, j] * response[i, j] + dark_e_per_s[i, j]) * exposure_s
-            state = advance(state)
-            word = word_of(state)
-            read, state = normal(word >> np.uint64(32), state)
-            if noise_scale != 1.0:
-                shot, state = normal(word, state)
-                charge = mean + noise_scale * np.sqrt(mean) * shot
-            elif mean > EXPANSION_FROM:
-                shot, state = normal(word, state)
-                charge = np.floor(mean + np.sqrt(mean) * shot + (shot * shot - 1.0) / 6.0 + 0.5)
-            else:
-                state = advance(state)
-                charge = poisson_small(mean, uniform_of(word_of(state)))
-            charge = min(max(charge, 0.0), full_well_e)
-            value = (charge + offset_e[i, j] + noise_scale * read_noise_e * read) * counts_per_electron
-            value = np.floor(value + black_level + 0.5)
-            counts[i, j] = np.uint16(min(max(value, 0.0), float(full_scale)))

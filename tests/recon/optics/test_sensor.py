@@ -79,7 +79,11 @@ def test_noise_is_normal_out_to_its_tails() -> None:
     plain = replace(READOUT, electrons_per_count=0.001, black_level=30_000.0, read_noise_e=2.0)
     noise = (frame(0.0, 1.0, plain, seed=9).ravel() - 30_000) / 2000
     assert stats.kstest(noise, "norm").pvalue > 1e-3
-    assert (np.abs(noise) > 3.2).mean() == pytest.approx(2 * stats.norm.sf(3.2), rel=0.4)
+    # Beyond 3.44 the ziggurat has a way of its own.
+    many = np.concatenate([frame(0.0, 1.0, plain, seed=seed).ravel() for seed in range(100, 160)])
+    noise = (many - 30_000) / 2000
+    for sign in (-1, 1):
+        assert (sign * noise > 3.8).mean() == pytest.approx(stats.norm.sf(3.8), rel=0.3)
 
 
 def test_gain_scales_signal_and_noise_alike() -> None:
@@ -120,8 +124,7 @@ def test_the_same_seed_repeats_a_frame_and_another_one_does_not() -> None:
 
 
 def test_frames_seeded_next_to_each_other_share_no_rows() -> None:
-    # Frame numbers step the seed by 2^16: the streams of a sensor's rows never meet.
-    first, second = (frame(500.0, 1.0, seed=seed) for seed in (0, 1 << 16))
+    first, second = (frame(500.0, 1.0, seed=seed) for seed in (0, 1))
     matches = (first[:, None, :] == second[None, :, :]).mean(axis=2)
     assert matches.max() < 0.2
 

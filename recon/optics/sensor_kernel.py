@@ -1,7 +1,7 @@
-"""Fast random numbers inside compiled loops: SplitMix64, normal deviates by the ziggurat, Poisson deviates.
+"""Compiled loop over a sensor's pixels, with the random numbers that it draws.
 
-A stream is one 64-bit state that the caller keeps; every function takes it and returns it advanced, so that a
-loop over rows can give each row its own stream.
+SplitMix64, normal deviates by the ziggurat, Poisson deviates. A stream is one 64-bit state; every function
+takes it and returns it advanced, so that each row has its own stream.
 """
 
 from __future__ import annotations
@@ -43,13 +43,6 @@ BORDER, WIDTH, DENSITY = _ziggurat()
 
 
 @compiled
-def stream(seed: np.uint64, row: int) -> np.uint64:
-    """Return the state of a row's own stream."""
-    state = (seed + np.uint64(row)) * np.uint64(0xD1342543DE82EF95) + np.uint64(0x9E3779B97F4A7C15)
-    return np.uint64(state ^ (state >> np.uint64(29)))
-
-
-@compiled
 def advance(state: np.uint64) -> np.uint64:
     """Return the next state."""
     return np.uint64(state + np.uint64(0x9E3779B97F4A7C15))
@@ -61,6 +54,12 @@ def word_of(state: np.uint64) -> np.uint64:
     word = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return np.uint64(word ^ (word >> np.uint64(31)))
+
+
+@compiled
+def stream(seed: np.uint64, row: int) -> np.uint64:
+    """Return the state of a row's own stream; rows of different seeds have nothing in common."""
+    return np.uint64(word_of(advance(seed)) ^ word_of(np.uint64(row) * np.uint64(0xD1342543DE82EF95)))
 
 
 @compiled
@@ -106,3 +105,44 @@ def poisson_small(mean: float, uniform: float) -> float:
         term *= mean / count
         total += term
     return count
+
+
+@compiled
+def expose_pixels(
+    electrons_per_s: npt.NDArray[np.float32],
+    response: npt.NDArray[np.float32],
+    dark_e_per_s: npt.NDArray[np.float32],
+    offset_e: npt.NDArray[np.float32],
+    exposure_s: float,
+    counts_per_electron: float,
+    black_level: float,
+    full_scale: int,
+    full_well_e: float,
+    read_noise_e: float,
+    noise_scale: float,
+    seed: np.uint64,
+    counts: npt.NDArray[np.uint16],
+) -> None:
+    """Write the counts of one exposure; see :mod:`recon.optics.sensor` for the model."""
+    height, width = counts.shape
+    for i in range(height):
+        # One stream a row, so that a row's noise does not depend on what came before it.
+        state = stream(seed, i)
+        for j in range(width):
+            mean = (electrons_per_s[i, j] * response[i, j] + dark_e_per_s[i, j]) * exposure_s
+            state = advance(state)
+            word = word_of(state)
+            read, state = normal(word >> np.uint64(32), state)
+            if noise_scale != 1.0:
+                shot, state = normal(word, state)
+                charge = mean + noise_scale * np.sqrt(mean) * shot
+            elif mean > EXPANSION_FROM:
+                shot, state = normal(word, state)
+                charge = np.floor(mean + np.sqrt(mean) * shot + (shot * shot - 1.0) / 6.0 + 0.5)
+            else:
+                state = advance(state)
+                charge = poisson_small(mean, uniform_of(word_of(state)))
+            charge = min(max(charge, 0.0), full_well_e)
+            value = (charge + offset_e[i, j] + noise_scale * read_noise_e * read) * counts_per_electron
+            value = np.floor(value + black_level + 0.5)
+            counts[i, j] = np.uint16(min(max(value, 0.0), float(full_scale)))
