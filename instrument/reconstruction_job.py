@@ -141,7 +141,29 @@ def job_from_calibration(
     ``binning`` then act on the pixels of both. Errors as ``job_from_files``.
     """
     folder = find_calibration(folder)
-    calibration, image = load_calibration(folder), read_image(image_path)
+    return job_with(
+        load_calibration(folder),
+        folder,
+        image_path,
+        dark=dark,
+        crop=crop,
+        binning=binning,
+        erasures=erasures,
+    )
+
+
+def job_with(
+    calibration: Calibration,
+    folder: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+    erasures: Choice = "saturated",
+) -> Job:
+    """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
+    image = read_image(image_path)
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)

@@ -60,6 +60,7 @@ class Rotation(enum.StrEnum):
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --dark dark.tif --bin 4 --out hand.tif",
         "diffuserbench reconstruct --psf psf.npy --image raw.npy --method fista --prior l1 --time 30",
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --method wiener --tau 0.01",
+        "diffuserbench reconstruct --volume psfs/ --image raw.tif --out volume.tif",
         "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
     )
 )
@@ -78,6 +79,25 @@ def reconstruct(
             show_default=False,
         ),
     ] = None,
+    volume: Annotated[
+        Path | None,
+        typer.Option(
+            "--volume",
+            metavar="FOLDER|STACK",
+            help="A volume: PSFs, one a depth (folder, stack or calibration).",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[
+        str,
+        typer.Option("--model", metavar="auto|convolution|local|lowrank", help="Camera model of a volume."),
+    ] = "auto",
+    background: Annotated[
+        bool,
+        typer.Option(
+            "--background/--no-background", help="Of a volume: estimate a smooth background as well."
+        ),
+    ] = True,
     z_mm: Annotated[
         float | None,
         typer.Option(
@@ -182,6 +202,31 @@ def reconstruct(
     grey or colour. Ctrl-C ends the work and keeps the picture so far; a second Ctrl-C gives it up.
     """
     outputs = Outputs.named(out, figure)
+    if volume is not None:
+        if (psf, calibration, z_mm, figure) != (None, None, None, None) or method is not Method.ADMM:
+            raise BenchError(
+                "With --volume, --psf, --calibration, --z-mm, --figure and --method do not apply."
+            )
+        from instrument.cli.volume import reconstruct_to_volume
+
+        reconstruct_to_volume(
+            volume,
+            image,
+            outputs,
+            model=model,
+            prior=None if prior is None else prior.value,
+            background=background,
+            dark=_dark(dark),
+            crop=None if crop is None else Crop.parse(crop),
+            binning=_binning(binning),
+            erasures=_erasures(erasures),
+            tau=tau,
+            iterations=iterations,
+            time_s=time_s,
+            tolerance=tolerance,
+            force=force,
+        )
+        return
     outputs.check(0, overwrite=force)
     with saying_what_is_left(*outputs.files()):
         job = _job(

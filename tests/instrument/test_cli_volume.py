@@ -1,0 +1,94 @@
+"""``diffuserbench reconstruct --volume`` from files to files."""
+
+import json
+
+import numpy as np
+import pytest
+import tifffile
+
+from instrument.calibration_file import save_calibration
+from instrument.cli import main
+from recon import Calibration, Geometry
+
+SIZE, DEPTHS, OFFSET = 32, 4, 100
+
+
+def psf(z):
+    """Spots of random lenslets, further apart the nearer the plane."""
+    lenses = np.random.default_rng(0).uniform(-9, 9, (12, 2))
+    image = np.zeros((SIZE, SIZE), np.float32)
+    rows, columns = np.round(lenses * (1 + 0.15 * z) + SIZE // 2).astype(int).T
+    np.add.at(image, (rows, columns), 200)
+    return image
+
+
+@pytest.fixture
+def files(tmp_path):
+    folder = tmp_path / "psfs"
+    folder.mkdir()
+    for z in range(DEPTHS):
+        tifffile.imwrite(folder / f"psf{z}.tif", psf(z))
+    photograph = 3 * np.roll(psf(2), (4, -3), (0, 1)) + OFFSET
+    photograph += np.random.default_rng(1).normal(0, 2, photograph.shape)
+    tifffile.imwrite(folder / "image.tif", photograph.astype(np.uint16))
+    return folder, folder / "image.tif", tmp_path / "volume.tif"
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*arguments):
+        code = main(["reconstruct", *map(str, arguments)])
+        output = capsys.readouterr()
+        return code, " ".join((output.out + output.err).split())
+
+    return call
+
+
+def test_writes_volume_views_and_record(files, run):
+    folder, image, out = files
+    code, output = run("--volume", folder, "--image", image, "--dark", OFFSET, "--prior", "l1", "--out", out)
+    assert code == 0, output
+    assert "one PSF a depth" in output
+    with tifffile.TiffFile(out) as tiff:
+        assert tiff.is_ome
+        assert tiff.series[0].axes == "ZYX"
+        volume = tiff.asarray()
+    assert np.unravel_index(volume.argmax(), volume.shape) == (2, SIZE // 2 + 4, SIZE // 2 - 3)
+    record = json.loads(out.with_suffix(".json").read_text())
+    assert record["model"] == "convolution"
+    assert record["background_estimated"]
+    assert record["grid"]["shape"] == [DEPTHS, SIZE, SIZE]
+    assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_voxel_sizes_of_a_calibration_reach_the_file(files, tmp_path, run):
+    _, image, out = files
+    z_um = np.array([9000.0, 10000.0, 11000.0, 12000.0])
+    positions = np.stack([0 * z_um, 0 * z_um, z_um], axis=1)
+    psfs = np.stack([psf(z)[None] for z in range(DEPTHS)])
+    save_calibration(Calibration(psfs, positions, geometry=Geometry(10.0, 5.0)), tmp_path / "calibration")
+    code, output = run(
+        "--volume", tmp_path / "calibration", "-i", image, "--dark", OFFSET, "-n", 3, "-o", out
+    )
+    assert code == 0, output
+    with tifffile.TiffFile(out) as tiff:
+        assert 'PhysicalSizeX="22.0"' in tiff.ome_metadata
+        assert 'PhysicalSizeZ="1000.0"' in tiff.ome_metadata
+    assert json.loads(out.with_suffix(".json").read_text())["grid"]["z_um"] == z_um.tolist()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--model", "exact"], "--model 'exact' is not known"),
+        (["--model", "local"], "several places of the field"),
+        (["--prior", "tv-haar"], "not for volumes"),
+        (["--z-mm", "3"], "do not apply"),
+    ],
+)
+def test_refuses_in_words(files, arguments, words, run):
+    folder, image, out = files
+    code, output = run("--volume", folder, "--image", image, "--out", out, "-n", "1", *arguments)
+    assert code == 2
+    assert words in output
+    assert not out.exists()
