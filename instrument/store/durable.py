@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,41 @@ def make_folder(path: Path) -> None:
 def write_json(path: Path, data: Json) -> None:
     """Write a mapping as a JSON file, atomically."""
     write_bytes(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+
+
+class SyncPool:
+    """Puts many files and folders on the disk at the same time.
+
+    Each sync ends with the disk emptying its cache, and the kernel joins such requests that come together:
+    here, sixteen frames of 1.3 megapixels took a third of the time that they take one after the other.
+    """
+
+    def __init__(self, threads: int = 8) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="sync")
+
+    def files(self, handles: Iterable[int]) -> None:
+        """Sync open files; returns, or raises the first error, when all have been tried."""
+        self._all([self._pool.submit(_sync_file, handle) for handle in handles])
+
+    def folders(self, paths: Iterable[Path]) -> None:
+        """Sync folders; returns, or raises the first error, when all have been tried."""
+        self._all([self._pool.submit(sync_folder, path) for path in paths])
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def _all(self, tasks: list[Future[None]]) -> None:
+        try:
+            wait(tasks)
+        finally:
+            wait(tasks)  # after Ctrl-C too: the caller closes the handles next
+        for task in tasks:
+            task.result()
+
+
+def _sync_file(handle: int) -> None:
+    os.fsync(handle)
 
 
 class AppendOnlyLog:

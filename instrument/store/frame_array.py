@@ -13,6 +13,7 @@ import shutil
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.atomic import sync_folder
-from instrument.store.durable import make_folder, write_json
+from instrument.store.durable import SyncPool, make_folder, write_json
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"
@@ -64,6 +65,16 @@ class FrameArray:
         self.frame_shape: tuple[int, ...] = (*shape[2:], shape[1]) if self.is_colour else shape[1:]
         self.dtype = np.dtype(described["data_type"])
         self._described = described
+
+    @cached_property
+    def _sync(self) -> SyncPool:
+        return SyncPool()
+
+    def close(self) -> None:
+        """End the threads that writing began, if any; reading needs no closing."""
+        if "_sync" in self.__dict__:
+            self._sync.close()
+            del self.__dict__["_sync"]
 
     @classmethod
     def create(
@@ -124,14 +135,13 @@ class FrameArray:
                     f"Frame {index} is {image.dtype} {image.shape}; "
                     f"the run stores {self.dtype} {self.frame_shape}."
                 )
-        # All of one kind before any of the next: a journalling file system then commits once for all frames,
-        # where frame by frame it would commit several times for each.
+        # All of one kind before any of the next, and those at the same time: the file system commits its
+        # journal once for all frames, where frame by frame it would several times for each.
         drafts: list[_Draft] = []
         try:
             for index, image in items:
                 drafts.append(self._write_draft(index, image))
-            for draft in drafts:
-                os.fsync(draft.handle)
+            self._sync.files(draft.handle for draft in drafts)
         except BaseException:
             for draft in drafts:
                 draft.path.unlink(missing_ok=True)
@@ -145,8 +155,7 @@ class FrameArray:
             target = self.chunk_path(index)
             draft.path.replace(target)
             folders.update(dict.fromkeys(folder for folder in target.parents if folder.is_relative_to(top)))
-        for folder in folders:
-            sync_folder(folder)
+        self._sync.folders(folders)
         return [draft.chunk for draft in drafts]
 
     def read(self, index: int) -> Image:

@@ -245,6 +245,8 @@ class RunWriter:
     def close(self) -> None:
         """Close the run's files and release its lock, without finishing it; closing twice does nothing."""
         self._log.close()
+        if self._array is not None:
+            self._array.close()
         if self._lock >= 0:
             lock, self._lock = self._lock, -1
             os.close(lock)

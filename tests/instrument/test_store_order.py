@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -36,9 +37,14 @@ class HonestDisk:
         self.moments = 0
         self.after_sync = lambda: None
         fsync = os.fsync
+        one_at_a_time = threading.RLock()  # files of a batch are synced by several threads
 
         def watched(handle: int) -> None:
             fsync(handle)
+            with one_at_a_time:
+                remember(handle)
+
+        def remember(handle: int) -> None:
             path = Path(f"/proc/self/fd/{handle}").resolve()
             if root == path or root in path.parents:
                 self._remember(handle, path)
@@ -120,7 +126,7 @@ def test_the_test_above_can_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     disk = HonestDisk(root, monkeypatch)
     plan = Plan(label="order", parts=(Part(label="a"),))
     with RunWriter.create(root, label="order", bench=BENCH, plan=plan) as writer:
-        monkeypatch.setattr("instrument.store.frame_array.sync_folder", lambda _: None)
+        monkeypatch.setattr("instrument.store.durable.SyncPool.folders", lambda *_: None)
         writer.write([FrameToStore(0, np.zeros((4, 5), np.uint8), METADATA)])
     (run,) = (p for p in disk.after_power_cut(tmp_path / "copy").iterdir() if p.name[0] != ".")
     try:
