@@ -6,56 +6,24 @@ import hashlib
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
-from drivers.camera import Camera, Roi, TriggerMode
-from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.device import DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
-from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.camera_settings import SimulatedCameraSettings
 from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-ROI_STEP = 4
-BINNINGS = (1, 2, 4)
-GAIN_LIMITS = (1.0, 16.0)
 
 
-class CameraOptions(DriverOptions):
-    """Options of the simulated camera in ``bench.toml``."""
-
-    color: bool = Field(
-        False, description="A Bayer (RGGB) mosaic over the pixels instead of a monochrome sensor."
-    )
-    crosstalk: float = Field(
-        0.05,
-        ge=0,
-        le=0.3,
-        description="Fraction of a band that each of the other colours' filters lets through.",
-    )
-    frames_per_s: float | None = Field(
-        None, gt=0, description="Highest frame rate of a sequence; left out: the sensor's."
-    )
-    replay_frames: int = Field(
-        0,
-        ge=0,
-        le=1000,
-        description=(
-            "Frames rendered beforehand for each state of light and settings, then shown in turn: the full "
-            "rate on a slow computer. 0: every frame is rendered with noise of its own."
-        ),
-    )
-
-
-class SimulatedCamera(SimulatedDevice, Camera):
+class SimulatedCamera(SimulatedCameraSettings):
     """A camera whose frames are exposures of what the simulated world throws onto its sensor.
 
     A frame is exposed wholly after it was asked for: it sees the world as it is half way through its
@@ -64,32 +32,18 @@ class SimulatedCamera(SimulatedDevice, Camera):
     two different photographs share their noise.
     """
 
-    kind = "camera"
-    Options = CameraOptions
     drops_counted_by = "device frame numbers"
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, CameraOptions):
-            raise TypeError(f"The simulated camera takes CameraOptions, not {type(options).__name__}.")
-        self._connect(shared)
-        self.options = options
-        self._spec = self.world.sensor
-        self._lock = threading.RLock()
-        self._arrived = threading.Condition(self._lock)
+        super().__init__(options, shared)
+        self._arrived = threading.Condition(threading.RLock())
         self._abort = threading.Event()
         self._producer: threading.Thread | None = None
         self._ring: deque[Frame] = deque()
         self._reset()
 
     def _reset(self) -> None:
-        low, high = self._spec.exposure_limits_ms
-        self._exposure_ms = min(max(10.0, low), high)
-        self._gain = 1.0
-        self._roi = Roi(0, 0, *self._spec.shape)
-        self._binning = 1
-        self._pixel_format = self.pixel_formats[0]
-        self._black_fraction = self._spec.black_level
-        self._trigger_mode: TriggerMode = "free_run"
+        self._reset_settings()
         self._triggers = 0
         self._next_id = 0
         self._lost = 0
@@ -97,10 +51,6 @@ class SimulatedCamera(SimulatedDevice, Camera):
         self._light: tuple[Any, npt.NDArray[np.float32]] | None = None
         self._pattern: tuple[Any, FixedPattern] | None = None
         self._replay: tuple[npt.NDArray[np.float32], Any, list[tuple[Pixels, float]]] | None = None
-
-    # Device ---
-    def _model(self) -> str:
-        return self._spec.name + (" Color" if self.options.color else "")
 
     def open(self) -> None:
         """Connect, with the camera's own default settings."""
@@ -116,187 +66,6 @@ class SimulatedCamera(SimulatedDevice, Camera):
             self._end()
             self._is_open = False
 
-    def settings(self) -> Mapping[str, Setting]:
-        """Read all settings."""
-        self._require()
-        return {
-            "exposure_ms": self._exposure_ms,
-            "gain": self._gain,
-            "black_level": self.black_level,
-            "pixel_format": self._pixel_format,
-            "significant_bits": self.significant_bits,
-            "roi": self._roi.as_tuple(),
-            "binning": self._binning,
-            "trigger_mode": self._trigger_mode,
-            "sensor_shape": self._spec.shape,
-            "pixel_pitch_um": self._spec.pitch_um,
-        }
-
-    # What the sensor is ---
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        """``(height, width)`` of the whole sensor in pixels."""
-        return self._spec.shape
-
-    @property
-    def pixel_pitch_um(self) -> float:
-        """Pitch of the unbinned pixels."""
-        return self._spec.pitch_um
-
-    @property
-    def pixel_formats(self) -> tuple[str, ...]:
-        """Formats by their GenICam names, the native one first."""
-        stem = "BayerRG" if self.options.color else "Mono"
-        return tuple(f"{stem}{bits}" for bits in (16, 12, 8) if bits <= self._spec.bits)
-
-    # Settings ---
-    @property
-    def exposure_ms(self) -> float:
-        """Exposure time."""
-        return self._exposure_ms
-
-    @property
-    def exposure_limits_ms(self) -> tuple[float, float]:
-        """Shortest and longest exposure."""
-        return self._spec.exposure_limits_ms
-
-    def set_exposure_ms(self, exposure_ms: float) -> float:
-        """Set the exposure; it counts whole microseconds."""
-        self._require()
-        low, high = self._spec.exposure_limits_ms
-        if not low <= exposure_ms <= high:
-            raise LimitError(
-                self.name, f"cannot expose {exposure_ms:g} ms.", f"Its exposure is {low:g} to {high:g} ms."
-            )
-        with self._lock:
-            self._exposure_ms = round(exposure_ms * 1e3) / 1e3
-        return self._exposure_ms
-
-    @property
-    def gain(self) -> float:
-        """Electronic gain factor."""
-        return self._gain
-
-    @property
-    def gain_limits(self) -> tuple[float, float]:
-        """Smallest and largest gain factor."""
-        return GAIN_LIMITS
-
-    def set_gain(self, gain: float) -> float:
-        """Set the gain factor; it has steps of 0.01."""
-        self._require()
-        low, high = GAIN_LIMITS
-        if not low <= gain <= high:
-            raise LimitError(self.name, f"has no gain {gain:g}.", f"Its gain is {low:g} to {high:g}.")
-        with self._lock:
-            self._gain = round(gain, 2)
-        return self._gain
-
-    @property
-    def black_level(self) -> float:
-        """Offset in counts of the present pixel format."""
-        return self._black_fraction * self._full_scale
-
-    def set_black_level(self, black_level: float) -> float:
-        """Set the offset, up to an eighth of full scale."""
-        self._require()
-        self._require_idle("black level")
-        highest = self._full_scale / 8
-        if not 0 <= black_level <= highest:
-            raise LimitError(
-                self.name, f"has no black level {black_level:g}.", f"It is 0 to {highest:g} counts."
-            )
-        self._black_fraction = black_level / self._full_scale
-        return self.black_level
-
-    @property
-    def roi(self) -> Roi:
-        """Region of interest in sensor pixels."""
-        return self._roi
-
-    def set_roi(self, roi: Roi | None) -> Roi:
-        """Set the region of interest; its borders fall on multiples of 4 pixels inside the one asked for."""
-        self._require()
-        self._require_idle("region of interest")
-        height, width = self._spec.shape
-        if roi is None:
-            self._roi = Roi(0, 0, height, width)
-            return self._roi
-        top, left = (-(-start // ROI_STEP) * ROI_STEP for start in (roi.top, roi.left))
-        bottom, right = (
-            end if end == side else end // ROI_STEP * ROI_STEP
-            for end, side in ((roi.top + roi.height, height), (roi.left + roi.width, width))
-        )
-        outside = roi.top < 0 or roi.left < 0 or roi.top + roi.height > height or roi.left + roi.width > width
-        if outside or bottom - top < ROI_STEP or right - left < ROI_STEP:
-            raise LimitError(
-                self.name,
-                f"cannot read the region (top, left, height, width) = {roi.as_tuple()}.",
-                f"The sensor has {height} x {width} pixels, the smallest region {ROI_STEP} x {ROI_STEP}.",
-            )
-        self._roi = Roi(top, left, bottom - top, right - left)
-        return self._roi
-
-    @property
-    def binning(self) -> int:
-        """Sensor pixels summed along each axis."""
-        return self._binning
-
-    @property
-    def binnings(self) -> tuple[int, ...]:
-        """Binning factors on offer (a colour mosaic cannot be summed)."""
-        return (1,) if self.options.color else BINNINGS
-
-    def set_binning(self, binning: int) -> int:
-        """Set the binning."""
-        self._require()
-        self._require_idle("binning")
-        if binning not in self.binnings:
-            raise LimitError(self.name, f"has no binning {binning}.", f"It offers {self.binnings}.")
-        self._binning = binning
-        return binning
-
-    @property
-    def pixel_format(self) -> str:
-        """Pixel format by its GenICam name."""
-        return self._pixel_format
-
-    def set_pixel_format(self, pixel_format: str) -> str:
-        """Set the pixel format."""
-        self._require()
-        self._require_idle("pixel format")
-        if pixel_format not in self.pixel_formats:
-            raise LimitError(
-                self.name,
-                f"has no pixel format {pixel_format!r}.",
-                f"It offers {', '.join(self.pixel_formats)}.",
-            )
-        self._pixel_format = pixel_format
-        return pixel_format
-
-    @property
-    def significant_bits(self) -> int:
-        """Bits that carry signal."""
-        return int(self._pixel_format.removeprefix("Mono").removeprefix("BayerRG"))
-
-    @property
-    def _full_scale(self) -> int:
-        return (1 << self.significant_bits) - 1
-
-    @property
-    def trigger_mode(self) -> TriggerMode:
-        """What starts an exposure."""
-        return self._trigger_mode
-
-    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
-        """Choose what starts an exposure; nothing is wired to the hardware trigger."""
-        self._require()
-        self._require_idle("trigger mode")
-        if mode not in ("free_run", "software"):
-            raise LimitError(self.name, f"has no trigger mode {mode!r}.", "It offers free_run, software.")
-        self._trigger_mode = mode
-        return mode
-
     # Taking images ---
     def snap(self) -> Frame:
         """Take one frame whose exposure begins now, and wait for it."""
@@ -311,7 +80,7 @@ class SimulatedCamera(SimulatedDevice, Camera):
         self._require_idle("second sequence")
         if n_buffers < 1:
             raise LimitError(self.name, f"cannot stream into {n_buffers} buffers.", "Ask for one or more.")
-        with self._lock:
+        with self._arrived:
             self._ring = deque(maxlen=n_buffers)
             self._triggers = 0
             self._lost = 0
@@ -372,10 +141,6 @@ class SimulatedCamera(SimulatedDevice, Camera):
         if producer is not None and producer is not threading.current_thread():
             producer.join()
 
-    def _require_idle(self, what: str) -> None:
-        if self._producer is not None:
-            raise DeviceError(self.name, f"streams: no new {what} now.", "Stop the sequence first.")
-
     # Producing frames ---
     def _produce(self) -> None:
         due = time.monotonic()
@@ -397,9 +162,14 @@ class SimulatedCamera(SimulatedDevice, Camera):
         except StoppedError:
             return
         except DeviceError as error:
+            self._failure = error
+        finally:
             with self._arrived:
-                self._failure = error
-                self._producer = None
+                if self._producer is threading.current_thread():
+                    # Not stopped from outside: whoever waits for a frame must hear that none comes.
+                    self._producer = None
+                    ended = DeviceError(self.name, "its sequence ended by an error.", "See the log.")
+                    self._failure = self._failure or ended
                 self._arrived.notify_all()
 
     def _await_trigger(self) -> bool:
@@ -413,7 +183,7 @@ class SimulatedCamera(SimulatedDevice, Camera):
 
     def _take(self) -> Frame:
         """Expose, read out, and wrap one frame."""
-        with self._lock:
+        with self._arrived:
             exposure_ms, gain = self._exposure_ms, self._gain
             frame_id, self._next_id = self._next_id, self._next_id + 1
         half = exposure_ms * 1e-3 / 2

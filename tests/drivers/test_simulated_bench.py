@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections.abc import Callable
@@ -13,7 +14,8 @@ from pydantic import ValidationError
 
 from drivers.camera import Roi
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
-from drivers.simulated.camera import CameraOptions, SimulatedCamera
+from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
@@ -205,6 +207,18 @@ def test_an_unplugged_camera_says_so_even_while_streaming() -> None:
     bench.world.plug_in("camera")
     bench.camera.open()
     bench.camera.snap()
+
+
+def test_a_sequence_that_dies_says_so_to_who_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    monkeypatch.setattr(bench.world, "photons_per_s", lambda *_: 1 / 0)
+    reported: queue.Queue[threading.ExceptHookArgs] = queue.Queue()
+    monkeypatch.setattr(threading, "excepthook", reported.put)
+    bench.camera.start_sequence()
+    with pytest.raises(DeviceError, match="ended by an error"):
+        bench.camera.next_frame(10.0)
+    assert not bench.camera.is_streaming
+    assert reported.get(timeout=10.0).exc_type is ZeroDivisionError
 
 
 @pytest.mark.parametrize("kind", ["stage", "led_array"])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.device import Device
-from drivers.simulated.camera import CameraOptions, SimulatedCamera
+from drivers.simulated.camera import SimulatedCamera
+from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.device import Device
-from drivers.simulated.camera import CameraOptions
+from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.display import DisplayCamera, DisplaySlm, DisplayStage, DisplayStageOptions
 from drivers.simulated.display_world import DisplayOptions, DisplayWorld
 from drivers.simulated.slm import SlmOptions
