@@ -8,6 +8,7 @@ from recon.operators.erasures import Erasures
 from recon.operators.local_convolution import FieldOfPsfs, local_convolution
 from recon.operators.low_rank import PrincipalPsfs, low_rank, principal_psfs
 from recon.operators.spatially_varying import Group, SpatiallyVarying
+from recon.operators.two_part import two_part_field
 
 __all__ = [
     "BackgroundRemoval",
@@ -24,4 +25,5 @@ __all__ = [
     "local_convolution",
     "low_rank",
     "principal_psfs",
+    "two_part_field",
 ]
