@@ -7,7 +7,9 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from drivers.device import DriverOptions
-from drivers.simulated.presets import DiffuserKind
+from drivers.simulated.presets import PRESETS, DiffuserKind
+
+MOST_SAMPLES = 32e6
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -81,6 +83,44 @@ class WorldOptions(DriverOptions):
         1.0, description="Brightness of the point source relative to the preset's."
     )
     spectral_samples: int = Field(1, ge=1, le=9, description="Wavelengths averaged in each colour band.")
+
+    @model_validator(mode="after")
+    def _diffuser_can_be_made(self) -> Self:
+        preset = PRESETS[self.preset]
+        pitch_um = preset.height_map_pitch_um
+        height_mm, width_mm = self.aperture_mm or preset.aperture_mm
+        samples = height_mm * width_mm * 1e6 / pitch_um**2
+        if samples > MOST_SAMPLES:
+            side_mm = MOST_SAMPLES**0.5 * pitch_um * 1e-3
+            raise ValueError(
+                f"aperture_mm = [{height_mm:g}, {width_mm:g}] is too large to simulate with preset "
+                f"{self.preset!r}: at most {side_mm:.0f} mm square"
+            )
+        if (self.diffuser or preset.diffuser) == "smooth":
+            if self.feature_size_um < 4 * pitch_um:
+                raise ValueError(
+                    f"feature_size_um = {self.feature_size_um:g} is finer than preset {self.preset!r} "
+                    f"samples its diffuser: at least {4 * pitch_um:g}"
+                )
+        else:
+            lenslet_um = self.lenslet_um or preset.lenslet_um
+            shortest_um = 1.7 * lenslet_um
+            if (self.focal_length_um or preset.focal_length_um) < shortest_um:
+                raise ValueError(
+                    f"lenslets of {lenslet_um:g} um in air cannot focus so close: focal_length_um is at "
+                    f"least {shortest_um:g}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _beads_lie_in_front(self) -> Self:
+        distance_mm = self.scene_distance_mm or PRESETS[self.preset].source_distance_mm
+        if self.scene == "beads" and (self.scene_depth_mm or 0.0) >= 2 * distance_mm:
+            raise ValueError(
+                f"scene_depth_mm = {self.scene_depth_mm:g} about a middle at {distance_mm:g} mm reaches "
+                f"behind the diffuser: less than {2 * distance_mm:g}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _table_fits(self) -> Self:

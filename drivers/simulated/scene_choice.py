@@ -37,8 +37,6 @@ def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Sce
         return tilted_target(bar_target(), z_um, height_um, options.scene_tilt_deg)
     depth_um = 0.5 * z_um if options.scene_depth_mm is None else 1e3 * options.scene_depth_mm
     near, far = z_um - depth_um / 2, z_um + depth_um / 2
-    if near <= 0:
-        raise ValueError(f"scene_depth_mm = {depth_um / 1e3:g} would reach behind the diffuser")
     extent_um = (height_um * near / z_um, height_um * near / z_um)
     return bead_volume(
         options.beads, extent_um, (near, far), diameter_um=options.bead_diameter_um, seed=options.seed

@@ -149,7 +149,13 @@ class SimulatedWorld(Surroundings):
     def _psf(self, source: Position, weights: Rgb, binning: int) -> Image:
         grid = self.sensor_grid(binning)
         spectrum = mixed_spectrum(weights, self.options.spectral_samples)
-        light = self.propagator.psf(source, grid, spectrum, diameter_um=self.source_diameter_um)
+        light = self.propagator.psf(
+            source,
+            grid,
+            spectrum,
+            diameter_um=self.source_diameter_um,
+            emission="isotropic" if self.preset.fluorescent else "lambertian",
+        )
         light *= response_on(grid, source, self.distance_um, self.fall_off)
         return light
 

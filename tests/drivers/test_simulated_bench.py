@@ -371,11 +371,21 @@ def test_ground_truth_follows_the_scene() -> None:
         {"aperture_mm": [0, 1]},
         {"mean_slope_deg": 45},
         {"typo": 1},
+        {"aperture_mm": [300.0, 300.0]},
+        {"feature_size_um": 2.0},
+        {"diffuser": "random_microlens", "focal_length_um": 300.0},
+        {"scene": "beads", "scene_depth_mm": 200.0},
     ],
 )
 def test_wrong_options_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        WorldOptions.model_validate(wrong)
+        WorldOptions.model_validate({"preset": "tiny"} | wrong)
+
+
+@pytest.mark.parametrize("kind", ["random_microlens", "regular_microlens"])
+def test_the_shortest_focal_length_allowed_can_be_made(kind: str) -> None:
+    bench = Bench(diffuser=kind, lenslet_um=100.0, focal_length_um=170.0)
+    assert np.isfinite(bench.world.diffuser.heights_um).all()
 
 
 def test_a_fall_off_table_is_what_the_pixels_do() -> None:
