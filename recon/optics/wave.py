@@ -11,7 +11,7 @@ scaling theorem) what remains is a convolution with a quadratic phase over the d
 :math:`\rho = z d / (z + d)`, stretched by :math:`1/\cos\theta` across and :math:`1/\cos^3\theta` along the
 direction of incidence, followed by the exact projection :math:`s = (1 + d/z)\,u - (d/z)\,x`. Because
 :math:`\theta` differs over the aperture when the source is close, the aperture is worked on in tiles small
-enough that the stretch hardly varies within one. docs/decisions/0006-propagation.md compares the choices.
+enough that the stretch hardly varies within one. docs/decisions/0008-propagation.md compares the choices.
 """
 
 from __future__ import annotations
