@@ -31,7 +31,7 @@ Array = npt.NDArray[Any]
 VolumePrior = Literal["tv", "tv-isotropic", "l1", "nonnegative"]
 PRIORS: tuple[VolumePrior, ...] = ("tv", "tv-isotropic", "l1", "nonnegative")
 
-NOISE_WEIGHT = {"tv": 1.0, "l1": 3.0}
+NOISE_WEIGHT = {"tv": 1.0, "l1": 1.5}
 """Default weight in units of the noise that the adjoint of a unit-energy PSF passes on: for TV as large, for
 l1 what noise exceeds in few voxels."""
 LEAST_TAU = {"tv": 1e-5, "l1": 1e-2}
