@@ -71,7 +71,8 @@ def reconstruct(
     z_um : float, optional
         Depth of the scene; chooses the nearest calibrated PSF. Needed when there are several.
     method : str
-        A name from :func:`recon.methods.method_names`: ``"admm"``, ``"fista"``, ``"wiener"``.
+        A name from :func:`recon.methods.method_names`: ``"admm"``, ``"admm-sensor"``
+        (for dense scenes on many pixels), ``"fista"``, ``"wiener"``.
     prior : str or Prior
         A name from :data:`PRIORS` (all but ``"none"`` include non-negativity), or a prior for the scaled
         problem of :func:`recon.preparation.prepare`. Of these, ``"wiener"`` keeps only the bounds.

@@ -86,18 +86,11 @@ def advance(
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def residual(
-    start: int, stop: int, r: Any, seen: Any, left: int, data: Any, weight: Any, e: Any, sums: Any
-) -> None:
-    """``r <- data - seen - e``; ``sums[row] <- sum weight (data - seen)^2``."""
-    width = data.shape[1]
+def residual(start: int, stop: int, r: Any, seen: Any, left: int, data: Any, e: Any) -> None:
+    """``r <- data - seen - e``."""
     for i in range(start, stop):
-        total = e[i, 0] - e[i, 0]
-        for j in range(width):
-            missing = data[i, j] - seen[i, left + j]
-            r[i, j] = missing - e[i, j]
-            total += weight[i, j] * missing * missing
-        sums[i] = total
+        for j in range(data.shape[1]):
+            r[i, j] = data[i, j] - seen[i, left + j] - e[i, j]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)

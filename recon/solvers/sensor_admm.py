@@ -154,8 +154,9 @@ class SensorAdmm(Solver):
     def step(self) -> IterationRecord:
         """Solve for the object, then update the priors' splits in one sweep over memory.
 
-        ``data_residual`` is that of the object before the data term's correction, ``objective`` its sum with
-        the priors after it: both meet the solution's as the iteration converges.
+        ``data_residual`` is the norm of ``e``, which is the object's residual but for what the data steps
+        leave; ``objective`` adds the priors of the object and its split variables. Both meet the solution's
+        as the iteration converges.
         """
         if self.iteration in BALANCING:
             self._splits.set_penalties(self._balanced_penalties())
@@ -174,7 +175,7 @@ class SensorAdmm(Solver):
         self._adapt()
 
     def _solve(self, channel: int, steps: int) -> float:
-        """Turn a channel's right-hand side into its object; return the squared data residual before.
+        """Turn a channel's right-hand side into its object; return its squared data residual.
 
         Conjugate gradients on ``e``, warm-started.
         """
@@ -189,12 +190,12 @@ class SensorAdmm(Solver):
         fft.rfft(y, out=Y)
         _over_rows(kernels.predict, Y, E, H, *T, P)
         fft.irfft_strip(P[None], self._top, band[None])
-        sums = self._row_sums[: len(r)]
-        _over_rows(kernels.residual, r, band, self._left, self._data[channel], weight, e, sums)
-        misfit = float(sums.sum())
+        _over_rows(kernels.residual, r, band, self._left, self._data[channel], e)
         rho_before = 1.0
         for step in range(steps):
             rho = float(np.vdot(r, self._preconditioners[channel].apply(r, self._z)))
+            if np.isnan(rho):
+                return rho
             if not rho > 0:
                 break
             if step:
@@ -221,7 +222,7 @@ class SensorAdmm(Solver):
         if self._erased:
             _over_rows(kernels.impute, self._data[channel], weight, e, f(IMPUTATION))
         fft.irfft(Y, y.shape[1], out=y)
-        return misfit
+        return float(np.vdot(e, weight * e if self._erased else e))
 
     def _adapt(self) -> None:
         """Tell the preconditioners of new penalties."""
