@@ -195,6 +195,7 @@ class SensorAdmm(Solver):
         for step in range(steps):
             rho = float(np.vdot(r, self._preconditioners[channel].apply(r, self._z)))
             if np.isnan(rho):
+                y[...] = rho
                 return rho
             if not rho > 0:
                 break
