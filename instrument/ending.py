@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 from instrument.bench import Bench
+from instrument.interrupt import interrupts_held
 from instrument.safety import StepsFailedError, try_all
 from instrument.store import FinishReason, Run, RunWriter
 
@@ -22,7 +23,7 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
     reason : FinishReason
     error : BaseException, optional
         What ended the acquisition. It gets notes on what failed here and on where the run is, and stays the
-        error that matters.
+        error that matters, also when Ctrl-C is pressed meanwhile.
 
     Returns
     -------
@@ -34,7 +35,21 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
     StepsFailedError, RunError
         When something failed here and there is no ``error`` to note it on: the bench could not be made safe,
         or the run's end not be written.
+    KeyboardInterrupt, SystemExit
+        When it was asked for meanwhile and there is no ``error``; everything was done before.
     """
+    with interrupts_held() as held:
+        run = _end(bench, writer, reason, error)
+    if error is None:
+        try:
+            held.answer()
+        except BaseException as interruption:
+            interruption.add_note(f"What was acquired is in {writer.path}")
+            raise
+    return run
+
+
+def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseException | None) -> Run:
     text = "" if error is None else str(error) or type(error).__name__
     ended: list[Run] = []
     try:

@@ -13,6 +13,7 @@ configured) and the run's files are closed, in that order, each tried even when 
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -235,6 +236,9 @@ class Runner:
             raise
         else:
             run = self._end(FinishReason.COMPLETED)
+        finally:
+            if not self._finished.is_set():  # a second Ctrl-C came before the ending had begun
+                self._end(FinishReason.ABORTED, sys.exception())
         return run
 
     def _do_steps(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from instrument.interrupt import CtrlC
+from instrument.interrupt import CtrlC, interrupts_held
 
 
 def in_context(work: Callable[[CtrlC], None]) -> None:
@@ -65,3 +65,32 @@ def test_without_ctrl_c_and_in_other_threads_nothing_happens() -> None:
     thread.start()
     thread.join()
     assert during == [before]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_held_signals_wait_for_the_end_and_the_third_goes_through(number: int) -> None:
+    def end(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(number, end)
+    try:
+        with interrupts_held() as held:
+            signal.raise_signal(number)
+            signal.raise_signal(number)
+        assert signal.getsignal(number) is end
+        with pytest.raises(KeyboardInterrupt):
+            held.answer()
+        with interrupts_held():
+            signal.raise_signal(number)
+            signal.raise_signal(number)
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(number)
+        assert signal.getsignal(number) is end
+    finally:
+        signal.signal(number, before)
+
+
+def test_nothing_held_is_nothing_to_answer() -> None:
+    with interrupts_held() as held:
+        pass
+    held.answer()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from instrument.config_file import parse_config
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
 from instrument.runner import RunState, RunStatus
 from instrument.safety import StepsFailedError
-from instrument.store import FinishReason, RunCondition
+from instrument.store import FinishReason, Run, RunCondition, RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -124,6 +125,52 @@ def test_whatever_fails_the_bench_is_safe_and_the_run_says_so(
     assert str(path) in str(caught.value.__notes__)
     interrupted = isinstance(error, KeyboardInterrupt)
     assert runner.status.reason is (FinishReason.ABORTED if interrupted else FinishReason.FAILED)
+
+
+def test_a_second_ctrl_c_before_the_ending_begins_skips_nothing_of_it(tmp_path: Path) -> None:
+    presses: list[RunStatus] = []
+
+    def press(status: RunStatus) -> None:
+        if status.done == 2 and len(presses) < 2:
+            presses.append(status)
+            raise KeyboardInterrupt
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path)
+        runner.on_progress = press
+        with pytest.raises(KeyboardInterrupt):
+            runner.execute()
+        assert calls(bench)[-4:] == SAFE
+    assert [p.state for p in presses] == [RunState.RUNNING, RunState.ENDING]
+    assert Run.open(runner.path).condition is RunCondition.ABORTED
+    assert runner.status.state is RunState.FINISHED
+
+
+@pytest.mark.parametrize("pressed_before", [True, False])
+def test_a_ctrl_c_while_the_run_is_closed_waits_until_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pressed_before: bool
+) -> None:
+    note = RunWriter.note
+
+    def interrupted_note(self: RunWriter, kind: str, **fields: object) -> None:
+        note(self, kind, **fields)
+        if kind == "finished":
+            signal.raise_signal(signal.SIGINT)
+
+    def press(name: str, count: int) -> None:
+        if pressed_before and (name, count) == ("camera.snap", 3):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(RunWriter, "note", interrupted_note)
+    on_call(monkeypatch, press)
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path)
+        with pytest.raises(KeyboardInterrupt) as caught:
+            runner.execute()
+        assert calls(bench)[-4:] == SAFE
+    assert str(runner.path) in str(caught.value.__notes__)
+    ended = RunCondition.ABORTED if pressed_before else RunCondition.COMPLETED
+    assert Run.open(runner.path).condition is ended
 
 
 def test_every_safe_step_is_tried_and_the_first_error_is_kept(
