@@ -162,7 +162,8 @@ class _LayerRenderer:
     def _cells(self, axis: int, edges_um: npt.NDArray[np.float64]) -> range:
         """Cells (multiples of the fine pitch) that hold any of the picture and can reach the sensor."""
         pitch = self.fine.pitch_um
-        on_sensor = -edges_um[[-1, 0]] * self.magnification / pitch
+        center = self.fine.center_um[1 - axis]
+        on_sensor = (-edges_um[[-1, 0]] * self.magnification - center) / pitch
         reach = (self.fine.shape[axis] * pitch / 2 + self.half_kernel[axis]) / pitch
         low = max(int(np.floor(on_sensor[0] + 0.5)), -int(np.ceil(reach)))
         high = min(int(np.ceil(on_sensor[1] - 0.5)), int(np.ceil(reach)))

@@ -101,3 +101,18 @@ def test_truth_keeps_a_pictures_light() -> None:
     row, column = np.argwhere(image).mean(axis=0)
     assert row > 60
     assert column > 60
+
+
+def test_a_sensor_off_the_axis_sees_its_part_of_the_picture(propagator: WavePropagator) -> None:
+    """Half of a sensor sees what the whole one sees there, although its centre is elsewhere."""
+    cell_um = GRID.pitch_um * Z_UM / DISTANCE_UM
+    radiance = np.random.default_rng(2).random((60, 60, 3)).astype(np.float32).mean(axis=2, keepdims=True)
+    size_um = (60 * cell_um, 60 * cell_um)
+    scene = Scene("middle", layers=(Layer(np.repeat(radiance, 3, 2), Z_UM, size_um),))
+
+    def seen(grid: PixelGrid) -> np.ndarray:
+        return render(scene, GREEN_ONLY, grid, propagator, no_fall_off, layer_photons=1.0, bead_photons=1.0)
+
+    right = PixelGrid((120, 80), GRID.pitch_um, (40 * GRID.pitch_um, 0.0))
+    whole, half = seen(GRID)[:, 80:], seen(right)
+    assert np.linalg.norm(half - whole) < 0.02 * np.linalg.norm(whole)
