@@ -265,7 +265,9 @@ class SimulatedCamera(SimulatedCameraSettings):
             light = self.world.photons_per_s(sensitivity, self._binning)
             if light is not None:
                 total += light[rows, columns] if mosaic is None else light[rows, columns] * mosaic
-        self._light = (key, total)
+        # What changed meanwhile (another thread switched a light) must not be found under the old key later.
+        unchanged = self.world.light_key() == key[0]
+        self._light = (key, total) if unchanged else None
         return total
 
     def _filters(self) -> list[tuple[Rgb, npt.NDArray[np.float32] | None]]:

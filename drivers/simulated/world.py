@@ -175,11 +175,12 @@ class SimulatedWorld(Surroundings):
             brightness = total * self.options.source_brightness * self.preset.source_photons_per_s_sr
             hue = (glow[0] / total, glow[1] / total, glow[2] / total)
             light = self.psf(self.source_position_um, hue, binning) * np.float32(brightness)
-        scene = self._scene
+        with self._lock:
+            scene, number = self._scene, self._scene_number
         if self.scene_lit and scene is not None:
             seen = _product(self._glow(self.options.scene_rgb), weights)
             picture = self._cached(
-                ("scene", self._scene_number, seen, binning), lambda: self._render(scene, seen, binning)
+                ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
             )
             light = picture if light is None else light + picture
         return light

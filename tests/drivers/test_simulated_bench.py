@@ -20,7 +20,7 @@ from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
-from drivers.simulated.world import SimulatedWorld
+from drivers.simulated.world import Rgb, SimulatedWorld
 
 Z_UM = 100e3
 
@@ -342,6 +342,45 @@ def test_grey_levels_become_phase_through_the_table() -> None:
         full = 2 * np.pi * 255 / 256
         expected = full * (np.array([[0, 255], [128, 64]]) / 255) ** 1.5
         np.testing.assert_allclose(slm.phase_rad, expected, rtol=1e-5)
+
+
+# Races ---
+def test_a_scene_changed_while_a_frame_is_made_is_not_mistaken_for_the_one_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench, other = Bench(scene="beads", beads=2), Bench(scene="beads", beads=1)
+    bench.world.scene_lit = other.world.scene_lit = True
+    glow = bench.world._glow
+
+    def change(light: Rgb) -> Rgb:
+        bench.world.set_scene(other.world.scene)
+        return glow(light)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.world, "_glow", change)
+        bench.world.photons_per_s((0, 1, 0))
+    seen, expected = (b.world.photons_per_s((0, 1, 0)) for b in (bench, other))
+    assert seen is not None
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_a_light_switched_while_a_frame_is_made_is_seen_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    lit = bench.lit()
+    bench.leds.off()
+    bench.counts()
+    key = bench.world.light_key
+
+    def switch_off() -> object:
+        lit_key = key()
+        bench.leds.off()
+        return lit_key
+
+    bench.leds.set_pattern(bench.leds.single(0, (0, 255, 0)))
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.world, "light_key", switch_off)
+        bench.counts()
+    np.testing.assert_array_equal(bench.lit(), lit)
 
 
 # Truth, options ---
