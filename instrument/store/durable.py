@@ -95,7 +95,7 @@ class AppendOnlyLog:
             while written < len(data):
                 written += os.write(self._handle, data[written:])
             os.fsync(self._handle)
-        except OSError:
+        except BaseException:  # Ctrl-C too: half a line would hide all that follow it
             os.ftruncate(self._handle, self._size)
             raise
         self._size += len(data)

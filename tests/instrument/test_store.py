@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -155,6 +156,27 @@ def test_a_torn_line_is_forgotten_and_the_next_one_is_whole(tmp_path: Path) -> N
         log.append([{"a": 4}])
         log.close()
         assert read_lines(path)[0] == [{"a": 1}, {"a": 2}, {"a": 4}]
+
+
+def test_an_interrupted_append_leaves_nothing_and_loses_nothing_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "log.jsonl"
+    log = AppendOnlyLog(path)
+    log.append([{"a": 1}])
+    for interruption in (KeyboardInterrupt(), OSError(5, "broken")):
+
+        def fail(_: int, error: BaseException = interruption) -> None:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", fail)
+            with pytest.raises(type(interruption)):
+                log.append([{"a": 2}])
+        assert read_lines(path)[0] == [{"a": 1}]
+    log.append([{"a": 3}])
+    log.close()
+    assert read_lines(path)[0] == [{"a": 1}, {"a": 3}]
 
 
 def test_a_frame_of_another_shape_or_place_is_refused(tmp_path: Path) -> None:
