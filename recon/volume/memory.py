@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import weakref
@@ -147,7 +148,13 @@ class Storage:
             )
         self._count += 1
         path = self._folder / f"{self._count}.dat"
-        return np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
+        array = np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
+        if hasattr(
+            os, "posix_fallocate"
+        ):  # a file without its blocks kills the process when the disk is full
+            with path.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+        return array
 
 
 def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
