@@ -120,8 +120,8 @@ def reconstruct(
     peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
     given_tau = tau
     tau = max(NOISE_WEIGHT / peak if peak > 0 else 0.0, LEAST_TAU) if tau is None else float(tau)
-    if not tau >= 0:
-        raise InputError(f"tau must not be negative; got {tau}.")
+    if not 0 <= tau < np.inf:
+        raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
     name, penalty = _named(prior, tau * peak)
     try:
         rules = StoppingRules(

@@ -96,37 +96,20 @@ def prepare(
     erasures: npt.ArrayLike | None = None,
 ) -> Prepared:
     """Check, subtract the background, scale. Parameters as :func:`recon.reconstruct`."""
-    data = as_channels(measurement, "measurement")
-    if background is not None:
-        data = data - like_data(background, data, "background")
-    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
-    if not valid.any(axis=(1, 2)).all():
-        raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
-
+    data, valid, saturated = data_of(measurement, background, erasures)
     if isinstance(calibration, Calibration):
         psfs, psf_z_um = select_psf(calibration, z_um)
         geometry = calibration.geometry
     else:
         psfs, psf_z_um, geometry = as_channels(calibration, "PSF"), None, Geometry()
     warnings = list(check_psf(psfs))
-    if psfs.shape[1:] != data.shape[1:]:
-        raise InputError(
-            f"The PSF has {_size(psfs)} pixels and the measurement {_size(data)}. Both must come from the "
-            "same sensor area at the same binning: crop or bin one to match the other."
-        )
+    require_same_pixels(psfs, data)
     if len(psfs) not in (1, len(data)):
         raise InputError(
             f"The PSF has {len(psfs)} channels and the measurement {len(data)}: give one PSF for all "
             "channels or one for each."
         )
-    for channel, (values, kept) in enumerate(zip(data, valid, strict=True)):
-        share = saturated_share(values[kept]) if kept.any() else 0.0
-        if share:
-            warnings.append(
-                f"The measurement's channel {channel} looks saturated: {share:.2%} of its pixels are at "
-                f"exactly its maximum {values[kept].max():g}. "
-                "Leave them out with erasures, or expose shorter."
-            )
+    warnings += saturated
 
     deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
     energy = np.sqrt(np.sum(psfs.astype(np.float64) ** 2, axis=(1, 2))).astype(np.float32)
@@ -145,6 +128,36 @@ def prepare(
         geometry=geometry,
         warnings=tuple(warnings),
     )
+
+
+def data_of(
+    measurement: npt.ArrayLike, background: npt.ArrayLike | None, erasures: npt.ArrayLike | None
+) -> tuple[Floats, npt.NDArray[np.bool_], list[str]]:
+    """Return data (n_channels, height, width) less background, which of it is valid, and warnings."""
+    counts = as_channels(measurement, "measurement")
+    data = counts if background is None else counts - like_data(background, counts, "background")
+    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
+    if not valid.any(axis=(1, 2)).all():
+        raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
+    warnings = []
+    # As it came: once a background is off, saturated pixels no longer share a value.
+    for channel, (values, kept) in enumerate(zip(counts, valid, strict=True)):
+        if share := saturated_share(values[kept]):
+            warnings.append(
+                f"The measurement's channel {channel} looks saturated: {share:.2%} of its pixels are at "
+                f"exactly its maximum {values[kept].max():g}. "
+                "Leave them out with erasures, or expose shorter."
+            )
+    return data, valid, warnings
+
+
+def require_same_pixels(psfs: Array, data: Array) -> None:
+    """Raise InputError when PSFs and data (n_channels, height, width) differ in size."""
+    if psfs.shape[1:] != data.shape[1:]:
+        raise InputError(
+            f"The PSF has {_size(psfs)} pixels and the measurement {_size(data)}. Both must come from the "
+            "same sensor area at the same binning: crop or bin one to match the other."
+        )
 
 
 def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: NoiseModel | float | None) -> float:

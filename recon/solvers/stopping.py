@@ -73,6 +73,12 @@ class StoppingRules:
     def __post_init__(self) -> None:
         if self.iterations is None and self.time_s is None and self.tolerance <= 0:
             raise ValueError("A run needs an end: give iterations, time_s or a tolerance above 0.")
+        if self.iterations is not None and self.iterations < 1:
+            raise ValueError(f"iterations must be 1 or more, not {self.iterations}.")
+        if self.time_s is not None and not self.time_s > 0:
+            raise ValueError(f"time_s must be above 0, not {self.time_s:g}.")
+        if not self.tolerance >= 0:
+            raise ValueError(f"tolerance must not be negative; got {self.tolerance:g}.")
 
 
 @dataclass(slots=True)

@@ -172,8 +172,8 @@ class ChannelProblem:
         kind = "tv" if self.prior.startswith("tv") else "l1"
         if tau is None:
             tau = max(NOISE_WEIGHT[kind] / peak if peak > 0 else 0.0, LEAST_TAU[kind])
-        if not tau >= 0:
-            raise InputError(f"tau must not be negative; got {tau}.")
+        if not 0 <= tau < np.inf:
+            raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
         weight = 0.0 if self.prior == "nonnegative" else tau * peak
         if isinstance(self.camera, SpatiallyVarying):
             return self._general(data, weight, start), tau

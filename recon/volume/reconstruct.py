@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.checks import as_channels, check_psf
+from recon.checks import check_psf
 from recon.errors import InputError
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
-from recon.preparation import Field, channel_noise, like_data
+from recon.preparation import Field, channel_noise, data_of, require_same_pixels
 from recon.solvers import Outcome, Solver, StoppingRules
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
@@ -174,12 +174,7 @@ def _prepare(
     erasures: npt.ArrayLike | None,
     noise: NoiseModel | float | None,
 ) -> Scaled:
-    data = as_channels(measurement, "measurement")
-    if background is not None:
-        data = data - like_data(background, data, "background")
-    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
-    if not valid.any(axis=(1, 2)).all():
-        raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
+    data, valid, saturated = data_of(measurement, background, erasures)
     depths = sort_by_depth(calibration)
     psfs = depths.central
     if psfs.shape[1] not in (1, len(data)):
@@ -187,7 +182,8 @@ def _prepare(
             f"The PSFs have {psfs.shape[1]} channels and the measurement {len(data)}: give one PSF for all "
             "channels or one for each."
         )
-    warnings = []
+    require_same_pixels(psfs[0], data)
+    warnings = saturated
     for z, psf in enumerate(psfs):
         warnings += [f"Depth {z}: {text}" for text in check_psf(psf)]
     deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)

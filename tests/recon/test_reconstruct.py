@@ -214,7 +214,7 @@ BAD = np.where(np.arange(12 * 14).reshape(12, 14) == 30, np.nan, GOOD)
         (GOOD, GOOD, {"method": "adm"}, "'adm' is not known. .* Did you mean 'admm'"),
         (GOOD, GOOD, {"prior": "tb"}, "'tb' is not known"),
         (GOOD, GOOD, {"prior": "tv-haar"}, "not HaarTotalVariation; fista may"),
-        (GOOD, GOOD, {"tau": -1.0}, "tau must not be negative"),
+        (GOOD, GOOD, {"tau": -1.0}, "tau must be 0 or more"),
         (GOOD, GOOD, {"noise": -1.0}, "must not be negative"),
         (GOOD, GOOD, {"field": "half"}, 'must be "sensor" or "full"'),
         (np.ones((1, 1)), np.ones((1, 1)), {}, "constant"),

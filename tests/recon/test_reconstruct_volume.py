@@ -172,7 +172,7 @@ def test_plan_counts_the_volumes():
         ({"prior": "haar"}, "prior 'haar' is not known"),
         ({"model": "exact"}, "model 'exact' is not known"),
         ({"model": "local"}, "several places of the field"),
-        ({"tau": -1.0}, "tau must not be negative"),
+        ({"tau": -1.0}, "tau must be 0 or more"),
         ({"field": "all"}, "field must be"),
         ({"erasures": np.ones((SIZE, SIZE), bool)}, "leave no pixel"),
     ],
@@ -247,3 +247,26 @@ def test_fall_off_needs_the_local_model():
     local, spread_local = residual("local")
     assert local < 0.5 * central
     assert spread_local < 0.5 * spread_central
+
+
+def test_scratch_files_hold_their_place_on_the_disk(tmp_path):
+    storage = memory.Storage(tmp_path)
+    storage.zeros((64, 1024), np.float32)
+    (file,) = tmp_path.glob("*/*.dat")
+    assert file.stat().st_blocks * 512 >= file.stat().st_size == 64 * 1024 * 4
+    storage.close()
+
+
+def test_psfs_of_another_size_are_refused_and_saturation_is_warned_of():
+    with pytest.raises(InputError, match="40 x 40 pixels and the measurement 32 x 40"):
+        reconstruct_volume(measurement()[:32], calibration())
+    dark = np.random.default_rng(0).uniform(90, 110, (SIZE, SIZE))
+    clipped = np.minimum(measurement() + dark, 200)
+    result = reconstruct_volume(clipped, calibration(), background=dark, iterations=1)
+    assert any("looks saturated" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("wrong", [{"tau": np.inf}, {"iterations": 0}, {"time_s": 0.0}, {"tolerance": -1.0}])
+def test_settings_without_a_meaning_are_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        reconstruct_volume(measurement(), calibration(), **wrong)
