@@ -12,7 +12,6 @@ configured) and the run's files are closed, in that order, each tried even when 
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import threading
 import time
@@ -299,14 +298,25 @@ class Runner:
     # The way out ---------------------------------------------------------------------------------
     def _end(self, reason: FinishReason, error: BaseException | None = None) -> Run:
         """Make the bench safe, then finish the run; a failure here never hides ``error``."""
-        with contextlib.suppress(Exception):
-            self._report(state=RunState.ENDING)
+        interruption = self._last_report(state=RunState.ENDING)
         try:
-            return end_run(self._bench, self._writer, reason, error)
+            run = end_run(self._bench, self._writer, reason, error)
         finally:
             self._finished.set()
-            with contextlib.suppress(Exception):
-                self._report(state=RunState.FINISHED, reason=reason)
+            interruption = self._last_report(state=RunState.FINISHED, reason=reason) or interruption
+        if interruption is not None and error is None:
+            raise interruption
+        return run
+
+    def _last_report(self, **changes: object) -> BaseException | None:
+        """Report; a listener that raises cannot keep the run from its end. Returns its interruption."""
+        try:
+            self._report(**changes)
+        except Exception:  # noqa: BLE001 - a listener's failure is not the run's
+            return None
+        except BaseException as interruption:  # noqa: BLE001 - e.g. a listener that passes Ctrl-C on
+            return interruption
+        return None
 
     # Status --------------------------------------------------------------------------------------
     def _report_stored(self, snapshot: Snapshot) -> None:

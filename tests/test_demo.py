@@ -231,4 +231,6 @@ def test_ctrl_c_ends_the_command_with_130_and_a_safe_bench(tmp_path: Path, wait_
     assert "Traceback" not in errors
     assert str(folder) in errors
     assert record["state"] == "aborted"
+    conditions = [Run.open(state.parent).condition for state in folder.glob("*/state.json")]
+    assert set(conditions) <= {RunCondition.COMPLETED, RunCondition.ABORTED}
     assert record.get("left", SAFE) == SAFE  # stopped before the bench was open, it is not there

@@ -173,6 +173,37 @@ def test_a_ctrl_c_while_the_run_is_closed_waits_until_it_is(
     assert Run.open(runner.path).condition is ended
 
 
+def test_a_listener_that_keeps_raising_ctrl_c_cannot_keep_the_run_from_being_marked_as_aborted(
+    tmp_path: Path,
+) -> None:
+    def pass_on(status: RunStatus) -> None:  # as the demo does: once pressed, every report raises
+        if status.done >= 2:
+            raise KeyboardInterrupt
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path, on_progress=pass_on)
+        with pytest.raises(KeyboardInterrupt) as caught:
+            runner.execute()
+        assert calls(bench)[-4:] == SAFE
+    run = Run.open(runner.path)
+    assert run.condition is RunCondition.ABORTED
+    assert len(run.records) == 2
+    assert str(runner.path) in str(caught.value.__notes__)
+
+
+def test_ctrl_c_at_the_last_report_is_passed_on_and_the_run_is_complete(tmp_path: Path) -> None:
+    def pass_on(status: RunStatus) -> None:
+        if status.state is RunState.ENDING:
+            raise KeyboardInterrupt
+
+    with open_mock_bench() as bench:
+        runner = prepare(bench, plan(), tmp_path, on_progress=pass_on)
+        with pytest.raises(KeyboardInterrupt):
+            runner.execute()
+        assert calls(bench)[-4:] == SAFE
+    assert Run.open(runner.path).condition is RunCondition.COMPLETED
+
+
 def test_every_safe_step_is_tried_and_the_first_error_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
