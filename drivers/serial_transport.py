@@ -237,18 +237,19 @@ class SerialTransport:
 
     def _exchange(self, command: bytes, matcher: Matcher, timeout_s: float, ticket: int) -> list[bytes]:
         awaited = _Awaited(matcher, [])
+        sent = False
         with self._changed:
             self._awaited = awaited
         try:
             with self._write:
                 if self._cancelled != ticket:
                     raise StoppedError(self.device, "the command was cancelled before it was sent.")
+                sent = True
                 self._send(command)
             with self._changed:
                 self._changed.wait_for(lambda: awaited.done or awaited.error is not None, timeout_s)
                 if awaited.done:
                     return awaited.messages
-                self._in_step = False
                 if awaited.error is not None:
                     raise awaited.error
             raise DeviceTimeoutError(
@@ -260,6 +261,8 @@ class SerialTransport:
         finally:
             with self._changed:
                 self._awaited = None
+                if sent and not awaited.done:  # too late, cancelled, Ctrl-C: a reply may still come
+                    self._in_step = False
 
     def _get_in_step(self, ticket: int) -> None:
         """Wait until old replies have run dry, then have the probe answered."""
@@ -294,12 +297,8 @@ class SerialTransport:
                     self._last_byte_s = time.monotonic()
                     for message in self._framer.feed(data):
                         self._dispatch(message)
-        except (
-            serial.SerialException,
-            OSError,
-            TypeError,
-        ) as error:  # TypeError: closed under pyserial's read
-            if self._serial is port:
+        except Exception as error:  # noqa: BLE001 - the port, or what a driver makes of its messages
+            if self._serial is port:  # else it was closed under pyserial's read
                 self._fail_awaited(self._lost(error))
 
     def _dispatch(self, message: bytes) -> None:

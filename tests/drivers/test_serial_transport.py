@@ -74,6 +74,36 @@ def test_a_late_reply_is_not_taken_for_the_next_commands(device: PtyDevice, port
     assert port.unmatched == 1  # the late one
 
 
+def test_a_reply_after_ctrl_c_is_not_taken_for_the_next_commands(
+    device: PtyDevice, port: SerialTransport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device.answer = lambda line: [0.3, *value(line)] if line == b"GET 1" else value(line)
+
+    def interrupted(*_: object) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(port._changed, "wait_for", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            get(port, 1)
+    assert get(port, 2) == b"VALUE 2"
+    assert get(port, 3) == b"VALUE 3"
+
+
+def test_a_driver_that_chokes_on_a_message_is_told_of_at_once(device: PtyDevice) -> None:
+    def choke(message: bytes) -> None:
+        float(message)
+
+    port = SerialTransport(str(device.link), "stage (test)", timeout_s=20.0, on_message=choke)
+    port.open()
+    device.answer = lambda _: [b"no number\n"]
+    began = time.monotonic()
+    with pytest.raises(DeviceError, match="no number"):
+        get(port, 1)
+    assert time.monotonic() - began < 15
+    port.close()
+
+
 def test_silence_is_a_timeout_that_says_what_came_so_far(device: PtyDevice, port: SerialTransport) -> None:
     device.answer = lambda line: [b"part one\npart tw"] if line == b"LIST" else value(line)
     with pytest.raises(DeviceTimeoutError, match=r"so far: 'part one'.*Check its power, cable"):
