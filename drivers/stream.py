@@ -253,6 +253,9 @@ class FrameStream:
             pass
         except DeviceError as error:
             self.error = error
+        except Exception as error:  # noqa: BLE001 - a driver's mistake: readers must not wait for ever
+            self.error = DeviceError(self.camera.name, f"its stream failed: {error!r}.", "Report this.")
+            self.error.__cause__ = error
         finally:
             self._end()
 

@@ -68,6 +68,11 @@ class StreamReader:
         self._delivered = 0
         self.missed = Missed(0, 0)
 
+    @property
+    def is_running(self) -> bool:
+        """Whether more frames may come."""
+        return self._stream.is_running
+
     def next_frame(self, timeout_s: float | None = None) -> Frame | None:
         """Return the oldest frame not yet got; None when the stream has ended or ``timeout_s`` is over.
 

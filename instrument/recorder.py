@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, StoppedError
 from drivers.frame import Frame, FrameMetadata
 from drivers.stream import FrameStream
 from drivers.stream_reader import StreamReader
@@ -121,7 +121,7 @@ class Recorder:
         self._stopping.set()
 
     def execute(self) -> Run:
-        """Record; returns the finished run.
+        """Record; returns the finished run, whose ``reason`` says how it ended.
 
         Raises
         ------
@@ -137,6 +137,8 @@ class Recorder:
             self._writer.start(drops_counted_by=self._bench.camera.drops_counted_by, n_buffers=self.n_buffers)
             with stream:
                 self._record(reader)
+        except StoppedError:
+            return end_run(self._bench, self._writer, FinishReason.STOPPED, None)
         except Exception as error:
             end_run(self._bench, self._writer, FinishReason.FAILED, error)
             raise
@@ -149,6 +151,8 @@ class Recorder:
         while not self._is_done():
             frame = reader.next_frame(0.1)
             if frame is None:
+                if not reader.is_running:  # STOP, from another thread
+                    raise StoppedError(self._bench.camera.name, "its stream was stopped.")
                 continue
             if self._began_s is None:
                 self._began_s = time.monotonic()

@@ -32,6 +32,8 @@ def keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[None]:
                 continue
             # Past Python's buffer, in which further keys would wait unseen by select.
             pressed = os.read(handle, 1).decode("latin-1").lower()
+            if not pressed:  # the terminal is gone
+                return
             if pressed in actions:
                 actions[pressed]()
 

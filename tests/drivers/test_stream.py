@@ -249,3 +249,14 @@ def test_the_newest_frame_alone_would_be_stale() -> None:
             stale += (int(frame.image[0, 0]) >= 1000) != lit
             time.sleep(0.02)
     assert stale > 0
+
+
+def test_a_drivers_mistake_reaches_those_who_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = finite(1000)
+
+    def broken(*_: object) -> None:
+        raise ValueError("wrong shape")
+
+    monkeypatch.setattr(camera, "next_frame_into", broken)
+    with FrameStream(camera, 4) as stream, pytest.raises(DeviceError, match="wrong shape"):
+        stream.reader().next_frame(5.0)

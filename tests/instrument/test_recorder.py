@@ -167,6 +167,18 @@ def test_ctrl_c_keeps_what_was_recorded_as_aborted(tmp_path: Path) -> None:
     assert_every_frame_is_at_its_number(run)
 
 
+def test_stop_from_another_thread_ends_a_recording(tmp_path: Path) -> None:
+    with bench_with(camera_of(100_000)) as bench:
+
+        def stop(status: RecordingStatus) -> None:
+            if status.written >= 3:
+                bench.stop()
+
+        run = record(bench, tmp_path, n_frames=90_000, on_progress=stop)
+    assert run.condition is RunCondition.STOPPED
+    assert_every_frame_is_at_its_number(run)
+
+
 def test_an_endless_recording_must_be_asked_for(tmp_path: Path) -> None:
     with bench_with(camera_of(10)) as bench, pytest.raises(BenchError, match="how much"):
         record(bench, tmp_path)
