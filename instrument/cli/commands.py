@@ -34,7 +34,9 @@ COMMANDS: Mapping[str, Command] = {
     "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.resume"),
     "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.record"),
     "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.list_runs"),
-    "show": Command(ACQUISITION, "say what is in a run, with a picture", "instrument.cli.show"),
+    "show": Command(
+        ACQUISITION, "say what is in a run; or show a hologram on the SLM", "instrument.cli.show_pattern"
+    ),
     "verify": Command(ACQUISITION, "read every frame of a run and check it", "instrument.cli.verify"),
     "export": Command(
         ACQUISITION, "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4", "instrument.cli.export"
@@ -45,6 +47,7 @@ COMMANDS: Mapping[str, Command] = {
     "hologram": Command(
         DISPLAY, "compute the SLM phase that shows a picture through the mask", "instrument.cli.hologram"
     ),
+    "align": Command(DISPLAY, "find the scattering mask and bring it to its place", "instrument.cli.align"),
     "table7.1": Command(
         DISPLAY,
         "the dissertation's comparison of methods, also without aliasing",

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
+from instrument.alignment_file import load_alignment
 from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
 from instrument.cli.hologram_output import Writer, tell
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
@@ -120,6 +121,10 @@ def hologram(
         Path | None,
         typer.Option("--weights", metavar="FILE", help="A weight image instead.", show_default=False),
     ] = None,
+    alignment: Annotated[
+        Path | None,
+        typer.Option("--alignment", metavar="FILE", help="From align mask.", show_default=False),
+    ] = None,
     method: Annotated[MethodName, typer.Option("--method", "-m")] = MethodName.LBFGS,
     grid: Annotated[
         GridName, typer.Option("--grid", help="dissertation: unpadded, aliases.")
@@ -183,6 +188,9 @@ def hologram(
     depths = _depths(z_mm, 1 if video else len(target))
     lasers = wavelengths if color else (None,)
     displays = [_display(config, size, expansion, nm, envelope) for nm in lasers]
+    if alignment is not None:
+        found = load_alignment(alignment)
+        displays = [found.of(display) for display in displays]
     writer = Writer(out, config.display.slm_binning, request, displays, video=len(pictures) if video else 0)
     writer.check(overwrite=force)
     with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:

@@ -63,9 +63,9 @@ def _between(nodes: Any, y: int, x: int, height: int, width: int) -> tuple[float
     u = (x + 0.5) / width * (nodes.shape[1] - 1)
     j, i = min(int(v), nodes.shape[0] - 2), min(int(u), nodes.shape[1] - 2)
     v, u = v - j, u - i
-    above = nodes[j, i] * (1 - u) + nodes[j, i + 1] * u
-    below = nodes[j + 1, i] * (1 - u) + nodes[j + 1, i + 1] * u
-    dy, dx = above * (1 - v) + below * v
+    a, b, c, d = (1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u
+    dy = a * nodes[j, i, 0] + b * nodes[j, i + 1, 0] + c * nodes[j + 1, i, 0] + d * nodes[j + 1, i + 1, 0]
+    dx = a * nodes[j, i, 1] + b * nodes[j, i + 1, 1] + c * nodes[j + 1, i, 1] + d * nodes[j + 1, i + 1, 1]
     return dy, dx
 
 
@@ -238,3 +238,12 @@ def weigh(image: Any, weights: Any, scale: float) -> Any:
             total += float(value) * float(weighted)
             image[y, x] = weighted
     return total / float(image.size)
+
+
+@njit(nogil=True, cache=True)
+def add_shifted(total: Any, spectrum: Any, rows: Any, columns: Any, ramp_y: Any, ramp_x: Any) -> None:
+    """``total[i, j] += spectrum[rows[i], columns[j]] * ramp_y[i] * ramp_x[j]``."""
+    for i in range(total.shape[0]):
+        weight, y = ramp_y[i], rows[i]
+        for j in range(total.shape[1]):
+            total[i, j] += spectrum[y, columns[j]] * (weight * ramp_x[j])

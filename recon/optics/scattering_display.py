@@ -123,7 +123,7 @@ class ScatteringDisplay:
         """
         field = self._on_mask(phase_rad, pose)
         field *= self._mask
-        return self._on_sensor(field)
+        return self._on_sensor(field, pose.roll_mrad)
 
     def _on_mask(self, phase_rad: npt.NDArray[np.floating], pose: MaskPose) -> Complex:
         """Return the field that reaches the mask, in the mask's frame."""
@@ -161,8 +161,11 @@ class ScatteringDisplay:
             field += depth_mm * scipy.fft.ifft2(slope, overwrite_x=True, workers=self.threads)
         return np.asarray(field, np.complex64)
 
-    def _on_sensor(self, field: Complex) -> Image:
-        """Fourier transform by the lens, stop at the field of view, integrate over camera pixels."""
+    def _on_sensor(self, field: Complex, mask_roll_mrad: float) -> Image:
+        """Fourier transform by the lens, stop at the field of view, integrate over camera pixels.
+
+        The far field turns with the mask, the camera stays.
+        """
         spec, n = self.spec, self.spec.oversampling
         height, width = self._coarse
         far = scipy.fft.fft2(field, overwrite_x=True, workers=self.threads)
@@ -187,7 +190,7 @@ class ScatteringDisplay:
             spec.sensor_pitch_um / spec.field_um,
             spec.sensor_offset_um[0] / spec.field_um,
             spec.sensor_offset_um[1] / spec.field_um,
-            spec.sensor_roll_mrad * 1e-3,
+            (spec.sensor_roll_mrad - mask_roll_mrad) * 1e-3,
             4 * spec.lens_distortion,
             scale,
         )

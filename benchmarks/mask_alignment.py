@@ -1,0 +1,197 @@
+"""Mask alignment from random starts on the simulated display, which knows the truth and does not tell.
+
+Each start draws shift, depth, rotation, tilts and relay magnification, with DC term, pixel fill, relay and
+lens distortion, camera offset and noise always on; the procedure is told none of it. Afterwards a hologram
+is photographed: computed for a perfectly placed mask and shown before aligning, computed with the pose found,
+and computed with the truth for a bench without misalignment. Writes a line a start::
+
+    python benchmarks/mask_alignment.py --starts 20 --out mask-alignment
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration_routines.display_io import DisplayBench
+from calibration_routines.hologram_capture import capture_hologram
+from calibration_routines.mask_alignment import AlignmentFailedError, MaskAlignment
+from drivers.simulated.display_world import DisplayWorld
+from instrument.bench import Bench
+from instrument.config_file import display_text, parse_config
+from instrument.display_setup import bench_display
+from instrument.hologram_job import prepare_target
+from instrument.sample_images import load_sample
+from recon.holography import Budget, DcTerm, Display, HologramModel, compute_hologram
+from recon.holography.camera_map import register_camera
+from recon.holography.pose import Pose
+
+ITERATIONS = 40
+
+
+def draw(seed: int) -> dict[str, str]:
+    """Return the options of one start."""
+    rng = np.random.default_rng(1000 + seed)
+    x, y = rng.uniform(-288, 288, 2)  # 72 mask pixels of 4 um
+    half_width = 640.0  # mask pixels
+    return {
+        "seed": str(seed),
+        "shift_um": f"[{x:.2f}, {y:.2f}]",
+        "z_um": f"{rng.uniform(-1000, 1000):.1f}",
+        "roll_mrad": f"{rng.uniform(-4, 4) / half_width * 1e3:.4f}",
+        "pitch_mrad": f"{rng.uniform(-5, 5):.3f}",
+        "yaw_mrad": f"{rng.uniform(-5, 5):.3f}",
+        "magnification": f"{rng.uniform(-0.003, 0.003):.6f}",
+    }
+
+
+def configuration(options: dict[str, str]) -> str:
+    """Return bench.toml of the simulated display with some options of the last table replaced."""
+    head, tail = display_text().split("\n[simulated_display]")
+    for key, value in options.items():
+        tail, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", tail)
+        assert count == 1, key
+    return f"{head}\n[simulated_display]{tail}"
+
+
+def true_pose(world: DisplayWorld) -> tuple[Pose, float]:
+    """Return the true pose without the cubic term, and the relay's cubic term at the corners, mask pixels."""
+    pose, options = world.pose(), world.options
+    pitch = options.mask_pitch_um
+    return (
+        Pose(
+            pose.shift_x_um / pitch,
+            pose.shift_y_um / pitch,
+            pose.roll_mrad,
+            options.magnification,
+            0.0,
+            pose.z_um,
+            pose.pitch_mrad,
+            pose.yaw_mrad,
+        ),
+        options.relay_distortion_um / pitch,
+    )
+
+
+def true_displacement(world: DisplayWorld, mask_shape: tuple[int, int]) -> np.ndarray:
+    """Return the true displacement field on nodes, cubic term as the simulated relay has it."""
+    pose, cubic = true_pose(world)
+    field = pose.displacement(mask_shape)
+    height, width = mask_shape
+    y, x = np.meshgrid(
+        (np.linspace(0, 1, field.shape[0]) - 0.5) * height,
+        (np.linspace(0, 1, field.shape[1]) - 0.5) * width,
+        indexing="ij",
+    )
+    sx, sy = x + field[..., 1], y + field[..., 0]
+    stretch = cubic * (sx**2 + sy**2) / (0.5 * np.hypot(height, width)) ** 3
+    return np.stack([sy * (1 + stretch) - y, sx * (1 + stretch) - x], axis=-1)
+
+
+def residual(world: DisplayWorld, pose: Pose, mask_shape: tuple[int, int]) -> float:
+    """Return the rms distance between true and found displacement over the mask, mask pixels."""
+    difference = true_displacement(world, mask_shape) - pose.displacement(mask_shape)
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
+
+
+def hologram(display: Display, target: object) -> np.ndarray:
+    """Compute a hologram."""
+    model = HologramModel(display, [target])  # type: ignore[list-item]
+    return compute_hologram(model, budget=Budget(iterations=ITERATIONS)).slm[0]
+
+
+def one_start(seed: int, plain: np.ndarray | None) -> tuple[dict[str, object], np.ndarray]:
+    """Run one start; ``plain`` is the hologram for a perfectly placed mask."""
+    config = parse_config(configuration(draw(seed)), None)
+    line: dict[str, object] = {"start": seed, **draw(seed)}
+    with Bench(config).open() as bench:
+        assert bench.stage is not None
+        assert bench.slm is not None
+        bench.stage.home()
+        (world,) = bench.shared.values()
+        assert isinstance(world, DisplayWorld)
+        known = bench_display(config, (bench.slm.shape, bench.slm.pixel_pitch_um))
+        target = prepare_target((load_sample("leaves", (512, 512)) * 255).astype(np.uint8), known)
+        plain = hologram(known, target) if plain is None else plain
+        io = DisplayBench(bench, config.display.slm_binning)
+        alignment = MaskAlignment(io, replace(known, dc=DcTerm(0.0)))
+        began = time.perf_counter()
+        try:
+            report = alignment.run()
+        except AlignmentFailedError as error:
+            line |= {"success": False, "said": str(error), "frames": io.frames}
+            return line, plain
+        shape = known.mask.shape
+        left = true_pose(world)[0]
+        line |= {
+            "success": True,
+            "frames": report.frames,
+            "seconds": round(time.perf_counter() - began, 1),
+            "efficiency": round(report.efficiency, 3),
+            "residual_px": round(residual(world, report.pose, shape), 3),
+            "z_left_um": round(left.z_um, 1),
+            "tilt_left_mrad": round(float(np.hypot(left.pitch_mrad, left.yaw_mrad)), 2),
+        }
+        aligned = replace(known, displacement=report.pose.displacement(shape))
+        shots = {"mean_per_ms": report.brightness_per_ms}
+        after = capture_hologram(
+            io, [hologram(aligned, target)], aligned, target, report.camera, **shots, average=2
+        )
+        line["psnr_after_db"] = round(after.scores.psnr_db, 2)
+        bench.stage.move_to({axis.name: 0.0 for axis in bench.stage.axes})
+        before = capture_hologram(io, [plain], known, target, report.camera, **shots, average=2)
+        line["psnr_before_db"] = round(before.scores.psnr_db, 2)
+    still = dict.fromkeys(("z_um", "roll_mrad", "pitch_mrad", "yaw_mrad"), "0.0") | {"shift_um": "[0.0, 0.0]"}
+    config = parse_config(configuration({**draw(seed), **still}), None)
+    with Bench(config).open() as bench:
+        assert bench.slm is not None
+        (world,) = bench.shared.values()
+        assert isinstance(world, DisplayWorld)
+        io = DisplayBench(bench, config.display.slm_binning)
+        exact = replace(known, displacement=true_displacement(world, known.mask.shape))
+        io.show(np.ones(known.slm_shape, complex))
+        across = known.wavelength_nm * known.focal_mm / known.mask_pitch_um / bench.camera.pixel_pitch_um
+        camera = register_camera(io.photograph(10.0), known, across)
+        perfect = capture_hologram(io, [hologram(exact, target)], exact, target, camera, **shots, average=2)
+        line["psnr_perfect_db"] = round(perfect.scores.psnr_db, 2)
+    return line, plain
+
+
+def main() -> None:
+    """Run all starts, print and write what came out."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--starts", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("mask-alignment"))
+    options = parser.parse_args()
+    lines: list[dict[str, object]] = []
+    plain = None
+    for seed in range(options.first, options.first + options.starts):
+        line, plain = one_start(seed, plain)
+        lines.append(line)
+        print({k: v for k, v in line.items() if k not in draw(0)}, flush=True)
+        write(options.out.with_suffix(".csv"), lines)
+    good = [line for line in lines if line["success"]]
+    print(f"SIMULATED: {len(good)} of {len(lines)} starts aligned")
+    for name in ("frames", "residual_px", "efficiency", "psnr_before_db", "psnr_after_db", "psnr_perfect_db"):
+        values = np.array([line[name] for line in good], float)
+        print(f"{name}: median {np.median(values):.3f}, worst {values.min():.3f} to {values.max():.3f}")
+
+
+def write(path: Path, lines: list[dict[str, object]]) -> None:
+    """Write one line a start."""
+    names = list(dict.fromkeys(name for line in lines for name in line))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+if __name__ == "__main__":
+    main()

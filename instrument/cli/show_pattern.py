@@ -1,0 +1,195 @@
+"""``diffuserbench show``: what is in a run; or put a hologram on the SLM, and photograph it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from calibration_routines.display_io import DisplayBench, approach_from_below
+from calibration_routines.hologram_capture import Capture, capture_hologram, find_camera
+from instrument.alignment_file import load_alignment
+from instrument.bench import Bench
+from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.display_setup import bench_display
+from instrument.errors import BenchError, FileError
+from instrument.hologram_job import prepare_target
+from instrument.images import read_image, write_image
+from instrument.slm_correction import load_slm_correction
+from instrument.slm_image import levels_phase, read_slm_image
+
+app = command_app()
+
+PICTURES = (".png", ".tif", ".tiff", ".npy", ".bmp")
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench show runs/2026-11-21_14-03-22_axial-sweep",
+        "diffuserbench show slm.png --bench display.toml --seconds 60",
+        "diffuserbench show slm.png --bench display.toml --capture seen.png --target picture.png",
+        "diffuserbench show slm-frame1.png slm-frame2.png --capture seen.png --target picture.png",
+    )
+)
+def show(
+    what: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN|PATTERN...",
+            help="A run's folder; or an 8-bit phase picture from hologram (several: frames that add).",
+        ),
+    ],
+    bench: BenchOption = None,
+    slm_calibration: Annotated[
+        Path | None,
+        typer.Option("--slm-calibration", metavar="FILE", help="From calibrate slm.", show_default=False),
+    ] = None,
+    alignment: Annotated[
+        Path | None,
+        typer.Option(
+            "--alignment",
+            metavar="FILE",
+            help="Bring the mask's stage to where align mask left it.",
+            show_default=False,
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds", min=0.0, help="How long. Default: until Enter or Ctrl-C.", show_default=False
+        ),
+    ] = None,
+    capture: Annotated[
+        Path | None,
+        typer.Option("--capture", metavar="FILE", help="Photograph it (PNG) and end.", show_default=False),
+    ] = None,
+    target: Annotated[
+        Path | None,
+        typer.Option(
+            "--target", metavar="FILE", help="With --capture: the picture wanted.", show_default=False
+        ),
+    ] = None,
+    average: Annotated[int, typer.Option("--average", min=1, help="Photographs a frame.")] = 4,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            "-p",
+            metavar="FILE",
+            help="Of a run: where its picture goes (PNG). Default: summary.png in its folder.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
+) -> None:
+    """Say how a run ended and what it holds, with a picture; or show a hologram on the SLM.
+
+    A hologram's look-up table and flatness are applied here, once.
+
+    With --capture the camera is registered by the mask's own speckle, the hologram photographed, brought to
+    the field of view, low-passed as an eye would, and compared with --target: PSNR and SSIM.
+    """
+    if len(what) == 1 and what[0].suffix.lower() not in PICTURES:
+        from instrument.cli.show import show as show_run
+
+        show_run(what[0], picture)
+        return
+    pattern = what
+    if (capture is None) != (target is None):
+        raise BenchError("Give --capture FILE and --target FILE together.")
+    if capture is not None and (capture.exists() and not force):
+        raise FileError(capture, "exists already.", "Choose another name, or overwrite with --force.")
+    if capture is not None and capture.suffix.lower() != ".png":
+        raise FileError(capture, "a capture is written as .png.")
+    correction = load_slm_correction(slm_calibration) if slm_calibration else None
+    place = load_alignment(alignment).stage_position if alignment else {}
+    read = [read_slm_image(path) for path in pattern]
+    with open_and_say(bench) as opened:
+        if opened.slm is None:
+            raise BenchError(f"{opened.label} has no [slm].")
+        for path, (levels, _) in zip(pattern, read, strict=True):
+            if levels.shape != opened.slm.shape:
+                raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
+        _place_mask(opened, place)
+        binning = opened.config.display.slm_binning
+        io = DisplayBench(opened, binning, correction)
+        fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
+        if capture is None or target is None:
+            _hold(io, fields, seconds)
+            return
+        _capture(opened, io, fields, read[0][1], capture, target, average)
+
+
+def _place_mask(bench: Bench, place: Mapping[str, float]) -> None:
+    """Home the stage where it has lost its reference, and approach the place from below."""
+    stage = bench.stage
+    if not place:
+        return
+    if stage is None:
+        raise BenchError(f"{bench.label} has no [stage] to bring the mask to its place.")
+    if not stage.is_homed:
+        typer.echo("Homing the stage.", err=True)
+        stage.home()
+    approach_from_below(stage, place)
+
+
+def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
+    io.bench.scene_on()
+    io.show(fields[0])
+    typer.echo(f"Shown on {io.slm.name}: {io.bench.label}", err=True)
+    if seconds is None and len(fields) == 1:
+        typer.echo("Press Enter to end.", err=True)
+        input()
+        return
+    end = time.monotonic() + (seconds if seconds is not None else float("inf"))
+    frame = 0
+    while time.monotonic() < end:
+        frame = (frame + 1) % len(fields)
+        if len(fields) > 1:
+            io.show(fields[frame])
+        time.sleep(min(0.02, max(end - time.monotonic(), 0)))
+
+
+def _capture(
+    opened: Bench,
+    io: DisplayBench,
+    fields: list[Any],
+    facts: dict[str, Any],
+    out: Path,
+    target: Path,
+    average: int,
+) -> None:
+    assert opened.slm is not None
+    display = bench_display(
+        opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um), expansion=facts.get("expansion")
+    )
+    envelope = facts.get("metrics_computed_for", {}).get("envelope", "shade")
+    wanted = prepare_target(read_image(target).pixels, display, envelope=envelope)
+    camera, mean_per_ms = find_camera(io, display)
+    found = capture_hologram(io, fields, display, wanted, camera, mean_per_ms=mean_per_ms, average=average)
+    simulated = bool(opened.simulated_kinds)
+    _write(found, out, camera.residual_px, simulated=simulated)
+    score = found.scores
+    mark = " (SIMULATED)" if simulated else ""
+    typer.echo(f"camera registered to {camera.residual_px:.2f} px{mark}")
+    typer.echo(
+        f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
+        f"middle quarter {score.crop_psnr_db:.2f} dB"
+    )
+    if found.saturated_fraction > 1e-3:
+        typer.echo(
+            f"Warning: {100 * found.saturated_fraction:.1f} % of the camera's pixels are saturated.", err=True
+        )
+    typer.echo(f"Wrote {out}")
+
+
+def _write(found: Capture, out: Path, residual_px: float, *, simulated: bool) -> None:
+    from dataclasses import asdict
+
+    pixels = np.clip(np.rint(found.seen * 255), 0, 255).astype(np.uint8)
+    facts = {"simulated": simulated, "metrics": asdict(found.scores), "camera_residual_px": residual_px}
+    write_image(out, pixels, {**facts, "low_passed": True, "white": 255})

@@ -1,0 +1,194 @@
+"""Which camera pixel sees which direction: registration by the mask's own speckle.
+
+With a blank SLM the camera sees the far field of the mask, which is known and, being an intensity, does not
+depend on where the mask is (only its rotation turns it with the mask). Matching it block by block gives the
+map from the field of view to the camera before anything is aligned, distortion included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.holography.display import Display
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMap:
+    """From places in the field of view to camera pixels.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Of the camera's frames.
+    pixels_across : float
+        Camera pixels across the field of view, nominally.
+    coefficients : ndarray, float64, (10, 2)
+        Third-order polynomial correction of (row, column), pixels.
+    residual_px : float
+        Rms residual of the fit.
+    """
+
+    shape: tuple[int, int]
+    pixels_across: float
+    coefficients: npt.NDArray[np.float64]
+    residual_px: float = float("nan")
+
+    def pixels(self, y: Array, x: Array) -> tuple[Array, Array]:
+        """Return row and column (0 is the centre of the first pixel) of places in fractions of the field."""
+        y, x = np.asarray(y, float), np.asarray(x, float)
+        terms = _terms(y, x) @ self.coefficients
+        row = (self.shape[0] - 1) / 2 + y * self.pixels_across + terms[..., 0]
+        column = (self.shape[1] - 1) / 2 + x * self.pixels_across + terms[..., 1]
+        return row, column
+
+    def resample(self, image: Array, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        """Return the camera's picture on a grid over the field of view, the axis in the middle.
+
+        Where the grid is coarser than the camera's pixels the mean over a grid step is taken.
+        """
+        from scipy.ndimage import map_coordinates, uniform_filter
+
+        size = [max(1, round(self.pixels_across / n)) for n in shape]
+        smooth = uniform_filter(np.asarray(image, float), size) if max(size) > 1 else np.asarray(image, float)
+        y, x = ((np.arange(n) - n // 2) / n for n in shape)
+        places = self.pixels(*np.meshgrid(y, x, indexing="ij"))
+        return np.asarray(map_coordinates(smooth, places, order=1, mode="constant"), np.float64)
+
+
+def _terms(y: Array, x: Array) -> Array:
+    return np.stack([y**i * x**j for i in range(4) for j in range(4 - i)], axis=-1)
+
+
+def mask_speckle(display: Display) -> npt.NDArray[np.float32]:
+    """Return the far field of the mask alone over the field of view, at twice the mask's own sampling."""
+    import scipy.fft
+
+    height, width = display.mask.shape
+    field = display.mask.field(display.wavelength_nm).astype(np.complex64)
+    far = np.fft.fftshift(np.abs(scipy.fft.fft2(field, (2 * height, 2 * width))) ** 2) / field.size
+    y, x = (np.sinc(np.arange(2 * n) / (2 * n) - 0.5) ** 2 for n in (height, width))
+    return np.asarray(far * y[:, None] * x, np.float32)
+
+
+def register_camera(
+    frame: Array, display: Display, pixels_across: float, *, blocks: int = 9, search: int = 10
+) -> CameraMap:
+    """Find the map from a frame taken with a blank SLM.
+
+    Parameters
+    ----------
+    frame : ndarray, (height, width)
+        Background subtracted.
+    display : Display
+    pixels_across : float
+        Nominal number of camera pixels across the field of view, within about a per cent.
+    blocks : int
+        Along each axis.
+    search : int
+        Largest local shift, pixels.
+
+    Raises
+    ------
+    InputError
+        When the speckle is not found: the frame is dark, another mask is in the beam, or the map is far off.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    speckle = mask_speckle(display)
+    samples = (speckle.shape[0] / pixels_across, speckle.shape[1] / pixels_across)
+    speckle = gaussian_filter(speckle, [0.4 * s for s in samples])
+    found = CameraMap((frame.shape[0], frame.shape[1]), pixels_across, np.zeros((10, 2)))
+    image = gaussian_filter(np.asarray(frame, np.float32), 0.5)
+    # The middle first, with a wide search; then outwards with the map found so far.
+    for reach, count, wide, order in ((0.08, 1, 60, 0), (0.25, 5, search, 1), (0.45, blocks, search, 3)):
+        places, shifts, weights = [], [], []
+        side = 160 if count == 1 else 96
+        for y in np.linspace(-reach, reach, count) if count > 1 else (0.0,):
+            for x in np.linspace(-reach, reach, count) if count > 1 else (0.0,):
+                match = _match(image, speckle, found, float(y), float(x), side, wide)
+                if match is not None:
+                    places.append((y, x))
+                    shifts.append(match[:2])
+                    weights.append(match[2])
+        found = _refit(found, np.array(places), np.array(shifts), np.array(weights), order, count)
+    return found
+
+
+def _match(
+    image: Array, speckle: Array, found: CameraMap, y: float, x: float, side: int, search: int
+) -> tuple[float, float, float] | None:
+    """Correlate one block; returns the shift left over and how much the peak stands out."""
+    from scipy.ndimage import map_coordinates
+
+    row, column = (float(v) for v in found.pixels(np.array(y), np.array(x)))
+    top, left = round(row) - side // 2, round(column) - side // 2
+    if top < search or left < search or top + side + search > image.shape[0]:
+        return None
+    if left + side + search > image.shape[1]:
+        return None
+    # What the block should look like: places in the field of each of its pixels, by the map's linear part.
+    step = 0.01
+    gradient = (
+        np.array(
+            [
+                np.subtract(found.pixels(np.array(y + step), np.array(x)), (row, column)),
+                np.subtract(found.pixels(np.array(y), np.array(x + step)), (row, column)),
+            ]
+        ).T
+        / step
+    )
+    inverse = np.linalg.inv(gradient)
+    rows, columns = np.meshgrid(np.arange(side) + top - row, np.arange(side) + left - column, indexing="ij")
+    fy, fx = (
+        y + inverse[0, 0] * rows + inverse[0, 1] * columns,
+        x + inverse[1, 0] * rows + inverse[1, 1] * columns,
+    )
+    height, width = speckle.shape
+    wanted = map_coordinates(speckle, [(fy + 0.5) * height, (fx + 0.5) * width], order=1)
+    around = image[top - search : top + side + search, left - search : left + side + search]
+    wanted = wanted - wanted.mean()
+    spectrum = np.fft.rfft2(around - around.mean()) * np.conj(np.fft.rfft2(wanted, around.shape))
+    correlation = np.fft.irfft2(spectrum, around.shape)[: 2 * search + 1, : 2 * search + 1]
+    i, j = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
+    contrast = float(correlation[i, j] / correlation.std())
+    if not (0 < i < 2 * search and 0 < j < 2 * search):
+        return None
+    dy = _vertex(correlation[i - 1 : i + 2, j])
+    dx = _vertex(correlation[i, j - 1 : j + 2])
+    return float(i + dy - search), float(j + dx - search), contrast
+
+
+def _vertex(three: Array) -> float:
+    bend = three[0] - 2 * three[1] + three[2]
+    return float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5)) if bend < 0 else 0.0
+
+
+def _refit(
+    found: CameraMap, places: Array, shifts: Array, contrast: Array, order: int, count: int
+) -> CameraMap:
+    clear = contrast > 6 if len(contrast) else np.zeros(0, bool)
+    if clear.sum() < max(1, count * count // 3):
+        raise InputError(
+            f"The mask's speckle was recognised in {int(clear.sum())} of {count * count} places on the "
+            "camera. Check that the laser shines, that the mask is the one described, and the focal length."
+        )
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    used = [n for n, (i, j) in enumerate(powers) if i + j <= order]
+    terms = _terms(places[:, 0], places[:, 1])[:, used]
+    good = clear
+    solution = np.zeros((len(used), 2))
+    for _ in range(3):
+        solution = np.linalg.lstsq(terms[good], shifts[good], rcond=None)[0]
+        error = np.hypot(*(shifts - terms @ solution).T)
+        good = clear & (error < max(1.0, 3 * float(np.median(error[clear]))))
+    coefficients = found.coefficients.copy()
+    coefficients[used] += solution
+    residual = float(np.sqrt(np.mean(error[good] ** 2)))
+    return CameraMap(found.shape, found.pixels_across, coefficients, residual)

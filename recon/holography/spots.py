@@ -1,0 +1,205 @@
+"""SLM patterns that focus many spots at once, each as if the mask were somewhere else.
+
+A spot is bright only where its hypothesis about the mask is right: the brightest spot of a picture tells the
+pose. Nothing has to move. The field that makes a spot is the conjugate mask times a plane wave, propagated
+back from the mask to the SLM's image and integrated over SLM pixels (Kuo 2020, Eqs. 7.11 and 7.12 with free
+space added). It is computed from the mask's spectrum, of which an SLM pixel passes only the main lobe of its
+sinc.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from recon.holography.display import Display
+from recon.holography.pose import Pose
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A spot to focus: where (integer bins of the mask's spectrum from the axis), and for which pose."""
+
+    row: int
+    column: int
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True)
+class SpotPattern:
+    """A pattern and what it would do.
+
+    Attributes
+    ----------
+    slm : ndarray, complex64, (height, width)
+        Of modulus 1.
+    spots : tuple of Spot
+    ideal : float
+        Intensity of a spot if its pose is the true one, in units of the mean over the field; without DC term
+        and envelope.
+    """
+
+    slm: npt.NDArray[np.complex64]
+    spots: tuple[Spot, ...]
+    ideal: float
+
+
+def depth_um(display: Display) -> float:
+    """Return the distance over which a random SLM pattern loses half of a spot's light."""
+    return 1.5 * (display.slm_pitch_um * 1e-3) ** 2 / (display.wavelength_nm * 1e-6) * 1e3
+
+
+class SpotMaker:
+    """Computes spot patterns for one display.
+
+    Parameters
+    ----------
+    display : Display
+        Its ``displacement`` is not used: poses say where the mask is.
+    threads : int
+        For the Fourier transforms.
+    """
+
+    def __init__(self, display: Display, *, threads: int = 1) -> None:
+        self.display = display
+        self.threads = threads
+        height, width = display.mask.shape
+        k = display.factor
+        # Two samples per SLM pixel (or one per mask pixel where that is coarser) hold the sinc's main lobe.
+        self.fine = 1 if k == 1 else 2
+        self.shape = (display.slm_shape[0] * self.fine, display.slm_shape[1] * self.fine)
+        mask = display.mask.field(display.wavelength_nm)
+        self._spectrum = scipy.fft.fft2(np.conj(mask).astype(np.complex64), workers=threads)
+        self._rows, self._columns = (scipy.fft.fftfreq(n, 1 / n).astype(int) for n in self.shape)
+        pitch_mm = display.mask_pitch_um * 1e-3
+        fy, fx = self._rows / (height * pitch_mm), self._columns / (width * pitch_mm)
+        self._f2 = (np.pi * display.wavelength_nm * 1e-6 * (fy[:, None] ** 2 + fx**2)).astype(np.float32)
+        # Cell centres of the coarser grid are (k / fine - 1) / 2 mask pixels past its first mask pixel.
+        offset = (k / self.fine - 1) / 2
+        self._centre = np.exp(
+            2j * np.pi * offset * (self._rows[:, None] / height + self._columns / width)
+        ).astype(np.complex64)
+        box = [np.sinc(f * k / self.fine / n) for f, n in ((self._rows, height), (self._columns, width))]
+        self._centre *= (box[0][:, None] * box[1]).astype(np.float32)
+        y, x = (np.arange(n, dtype=np.float32) - (n - 1) / 2 for n in self.shape)
+        scale = pitch_mm * k / self.fine
+        self._y_mm, self._x_mm = y * scale, x * scale
+        self._ones = np.ones(self.shape, np.complex64)
+        self._levels = np.zeros(self.shape, np.uint8)
+        self._last: tuple[float, npt.NDArray[np.complex64]] = (0.0, np.ones((1, 1), np.complex64))
+
+    def field(self, spot: Spot) -> npt.NDArray[np.complex64]:
+        """Return the SLM field that focuses one spot, complex64 (height, width) of the SLM."""
+        from recon.holography import _kernels
+
+        wave = self._at_slm(spot)
+        pose = spot.pose
+        nodes = (pose.displacement(self.display.mask.shape) * (self.fine / self.display.factor)).astype(
+            np.float32
+        )
+        out = np.zeros(self.display.slm_shape, np.complex64)
+        one, row, column = np.ones(1, np.complex64), self._ones[:, 0], self._ones[0]
+        _kernels.gather_displaced(
+            out, wave, self._levels, one, row, column, nodes, self.fine, 0, self.shape[0]
+        )
+        return out
+
+    def pattern(self, spots: Sequence[Spot], *, seed: int = 0) -> SpotPattern:
+        """Superpose spots with random phases and keep the phase of the sum."""
+        parts = [self.field(spot) for spot in spots]
+        phases = np.exp(2j * np.pi * np.random.default_rng(seed).random(len(parts))).astype(np.complex64)
+        total = sum(part * phase for part, phase in zip(parts, phases, strict=True))
+        slm = np.exp(1j * np.angle(total)).astype(np.complex64)
+        return SpotPattern(slm, tuple(spots), self.ideal(len(spots)))
+
+    def shift_pattern(self, spots: Sequence[Spot], *, seed: int = 0) -> SpotPattern:
+        """As :meth:`pattern` for poses that differ in shift and z only: much faster."""
+        from recon.holography import _kernels
+
+        height, width = self.display.mask.shape
+        phases = np.exp(2j * np.pi * np.random.default_rng(seed).random(len(spots)))
+        total = np.zeros(self.shape, np.complex64)
+        layer = np.zeros_like(total)
+        for z_um in sorted({spot.pose.z_um for spot in spots}):
+            layer[:] = 0
+            for spot, phase in zip(spots, phases, strict=True):
+                if spot.pose.z_um == z_um:
+                    ramp_y = phase * np.exp(-2j * np.pi * self._rows * (spot.pose.shift_y / height))
+                    ramp_x = np.exp(-2j * np.pi * self._columns * (spot.pose.shift_x / width))
+                    _kernels.add_shifted(
+                        layer,
+                        self._spectrum,
+                        (self._rows - spot.row) % height,
+                        (self._columns - spot.column) % width,
+                        ramp_y.astype(np.complex64),
+                        ramp_x.astype(np.complex64),
+                    )
+            total += layer * self._free_space(z_um) if z_um else layer
+        field = scipy.fft.ifft2(total * self._centre, overwrite_x=True, workers=self.threads)
+        n = self.fine
+        binned = field.reshape(field.shape[0] // n, n, field.shape[1] // n, n).sum(axis=(1, 3))
+        slm = np.exp(1j * np.angle(binned)).astype(np.complex64)
+        return SpotPattern(slm, tuple(spots), self.ideal(len(spots)))
+
+    # Steps -------------------------------------------------------------------------------------
+    def _window(self, spot: Spot) -> npt.NDArray[np.complex64]:
+        """Spectrum of conjugate mask times plane wave at the frequencies that the SLM can make."""
+        height, width = self._spectrum.shape
+        rows = (self._rows - spot.row) % height
+        columns = (self._columns - spot.column) % width
+        window: npt.NDArray[np.complex64] = self._spectrum[np.ix_(rows, columns)]
+        return window
+
+    def _at_slm(self, spot: Spot) -> npt.NDArray[np.complex64]:
+        """Field in the SLM's image plane, two samples per SLM pixel, in the mask's frame."""
+        pose = spot.pose
+        spectrum = self._window(spot) * self._centre
+        if pose.z_um:
+            spectrum *= self._free_space(pose.z_um)
+        wave = scipy.fft.ifft2(spectrum, workers=self.threads)
+        if pose.pitch_mrad or pose.yaw_mrad:
+            depth = 1e-3 * (pose.pitch_mrad * self._y_mm[:, None] + pose.yaw_mrad * self._x_mm)
+            depth = depth.astype(np.float32)
+            # Second order in the depth: the probes tilt by far more than the mask ever is.
+            spectrum *= np.complex64(1j) * self._f2
+            wave += depth * scipy.fft.ifft2(spectrum, workers=self.threads)
+            spectrum *= np.complex64(0.5j) * self._f2
+            wave += depth**2 * scipy.fft.ifft2(spectrum, overwrite_x=True, workers=self.threads)
+        return np.ascontiguousarray(wave, np.complex64)
+
+    def _free_space(self, z_um: float) -> npt.NDArray[np.complex64]:
+        """Return the factor that takes the light back by ``z_um`` (the last one is kept)."""
+        if self._last[0] != z_um:
+            self._last = (z_um, np.exp(np.complex64(1j * z_um * 1e-3) * self._f2))
+        return self._last[1]
+
+    def ideal(self, count: int) -> float:
+        """Return the intensity of each of ``count`` spots where their pose is right.
+
+        ``pi / 4`` of the light is left by the phase-only sum over the mask pixels of an SLM pixel (without a
+        finer mask nothing is lost there) and again by superposing several spots.
+        """
+        kept = (1.0 if self.display.factor == 1 else np.pi / 4) * (1.0 if count == 1 else np.pi / 4)
+        return kept * self.display.slm_shape[0] * self.display.slm_shape[1] / count
+
+
+def spread_spots(
+    count: int, shape: tuple[int, int], *, reach: float = 0.38, seed: int = 0
+) -> list[tuple[int, int]]:
+    """Return places for spots: integer bins from the axis, a jittered grid inside ``reach`` of the field."""
+    rng = np.random.default_rng(seed)
+    side = int(np.ceil(np.sqrt(count)))
+    cells = [(i, j) for i in range(side) for j in range(side)]
+    rng.shuffle(cells)
+    places = []
+    for i, j in cells[:count]:
+        y, x = ((np.array([i, j]) + 0.5 + rng.uniform(-0.15, 0.15, 2)) / side * 2 - 1) * reach
+        places.append((round(y * shape[0]), round(x * shape[1])))
+    return places

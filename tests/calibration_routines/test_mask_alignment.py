@@ -1,0 +1,130 @@
+"""Mask alignment and captures on a small simulated display, which the procedure knows nothing about."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.display_io import DisplayBench
+from calibration_routines.mask_alignment import AlignmentFailedError, AlignmentSettings, MaskAlignment
+from instrument.alignment_file import load_alignment
+from instrument.bench import Bench
+from instrument.cli import main
+from instrument.config_file import display_text, parse_config
+from instrument.display_setup import bench_display
+from instrument.images import write_image
+from instrument.slm_correction import SlmCorrection
+from instrument.slm_image import phase_levels
+
+SMALL = {
+    "shape": "[200, 280]",
+    "shift_um": "[31.0, -42.0]",
+    "z_um": "150.0",
+    "roll_mrad": "4.0",
+    "pitch_mrad": "2.0",
+    "yaw_mrad": "-1.5",
+    "magnification": "0.002",
+    "relay_distortion_um": "0.0",
+}
+
+
+def small(**changes: str) -> str:
+    text = display_text()
+    for key, value in (SMALL | changes).items():
+        text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
+        assert count == 1, key
+    return text
+
+
+SETTINGS = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, refinements=2)
+
+
+def aligned(bench: Bench, settings: AlignmentSettings = SETTINGS):
+    assert bench.stage is not None
+    assert bench.slm is not None
+    bench.stage.home()
+    display = bench_display(bench.config, (bench.slm.shape, bench.slm.pixel_pitch_um))
+    return MaskAlignment(DisplayBench(bench, 2), display, settings).run()
+
+
+@pytest.mark.slow
+def test_it_says_so_when_it_fails_and_puts_the_stage_back() -> None:
+    text = small(shift_um="[400.0, -42.0]")  # far outside what is searched
+    with Bench(parse_config(text, None)).open() as bench:
+        assert bench.stage is not None
+        with pytest.raises(AlignmentFailedError, match="failed: spots reach"):
+            aligned(bench)
+        assert bench.stage.commanded_position() == {axis.name: 0.0 for axis in bench.stage.axes}
+
+
+def test_another_mask_is_noticed_at_once() -> None:
+    text = small().replace("mask_seed = 0", "mask_seed = 1", 1)
+    with (
+        Bench(parse_config(text, None)).open() as bench,
+        pytest.raises(AlignmentFailedError, match="speckle"),
+    ):
+        aligned(bench)
+
+
+def test_frames_are_counted_and_limited() -> None:
+    few = AlignmentSettings(reach=16.0, depth_um=300.0, spots=27, max_frames=4)
+    with (
+        Bench(parse_config(small(), None)).open() as bench,
+        pytest.raises(AlignmentFailedError, match="gave up"),
+    ):
+        aligned(bench, few)
+
+
+@pytest.mark.slow
+def test_from_the_command_line_to_a_photographed_hologram(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bench.toml").write_text(small())
+    y, x = np.mgrid[:128, :128]
+    write_image("picture.png", np.where((y - 64) ** 2 + (x - 50) ** 2 < 900, 200, 90).astype(np.uint8))
+    assert main(["hologram", "picture.png", "--out", "blind.png", "-n", "30"]) == 0
+    assert main(["align", "mask", "--reach", "16", "--depth-um", "300", "--moves", "1"]) == 0
+    assert "(SIMULATED)" in capsys.readouterr().out
+    found = load_alignment(Path("alignment.json"))
+    assert found.simulated
+    first = json.loads(Path("alignment.json").read_text())["found_at"]
+    assert first["shift_x"] == pytest.approx(31.0 / 4, abs=0.4)
+    assert first["shift_y"] == pytest.approx(-42.0 / 4, abs=0.4)
+    assert first["roll_mrad"] == pytest.approx(4.0, abs=1.0)
+    assert first["scale"] == pytest.approx(0.002, abs=0.0012)
+    assert first["z_um"] == pytest.approx(150.0, abs=60.0)
+    assert found.stage_position["x_um"] == pytest.approx(-31.0, abs=3.0)
+    assert abs(found.pose.shift_x) < 0.6
+    assert 0.3 < found.efficiency < 1.1
+    assert min(found.error.values()) > 0
+    assert Path("alignment.png").exists()
+    aligned_to = ["--alignment", "alignment.json"]
+    assert main(["hologram", "picture.png", "--out", "sharp.png", "-n", "30", *aligned_to]) == 0
+    figures = {}
+    for name, options in (("blind", []), ("sharp", aligned_to)):
+        capsys.readouterr()
+        arguments = ["--capture", f"{name}-seen.png", "--target", "picture.png", "--average", "2"]
+        assert main(["show", f"{name}.png", *arguments, *options]) == 0
+        said = capsys.readouterr().out
+        assert "(SIMULATED)" in said
+        quality = re.search(r"photographed: ([\d.]+) dB", said)
+        assert quality is not None
+        figures[name] = float(quality[1])
+    assert figures["sharp"] > figures["blind"] + 4
+    assert main(["show", "sharp.png", "--capture", "sharp-seen.png", "--target", "picture.png"]) == 2
+    assert main(["show", "sharp.png", "--seconds", "0"]) == 0
+
+
+def test_levels_go_through_the_look_up_table_once() -> None:
+    gamma = 2 * np.pi * (np.arange(256) / 255) ** 1.5
+    correction = SlmCorrection(gamma, np.full((4, 5), 0.5))
+    wanted = np.random.default_rng(0).uniform(0, 2 * np.pi, (40, 50))
+    shown = gamma[correction.apply(phase_levels(wanted))] + 0.5
+    assert np.abs(np.angle(np.exp(1j * (shown - wanted)))).max() < 0.06
+    ideal = phase_levels(wanted)
+    np.testing.assert_array_equal(SlmCorrection.ideal().apply(ideal), ideal)
