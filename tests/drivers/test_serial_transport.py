@@ -77,6 +77,7 @@ def test_a_late_reply_is_not_taken_for_the_next_commands(device: PtyDevice, port
 def test_a_reply_after_ctrl_c_is_not_taken_for_the_next_commands(
     device: PtyDevice, port: SerialTransport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert get(port, 0) == b"VALUE 0"
     device.answer = lambda line: [0.3, *value(line)] if line == b"GET 1" else value(line)
 
     def interrupted(*_: object) -> bool:

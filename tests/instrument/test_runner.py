@@ -15,7 +15,7 @@ from instrument.acquire import acquire, prepare
 from instrument.bench import Bench
 from instrument.config_file import parse_config
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
-from instrument.runner import RunState, RunStatus
+from instrument.runner import Runner, RunState, RunStatus
 from instrument.safety import StepsFailedError
 from instrument.store import FinishReason, Run, RunCondition, RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
@@ -127,23 +127,25 @@ def test_whatever_fails_the_bench_is_safe_and_the_run_says_so(
     assert runner.status.reason is (FinishReason.ABORTED if interrupted else FinishReason.FAILED)
 
 
-def test_a_second_ctrl_c_before_the_ending_begins_skips_nothing_of_it(tmp_path: Path) -> None:
-    presses: list[RunStatus] = []
+def test_a_second_ctrl_c_before_the_ending_begins_skips_nothing_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end, reasons = Runner._end, []
 
-    def press(status: RunStatus) -> None:
-        if status.done == 2 and len(presses) < 2:
-            presses.append(status)
+    def interrupted_end(self: Runner, reason: FinishReason, error: BaseException | None = None) -> Run:
+        reasons.append(reason)
+        if len(reasons) == 1:
             raise KeyboardInterrupt
+        return end(self, reason, error)
 
+    monkeypatch.setattr(Runner, "_end", interrupted_end)
     with open_mock_bench() as bench:
         runner = prepare(bench, plan(), tmp_path)
-        runner.on_progress = press
         with pytest.raises(KeyboardInterrupt):
             runner.execute()
         assert calls(bench)[-4:] == SAFE
-    assert [p.state for p in presses] == [RunState.RUNNING, RunState.ENDING]
+    assert reasons == [FinishReason.COMPLETED, FinishReason.ABORTED]
     assert Run.open(runner.path).condition is RunCondition.ABORTED
-    assert runner.status.state is RunState.FINISHED
 
 
 @pytest.mark.parametrize("pressed_before", [True, False])
