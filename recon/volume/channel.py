@@ -165,7 +165,7 @@ class ChannelProblem:
         rest: Array = self._removal.background(self.data - self.camera.forward(solution))
         return np.asarray(rest[0])
 
-    def solver(self, tau: float | None, start: Array | None, *, keep_state: bool) -> tuple[Solver, float]:
+    def solver(self, tau: float | None, start: Array | None) -> tuple[Solver, float]:
         """Return a solver, and the prior's weight relative to ``max |A^H b|``."""
         data = self.data if self._removal is None else self._removal.forward(self.data)
         peak = self._peak(data)
@@ -186,7 +186,7 @@ class ChannelProblem:
                     valid=self.valid,
                     background=self._removal,
                     initial=start,
-                    keep_state=keep_state,
+                    keep_state=False,
                     storage=self._storage,
                 ),
                 tau,
@@ -201,7 +201,7 @@ class ChannelProblem:
                 valid=self.valid,
                 background=self._removal,
                 initial=start,
-                keep_state=keep_state,
+                keep_state=False,
                 storage=self._storage,
             ),
             tau,

@@ -83,7 +83,8 @@ def reconstruct_volume(
     scratch : path, optional
         Folder on a fast disk for what does not fit into memory. Without it a volume too large is refused.
     callback : callable, optional
-        ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one.
+        ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one, and may be
+        called until ``callback`` returns.
     cancel : threading.Event, optional
         Set it to stop after the iteration in progress.
 
@@ -123,7 +124,7 @@ def reconstruct_volume(
             scratch=scratch,
         )
         start = None if initial is None else run.start(_channel(initial.volume, channel), window)
-        solver, relative = run.solver(tau, start, keep_state=callback is not None)
+        solver, relative = run.solver(tau, start)
         scale = float(scaled.noise[channel]) / scaled.energy
 
         def tell(solver: Solver, record: IterationRecord, scale: float = scale) -> None:

@@ -8,6 +8,7 @@ import pytest
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct_volume
 from recon.solvers import StopReason
 from recon.volume import memory
+from recon.volume.channel import ChannelProblem
 from recon.volume.model import choose_model, sort_by_depth
 
 SIZE, DEPTHS, SPAN = 40, 8, 0.4
@@ -270,3 +271,17 @@ def test_psfs_of_another_size_are_refused_and_saturation_is_warned_of():
 def test_settings_without_a_meaning_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         reconstruct_volume(measurement(), calibration(), **wrong)
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_being_called_back_costs_no_volume_more_at_the_end(monkeypatch, prior):
+    solvers = []
+    solver = ChannelProblem.solver
+
+    def noted(*args, **options):
+        solvers.append(solver(*args, **options))
+        return solvers[-1]
+
+    monkeypatch.setattr(ChannelProblem, "solver", noted)
+    reconstruct_volume(measurement(), calibration(), prior=prior, iterations=1, callback=lambda *_: None)
+    assert not solvers[0][0].keep_state
