@@ -30,6 +30,7 @@ class Method(enum.StrEnum):
     """The methods of :func:`recon.reconstruct`."""
 
     ADMM = "admm"
+    ADMM_SENSOR = "admm-sensor"
     FISTA = "fista"
     WIENER = "wiener"
 
@@ -132,7 +133,12 @@ def reconstruct(
         ),
     ] = "saturated",
     method: Annotated[
-        Method, typer.Option("--method", "-m", help="admm: best; fista: plain; wiener: one shot.")
+        Method,
+        typer.Option(
+            "--method",
+            "-m",
+            help="admm: best; admm-sensor: dense scenes on many pixels; fista: plain; wiener: one shot.",
+        ),
     ] = Method.ADMM,
     prior: Annotated[
         PriorName | None,
@@ -203,10 +209,18 @@ def reconstruct(
     """
     outputs = Outputs.named(out, figure)
     if volume is not None:
-        if (psf, calibration, z_mm, figure) != (None, None, None, None) or method is not Method.ADMM:
-            raise BenchError(
-                "With --volume, --psf, --calibration, --z-mm, --figure and --method do not apply."
-            )
+        pictures_only = {
+            "--psf": psf is not None,
+            "--calibration": calibration is not None,
+            "--z-mm": z_mm is not None,
+            "--method": method is not Method.ADMM,
+            "--rotate": rotate is not Rotation.NONE,
+            "--figure": figure is not None,
+            "--allow-saturated": allow_saturated,
+            "--mixed-depth": mixed_depth,
+        }
+        if given := [option for option, is_given in pictures_only.items() if is_given]:
+            raise BenchError(f"With --volume these do not apply: {', '.join(given)}. Leave them out.")
         from instrument.cli.volume import reconstruct_to_volume
 
         reconstruct_to_volume(
@@ -227,6 +241,8 @@ def reconstruct(
             force=force,
         )
         return
+    if model != "auto" or not background:
+        raise BenchError("--model and --no-background are for volumes: give --volume, or leave them out.")
     outputs.check(0, overwrite=force)
     with saying_what_is_left(*outputs.files()):
         job = _job(

@@ -54,6 +54,8 @@ def reconstruct_to_volume(
         job = volume_job(psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
         for name, text in job.notes.items():
             typer.echo(f"{name:<12}{text}")
+        if job.simulated:
+            typer.echo("SIMULATED   PSFs or image come from the simulated bench")
         outputs.check(len(job.calibration.psfs) * job.measurement.size, overwrite=force)
         with progress_bar() as bar, first_interrupt_cancels() as cancel:
             task = bar.add_task("volume", total=limit, note="")

@@ -21,7 +21,10 @@ from scipy.signal import convolve2d
 
 from instrument.calibration_file import save_calibration
 from instrument.cli import main
+from instrument.cli.reconstruct import Method, PriorName
 from instrument.images import read_image, write_image
+from recon.methods import method_names
+from recon.picture import PRIORS
 from recon.types import Calibration, Geometry
 
 RNG = np.random.default_rng(3)
@@ -396,3 +399,8 @@ def count_runs(line: npt.NDArray[np.bool_]) -> int:
     edges = np.diff(np.concatenate([[0], line.astype(int), [0]]))
     lengths = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
     return int(np.count_nonzero(lengths >= 3))
+
+
+def test_every_method_and_prior_is_on_offer() -> None:
+    assert [m.value for m in Method] == list(method_names())
+    assert [p.value for p in PriorName] == list(PRIORS)

@@ -92,3 +92,28 @@ def test_refuses_in_words(files, arguments, words, run):
     assert code == 2
     assert words in output
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--method", "admm-sensor")]
+)
+def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
+    folder, image, out = files
+    code, output = run("--volume", folder, "--image", image, "--out", out, *options)
+    assert code == 2
+    assert f"With --volume these do not apply: {options[0]}." in output
+    code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, "--no-background")
+    assert code == 2
+    assert "are for volumes" in output
+    assert not out.exists()
+
+
+def test_simulated_volumes_are_called_so(files, run, tmp_path):
+    _, image, out = files
+    stack = np.stack([psf(z) for z in range(DEPTHS)])[:, None]
+    positions = np.stack([np.zeros(DEPTHS), np.zeros(DEPTHS), np.linspace(9e3, 12e3, DEPTHS)], axis=1)
+    simulated = Calibration(stack, positions, None, Geometry(), provenance={"simulated": True})
+    save_calibration(simulated, tmp_path / "calibration")
+    code, output = run("--volume", tmp_path / "calibration", "--image", image, "--out", out, "-n", 2)
+    assert code == 0, output
+    assert "SIMULATED" in output
