@@ -94,6 +94,7 @@ class CarriageStage(SimulatedDevice, Stage):
         self._stop = threading.Event()
         self._lock = threading.RLock()
         self._homed = False
+        self._homing = False
         self._commanded = self.carriage.reported()
 
     @abstractmethod
@@ -155,14 +156,19 @@ class CarriageStage(SimulatedDevice, Stage):
         self._require()
         with self._lock:
             self._homed = False
+            self._homing = True
             self._begin({spec.name: spec.home for spec in self.carriage.axes.values()})
-        self.wait()
-        if not self.world.clock.wait(REFERENCE_S, self._stop):
-            raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
-        with self._lock:
-            self.carriage.find_reference()
-            self._commanded = self.carriage.reported()
-            self._homed = True
+        try:
+            self.wait()
+            self.world.clock.wait(REFERENCE_S, self._stop)
+            with self._lock:
+                if self._stop.is_set():
+                    raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
+                self.carriage.find_reference()
+                self._commanded = self.carriage.reported()
+                self._homed = True
+        finally:
+            self._homing = False
 
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
         """Move the named axes to absolute positions."""
@@ -229,7 +235,7 @@ class CarriageStage(SimulatedDevice, Stage):
 
     def _halt(self) -> None:
         with self._lock:
-            if self.carriage.is_moving:
+            if self.carriage.is_moving or self._homing:
                 self._stop.set()
             self.carriage.halt()
             self._commanded = self.carriage.reported()

@@ -261,6 +261,22 @@ def test_stop_cuts_a_long_exposure_short() -> None:
 
 
 # The camera's electronics ---
+def test_stop_ends_homing_on_the_reference_mark_too() -> None:
+    bench = Bench()
+    stopped: list[bool] = []
+
+    def stop_at_the_mark(_seconds: float, cancelled: threading.Event) -> bool:
+        bench.stage.stop()
+        stopped.append(cancelled.is_set())
+        return not cancelled.is_set()
+
+    bench.world.clock.wait = stop_at_the_mark  # type: ignore[method-assign]
+    with pytest.raises(StoppedError, match="homing was stopped"):
+        bench.stage.home()
+    assert stopped == [True]
+    assert not bench.stage.is_homed
+
+
 def test_a_region_is_cut_out_of_the_whole_frame() -> None:
     bench = Bench()
     whole = bench.lit()
