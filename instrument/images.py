@@ -81,15 +81,15 @@ def read_image(path: Path | str) -> ImageFile:
     return ImageFile(path, pixels, (*notes, *more, *converted), _metadata(path))
 
 
-def read_stack(path: Path | str) -> ImageFile:
+def read_stack(path: Path | str, *, leave_out: Path | None = None) -> ImageFile:
     """Read a stack of images: a multi-page TIFF, an array with one more axis, or a folder of images.
 
-    The images of a folder are taken in the order of their names and must agree in shape and dtype. A single
-    image is a stack of one. Errors as :func:`read_image`.
+    The images of a folder are taken in the order of their names, all but the file ``leave_out``, and must
+    agree in shape and dtype. A single image is a stack of one. Errors as :func:`read_image`.
     """
     path = Path(path)
     if path.is_dir():
-        return _read_folder(path)
+        return _read_folder(path, leave_out)
     array, notes = _decode(path)
     if array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (3, 4) and not _is_npy(path)):
         array, more = _one_image(path, array)
@@ -263,9 +263,11 @@ def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tupl
     return array, lossy
 
 
-def _read_folder(folder: Path) -> ImageFile:
+def _read_folder(folder: Path, leave_out: Path | None) -> ImageFile:
     suffixes = {".tif", ".tiff", ".png", ".bmp", ".npy", ".jpg", ".jpeg"}
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith("."))
+    if leave_out is not None:
+        paths = [p for p in paths if p.resolve() != leave_out.resolve()]
     if not paths:
         raise FileError(folder, f"holds no images ({READABLE}).")
     first = read_image(paths[0])

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from instrument.calibration_file import is_calibration
 from instrument.erasures import Choice
-from instrument.errors import FileError
-from instrument.images import ImageFile, read_image, read_stack
+from instrument.images import read_stack
 from instrument.preparation import Crop, darkest_block
 from instrument.reconstruction_job import DarkChoice, Job, job_from_calibration, job_with
 from recon.types import Calibration
-
-SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".npy")
 
 
 def volume_job(
@@ -45,7 +40,7 @@ def volume_job(
     """
     if psfs.is_dir() and is_calibration(psfs):
         return job_from_calibration(psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
-    stack = _stack(psfs, image)
+    stack = read_stack(psfs, leave_out=image).pixels
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
         pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
@@ -54,21 +49,3 @@ def volume_job(
         np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs)}
     )
     return job_with(calibration, psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
-
-
-def _stack(psfs: Path, image: Path) -> npt.NDArray[Any]:
-    if not psfs.is_dir():
-        return read_stack(psfs).pixels
-    files = sorted(p for p in psfs.iterdir() if p.suffix.lower() in SUFFIXES)
-    files = [p for p in files if p.resolve() != image.resolve()]
-    if not files:
-        raise FileError(
-            psfs, f"holds no PSF images ({', '.join(SUFFIXES)}).", "One file a depth is expected."
-        )
-    images: list[ImageFile] = [read_image(p) for p in files]
-    for other in images[1:]:
-        if other.pixels.shape != images[0].pixels.shape or other.pixels.dtype != images[0].pixels.dtype:
-            raise FileError(
-                other.path, f"is {other.describe()}, but {images[0].path} is {images[0].describe()}."
-            )
-    return np.stack([i.pixels for i in images])
