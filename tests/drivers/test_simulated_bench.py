@@ -295,6 +295,16 @@ def test_binning_sums_light() -> None:
     np.testing.assert_allclose(binned, summed, atol=4)
 
 
+def test_each_pixel_that_is_summed_is_read_with_its_own_noise() -> None:
+    bench = Bench(noise=1.0)
+    bench.camera.set_gain(16.0)  # far above rounding
+    noise = []
+    for binning in (1, 4):
+        bench.camera.set_binning(binning)
+        noise.append(np.std(bench.counts() - bench.counts()))
+    assert noise[1] / noise[0] == pytest.approx(4, rel=0.1)
+
+
 def test_a_mosaic_separates_colours() -> None:
     bench = Bench(camera=CameraOptions(color=True, crosstalk=0.1), source_diameter_um=3000.0)
     assert bench.camera.pixel_formats[0].startswith("BayerRG")
