@@ -115,8 +115,19 @@ class Bench:
             except LimitError as error:
                 error.add_note(f"The value is from [camera] in {self.config.path}.")
                 raise
+        if kind == "led_array":
+            self._refuse_missing_leds(cast(LedArray, device))
         _log.info("%s opened: %s", device.name, device.identity)
         return device
+
+    def _refuse_missing_leds(self, led_array: LedArray) -> None:
+        count = len(led_array.led_positions_mm)
+        if missing := [led for led in self.config.source.leds if led >= count]:
+            raise LimitError(
+                led_array.name,
+                f"has LEDs 0 to {count - 1}, but [source] leds in {self.config.path} names "
+                f"{', '.join(map(str, missing))}.",
+            )
 
     def _claim(self, kind: Kind) -> None:
         """Keep other programs from a device, before it is touched, until the bench is closed."""

@@ -76,7 +76,7 @@ class SourceTable(Table):
             "of the diffuser's aperture."
         ),
     )
-    leds: tuple[int, ...] = Field(
+    leds: tuple[Annotated[int, Field(ge=0)], ...] = Field(
         (0,), min_length=1, description="Indices of the LEDs that light the source."
     )
     rgb: tuple[Level, Level, Level] = Field(

@@ -71,8 +71,11 @@ class Mistakes:
 
 def nearest_name(name: str, names: Iterable[str]) -> str | None:
     """Return the name that was probably meant, or None where none is close."""
-    close = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.6)
-    return close[0] if close else None
+    names = list(names)
+    if close := difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.6):
+        return close[0]
+    longer = [known for known in names if len(name) > 2 and known.startswith(name.lower())]
+    return longer[0] if len(longer) == 1 else None
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -178,6 +178,15 @@ def test_check_reports_all_failing_devices_with_status_1(
     assert "camera: Mock M1" in output.out
 
 
+@pytest.mark.usefixtures("mock_drivers")
+def test_check_refuses_a_source_lit_by_an_led_that_the_array_does_not_have(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH + "[source]\nleds = [0, 9999]\n")
+    assert main(["check"]) == 1
+    assert "[source] leds in bench.toml names 9999" in capsys.readouterr().err
+
+
 def test_every_mistake_of_a_bench_file_reaches_the_terminal(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -119,6 +119,13 @@ def test_a_misspelt_driver_does_not_hide_the_other_mistakes_of_its_table() -> No
 def test_an_unknown_table_is_refused_with_the_nearest_name() -> None:
     (found,) = mistakes('[camera]\ndriver = "mock"\n[gemetry]\npixel_pitch_um = 1.0\n')
     assert re.search(r":3: \[gemetry\]: no such table.*Did you mean 'geometry'", found)
+    (found,) = mistakes('[camera]\ndriver = "mock"\n[led]\ndriver = "mock"\n')
+    assert re.search(r":3: \[led\]: no such table.*Did you mean 'led_array'", found)
+
+
+def test_an_led_of_the_source_that_no_array_can_have_is_a_mistake() -> None:
+    (found,) = mistakes('[camera]\ndriver = "mock"\n[source]\nleds = [0, -4]\n')
+    assert re.search(r":4: \[source\] leds\[1\]: must be greater than or equal to 0, not -4", found)
 
 
 @pytest.mark.parametrize(
