@@ -172,13 +172,21 @@ def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
     Raises
     ------
     FileError
-        When its shape differs from the image's.
+        When its shape, channels or bit depth differ from the image's.
     """
     if dark.pixels.shape[:2] != image.pixels.shape[:2] or (dark.is_colour and not image.is_colour):
         raise FileError(
             dark.path,
             f"the dark frame is {dark.describe()}, but the image {image.path} is {image.describe()}.",
             "Take it with the same camera, region of interest and binning.",
+        )
+    depths = dark.pixels.dtype, image.pixels.dtype
+    if depths[0] != depths[1] and all(d.kind == "u" for d in depths):
+        raise FileError(
+            dark.path,
+            f"the dark frame has {8 * depths[0].itemsize} bit, but the image {image.path} has "
+            f"{8 * depths[1].itemsize} bit: their counts are not the same.",
+            "Use the raw file of the dark frame.",
         )
     frame = dark.pixels.astype(np.float32)
     return Dark(frame, frame, f"the frame {dark.path} (mean {float(frame.mean()):.1f} counts)")

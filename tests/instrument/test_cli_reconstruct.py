@@ -298,7 +298,7 @@ def without_root_powers() -> None:
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--out", "locked/out.tif"), "no permission to write in locked"),
+        (("--out", "locked/out.tif"), "/locked. Choose another place."),
         (("--psf", "secret.tif"), "secret.tif"),
     ],
 )

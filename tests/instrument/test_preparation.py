@@ -177,6 +177,9 @@ def test_a_psf_that_vanishes_with_the_dark_is_refused(tmp_path: Path) -> None:
     write_image(tmp_path / "dark.tif", np.zeros((9, 9), np.uint16))
     with pytest.raises(FileError, match=r"dark frame is 9 x 9"):
         job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=tmp_path / "dark.tif")
+    write_image(tmp_path / "dark.tif", np.zeros_like(psf_pixels(), np.uint8))
+    with pytest.raises(FileError, match=r"the dark frame has 8 bit, but the image .* has 16 bit"):
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=tmp_path / "dark.tif")
 
 
 def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
