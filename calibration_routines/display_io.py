@@ -44,6 +44,10 @@ class DisplayBench:
         """Show the phase of an SLM field, complex (height, width) in binned pixels."""
         self.slm.display(self.correction.apply(phase_levels(np.angle(field), self.binning)))
 
+    def show_levels(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Show grey levels as they are, uncorrected, (height, width) of the whole SLM."""
+        self.slm.display(levels)
+
     def photograph(self, exposure_ms: float) -> Array:
         """Return counts a millisecond, background subtracted, float64: one frame, and a dark one at first.
 
@@ -71,3 +75,24 @@ def approach_from_below(stage: Stage, target: Mapping[str, float]) -> None:
     play = {name: 5.0 if name.endswith("_um") else 0.1 for name in target}
     stage.move_to({name: max(value - play[name], limits[name][0]) for name, value in target.items()})
     stage.move_to(target)
+
+
+def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
+    """Bring the mask's stage to where an alignment left it, homing it where it has lost its reference.
+
+    An empty place moves nothing.
+
+    Raises
+    ------
+    BenchError
+        When there is a place and no stage.
+    DeviceError
+        When the stage refuses or fails.
+    """
+    if not place:
+        return
+    if bench.stage is None:
+        raise BenchError(f"{bench.label} has no [stage] to bring the mask to its place.")
+    if not bench.stage.is_homed:
+        bench.stage.home()
+    approach_from_below(bench.stage, place)

@@ -22,14 +22,14 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display_io import DisplayBench, approach_from_below
-from calibration_routines.hologram_capture import find_camera
+from calibration_routines.spot_camera import SpotCamera
 from instrument.errors import BenchError
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
 from recon.holography.pose import NAMES, Pose
 from recon.holography.pose_fit import PoseProbe
-from recon.holography.spots import Spot, SpotMaker, depth_um, spread_spots
+from recon.holography.spots import depth_um
 
 Array = npt.NDArray[Any]
 Progress = Callable[[str, int], object]
@@ -134,17 +134,13 @@ class MaskAlignment:
         self.io = io
         self.display = replace(display, displacement=None)
         self.settings = settings or AlignmentSettings()
-        self.maker = SpotMaker(self.display)
-        self.probe = PoseProbe(self.maker)
+        self.spots = SpotCamera(io, self.display, before_frame=self._enough)
+        self.probe = PoseProbe(self.spots.maker)
         self._progress = progress
-        self._seed = 0
         tilt = self.settings.tilt_mrad
         self._prior = np.array([np.inf] * 6 + [tilt, tilt])
         self.log: list[str] = []
         self.efficiencies: list[tuple[int, float]] = []
-        camera = io.bench.camera
-        pitch_um = camera.pixel_pitch_um * camera.binning
-        self._across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
 
     def run(self) -> AlignmentReport:
         """Align; returns what was found and leaves the stage at the best pose.
@@ -191,16 +187,15 @@ class MaskAlignment:
         pose, error, efficiency = self._refine(pose, self.settings.refinements, small=True)
         self._check(efficiency)
         return AlignmentReport(
-            pose, error, efficiency, found_at, self.io.frames, self.camera, self.mean_per_ms, self.log,
-            self.efficiencies,
+            pose, error, efficiency, found_at, self.io.frames, self.spots.camera, self.spots.mean_per_ms,
+            self.log, self.efficiencies,
         )  # fmt: skip
 
     # Steps -------------------------------------------------------------------------------------
     def _register(self) -> None:
         """Blank SLM: register the camera, and learn how bright the mean intensity is."""
-        self._enough()
-        self.camera, self.mean_per_ms = find_camera(self.io, self.display)
-        self._say(f"camera registered to {self.camera.residual_px:.2f} px")
+        self.spots.register()
+        self._say(f"camera registered to {self.spots.camera.residual_px:.2f} px")
 
     def _search(self) -> Pose:
         settings, k = self.settings, self.display.factor
@@ -214,7 +209,7 @@ class MaskAlignment:
         order = np.random.default_rng(1).permutation(len(hypotheses))
         for first in range(0, len(order), settings.spots):
             chosen = order[first : first + settings.spots]
-            brightness[chosen], _ = self._measure([hypotheses[n] for n in chosen], shifts_only=True)
+            brightness[chosen], _ = self.spots.measure([hypotheses[n] for n in chosen], shifts_only=True)
             self._tell("search for the shift")
         maps = brightness.reshape(len(depths), 2 * steps + 1, 2 * steps + 1)
         score = _smooth(maps).ravel()
@@ -263,7 +258,7 @@ class MaskAlignment:
 
     def _best(self, poses: Sequence[Pose], count: int, words: str) -> list[Pose]:
         """Measure poses twice with other places for the spots and return the brightest ones."""
-        total = sum(self._measure(poses)[0] for _ in range(2))
+        total = sum(self.spots.measure(poses)[0] for _ in range(2))
         self._tell(words)
         order = np.argsort(total)[::-1]
         return [poses[n] for n in order[:count]]
@@ -275,20 +270,16 @@ class MaskAlignment:
         error = np.full(len(NAMES), np.nan)
         efficiency = 0.0
         for count in (pictures,) if small else (1, 1, pictures):
-            frames = [self._measure(self.probe.poses(pose)) for _ in range(count)]
+            frames = [self.spots.measure(self.probe.poses(pose)) for _ in range(count)]
             brightness = np.array([b for b, _ in frames])
             noise = float(np.mean([n for _, n in frames]))
             step = self.probe.step(brightness, noise, pose, self._prior)
-            efficiency = float(brightness[:, -1].mean()) / self._ideal(len(NAMES) * 2 + 1)
+            efficiency = float(brightness[:, -1].mean()) / self.spots.ideal(len(NAMES) * 2 + 1)
             pose, error = pose.plus(step.change), step.error
             self.efficiencies.append((self.io.frames, efficiency))
             self._tell(f"refinement, efficiency {efficiency:.2f}")
         self._check(efficiency, floor=0.05)
         return pose, error, efficiency
-
-    def _ideal(self, count: int) -> float:
-        """Brightness of a right spot among ``count``, the known DC term taken off."""
-        return self.maker.ideal(count) * (1 - self.display.dc.power)
 
     def _worth_moving(self, pose: Pose, error: npt.NDArray[np.float64]) -> bool:
         """Whether the stage can take out more than its measurement's uncertainty or the tolerance."""
@@ -347,54 +338,7 @@ class MaskAlignment:
             yaw_mrad=left.get("yaw_mrad", pose.yaw_mrad),
         )
 
-    # Pictures ----------------------------------------------------------------------------------
-    def _measure(self, poses: Sequence[Pose], *, shifts_only: bool = False) -> tuple[Array, float]:
-        """Show spots for poses and return their brightness, in units of the mean intensity at a spot's peak.
-
-        Also the noise of an amplitude (half the root mean square of what surrounds the spots).
-        """
-        self._seed += 1
-        shape = self.display.mask.shape
-        places = spread_spots(len(poses), shape, seed=self._seed)
-        spots = [Spot(row, column, pose) for (row, column), pose in zip(places, poses, strict=True)]
-        make = self.maker.shift_pattern if shifts_only else self.maker.pattern
-        pattern = make(spots, seed=self._seed)
-        self.io.show(pattern.slm)
-        # Ideal spots would reach two thirds of full scale.
-        camera = self.io.bench.camera
-        full = (1 << camera.significant_bits) - 1
-        peak = max(pattern.ideal * self._spot_area() ** -1 * 0.5, 30.0) * self.mean_per_ms
-        frame = self._photograph(0.66 * full / peak)
-        rows, columns = self.camera.pixels(
-            np.array([s.row / shape[0] for s in spots]), np.array([s.column / shape[1] for s in spots])
-        )
-        envelope = np.array([(np.sinc(s.row / shape[0]) * np.sinc(s.column / shape[1])) ** 2 for s in spots])
-        window = 1 if shifts_only else 2
-        found, around = _read_spots(frame / self.mean_per_ms, rows, columns, window)
-        share = self._captured(window)
-        # From camera pixels to the brightness at the peak: a spot's area is one mask-spectrum bin.
-        scale = 1.0 / (self._spot_area() * share * envelope)
-        noise = float(np.sqrt(np.median(around) / 2))
-        return found * scale, noise
-
-    def _spot_area(self) -> float:
-        """Camera pixels in the area of a spot."""
-        height, width = self.display.mask.shape
-        return max(self._across / height, 1e-9) * (self._across / width)
-
-    def _captured(self, window: int) -> float:
-        """Part of a spot's light inside the window that is read."""
-        share = 1.0
-        for n in self.display.mask.shape:
-            reach = (window + 0.5) / (self._across / n)
-            x = np.linspace(-reach, reach, 2001)
-            share *= float((np.sinc(x) ** 2).mean() * 2 * reach)
-        return share
-
-    def _photograph(self, exposure_ms: float) -> Array:
-        self._enough()
-        return self.io.photograph(exposure_ms)
-
+    # Saying ------------------------------------------------------------------------------------
     def _enough(self) -> None:
         if self.io.frames >= self.settings.max_frames:
             raise AlignmentFailedError(
@@ -416,20 +360,6 @@ class MaskAlignment:
     def _tell(self, words: str) -> None:
         if self._progress is not None:
             self._progress(words, self.io.frames)
-
-
-def _read_spots(frame: Array, rows: Array, columns: Array, window: int) -> tuple[Array, Array]:
-    """Sum each spot's window above the ring around it; returns sums and the rings' mean."""
-    from scipy.ndimage import map_coordinates
-
-    reach = np.arange(-6, 7)
-    y, x = np.meshgrid(reach, reach, indexing="ij")
-    places = [rows[:, None, None] + y, columns[:, None, None] + x]
-    patches = map_coordinates(frame, places, order=1, mode="nearest")
-    inside = (abs(y) <= window) & (abs(x) <= window)
-    ring = (abs(y) >= 4) | (abs(x) >= 4)
-    around = patches[:, ring].mean(axis=1)
-    return patches[:, inside].sum(axis=1) - around * int(inside.sum()), around
 
 
 def _smooth(maps: Array) -> Array:

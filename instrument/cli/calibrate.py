@@ -21,19 +21,23 @@ from calibration_routines import (
 )
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
+from instrument.cli import calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import one_task
 from instrument.errors import BenchError
 from instrument.plan import estimate
 from recon.types import Geometry
 
-app = command_app("Measure point spread functions (PSFs).")
+app = command_app("Measure point spread functions (PSFs), or how an SLM answers.")
 _MAX_PLANES = 256
 
 
 @app.callback()
 def calibrate() -> None:
     """Measure what the reconstruction needs to know about the bench."""
+
+
+app.command(epilog=calibrate_slm.EPILOG)(calibrate_slm.slm)
 
 
 @app.command(

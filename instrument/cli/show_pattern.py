@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from calibration_routines.display_io import DisplayBench, approach_from_below
+from calibration_routines.camera_in_the_loop import refine_hologram
+from calibration_routines.display_io import DisplayBench, bring_mask
 from calibration_routines.hologram_capture import Capture, capture_hologram, find_camera
-from instrument.alignment_file import load_alignment
+from instrument.alignment_file import Alignment, load_alignment
 from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.display_setup import bench_display
@@ -20,7 +21,9 @@ from instrument.errors import BenchError, FileError
 from instrument.hologram_job import prepare_target
 from instrument.images import read_image, write_image
 from instrument.slm_correction import load_slm_correction
-from instrument.slm_image import levels_phase, read_slm_image
+from instrument.slm_image import levels_phase, phase_levels, read_slm_image, write_slm_image
+from recon.holography import Display, Target
+from recon.holography.camera_map import CameraMap
 
 app = command_app()
 
@@ -84,6 +87,15 @@ def show(
             show_default=False,
         ),
     ] = None,
+    refine: Annotated[
+        int,
+        typer.Option(
+            "--refine",
+            min=0,
+            metavar="N",
+            help="With --capture: N rounds with the camera in the loop; writes PATTERN-refined.png.",
+        ),
+    ] = 0,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
 ) -> None:
     """Say how a run ended and what it holds, with a picture; or show a hologram on the SLM.
@@ -105,8 +117,10 @@ def show(
         raise FileError(capture, "exists already.", "Choose another name, or overwrite with --force.")
     if capture is not None and capture.suffix.lower() != ".png":
         raise FileError(capture, "a capture is written as .png.")
+    if refine and (capture is None or len(pattern) > 1):
+        raise BenchError("--refine needs --capture, and one pattern.")
     correction = load_slm_correction(slm_calibration) if slm_calibration else None
-    place = load_alignment(alignment).stage_position if alignment else {}
+    place = load_alignment(alignment) if alignment else None
     read = [read_slm_image(path) for path in pattern]
     with open_and_say(bench) as opened:
         if opened.slm is None:
@@ -114,27 +128,15 @@ def show(
         for path, (levels, _) in zip(pattern, read, strict=True):
             if levels.shape != opened.slm.shape:
                 raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
-        _place_mask(opened, place)
+        bring_mask(opened, place.stage_position if place else {})
         binning = opened.config.display.slm_binning
         io = DisplayBench(opened, binning, correction)
         fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
         if capture is None or target is None:
             _hold(io, fields, seconds)
             return
-        _capture(opened, io, fields, read[0][1], capture, target, average)
-
-
-def _place_mask(bench: Bench, place: Mapping[str, float]) -> None:
-    """Home the stage where it has lost its reference, and approach the place from below."""
-    stage = bench.stage
-    if not place:
-        return
-    if stage is None:
-        raise BenchError(f"{bench.label} has no [stage] to bring the mask to its place.")
-    if not stage.is_homed:
-        typer.echo("Homing the stage.", err=True)
-        stage.home()
-    approach_from_below(stage, place)
+        job = _CaptureJob(opened, io, read[0][1], capture, target, average, place)
+        job.run(fields, pattern[0], refine)
 
 
 def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
@@ -154,42 +156,84 @@ def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
         time.sleep(min(0.02, max(end - time.monotonic(), 0)))
 
 
-def _capture(
-    opened: Bench,
-    io: DisplayBench,
-    fields: list[Any],
-    facts: dict[str, Any],
-    out: Path,
-    target: Path,
-    average: int,
-) -> None:
-    assert opened.slm is not None
-    display = bench_display(
-        opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um), expansion=facts.get("expansion")
-    )
-    envelope = facts.get("metrics_computed_for", {}).get("envelope", "shade")
-    wanted = prepare_target(read_image(target).pixels, display, envelope=envelope)
-    camera, mean_per_ms = find_camera(io, display)
-    found = capture_hologram(io, fields, display, wanted, camera, mean_per_ms=mean_per_ms, average=average)
-    simulated = bool(opened.simulated_kinds)
-    _write(found, out, camera.residual_px, simulated=simulated)
-    score = found.scores
-    mark = " (SIMULATED)" if simulated else ""
-    typer.echo(f"camera registered to {camera.residual_px:.2f} px{mark}")
-    typer.echo(
-        f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
-        f"middle quarter {score.crop_psnr_db:.2f} dB"
-    )
-    if found.saturated_fraction > 1e-3:
-        typer.echo(
-            f"Warning: {100 * found.saturated_fraction:.1f} % of the camera's pixels are saturated.", err=True
+@dataclass(frozen=True, slots=True)
+class _CaptureJob:
+    """Photographs fields and says how good they are; refines one where asked to."""
+
+    opened: Bench
+    io: DisplayBench
+    facts: dict[str, Any]
+    out: Path
+    target: Path
+    average: int
+    place: Alignment | None
+
+    def run(self, fields: list[Any], pattern: Path, refine: int) -> None:
+        """Photograph, compare, write; with the camera in the loop ``refine`` times."""
+        opened = self.opened
+        assert opened.slm is not None
+        display = bench_display(
+            opened.config,
+            (opened.slm.shape, opened.slm.pixel_pitch_um),
+            expansion=self.facts.get("expansion"),
         )
-    typer.echo(f"Wrote {out}")
+        display = self.place.of(display) if self.place else display
+        envelope = self.facts.get("metrics_computed_for", {}).get("envelope", "shade")
+        wanted = prepare_target(read_image(self.target).pixels, display, envelope=envelope)
+        camera, mean_per_ms = find_camera(self.io, display)
+        simulated = bool(opened.simulated_kinds)
+        mark = " (SIMULATED)" if simulated else ""
+        typer.echo(f"camera registered to {camera.residual_px:.2f} px{mark}")
+        if refine:
+            found = self._refine(fields[0], display, wanted, camera, mean_per_ms, refine, pattern)
+        else:
+            found = capture_hologram(
+                self.io, fields, display, wanted, camera, mean_per_ms=mean_per_ms, average=self.average
+            )
+        _write(found, self.out, camera.residual_px, simulated=simulated)
+        score = found.scores
+        typer.echo(
+            f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
+            f"middle quarter {score.crop_psnr_db:.2f} dB"
+        )
+        if found.saturated_fraction > 1e-3:
+            percent = 100 * found.saturated_fraction
+            typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
+        typer.echo(f"Wrote {self.out}")
+
+    def _refine(
+        self,
+        field: Any,
+        display: Display,
+        wanted: Target,
+        camera: CameraMap,
+        mean_per_ms: float,
+        rounds: int,
+        pattern: Path,
+    ) -> Capture:
+        found = refine_hologram(
+            self.io,
+            field[None],
+            display,
+            wanted,
+            camera,
+            mean_per_ms=mean_per_ms,
+            rounds=rounds,
+            average=self.average,
+            progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+        )
+        path = pattern.with_name(f"{pattern.stem}-refined.png")
+        facts = {**self.facts, "refined_by_camera": True, "captured_psnr_db": list(found.psnr_db)}
+        facts.pop("format", None)
+        facts.pop("levels_per_turn", None)
+        write_slm_image(path, phase_levels(np.angle(found.slm[0]), self.io.binning), facts)
+        typer.echo(
+            f"camera in the loop: {found.psnr_db[0]:.2f} dB -> {found.best.scores.psnr_db:.2f} dB; {path}"
+        )
+        return found.best
 
 
 def _write(found: Capture, out: Path, residual_px: float, *, simulated: bool) -> None:
-    from dataclasses import asdict
-
     pixels = np.clip(np.rint(found.seen * 255), 0, 255).astype(np.uint8)
     facts = {"simulated": simulated, "metrics": asdict(found.scores), "camera_residual_px": residual_px}
     write_image(out, pixels, {**facts, "low_passed": True, "white": 255})

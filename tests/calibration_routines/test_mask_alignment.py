@@ -11,14 +11,19 @@ import pytest
 
 from calibration_routines.display_io import DisplayBench
 from calibration_routines.mask_alignment import AlignmentFailedError, AlignmentSettings, MaskAlignment
+from calibration_routines.slm_calibration import measure_flatness, measure_look_up_table
+from drivers.simulated.display_world import DisplayWorld
 from instrument.alignment_file import load_alignment
 from instrument.bench import Bench
 from instrument.cli import main
 from instrument.config_file import display_text, parse_config
 from instrument.display_setup import bench_display
 from instrument.images import write_image
-from instrument.slm_correction import SlmCorrection
+from instrument.slm_correction import SlmCorrection, load_slm_correction
 from instrument.slm_image import phase_levels
+from recon.errors import InputError
+from recon.holography.pose import Pose
+from recon.holography.slm_response import MODES, mode
 
 SMALL = {
     "shape": "[200, 280]",
@@ -116,6 +121,13 @@ def test_from_the_command_line_to_a_photographed_hologram(
         assert quality is not None
         figures[name] = float(quality[1])
     assert figures["sharp"] > figures["blind"] + 4
+    # The camera in the loop gains, and the refined pattern shows again what it gained.
+    loop = ["--capture", "loop.png", "--target", "picture.png", "--average", "2", "--refine", "2"]
+    assert main(["show", "sharp.png", *loop, *aligned_to]) == 0
+    gained = re.search(r"loop: ([\d.]+) dB -> ([\d.]+) dB", capsys.readouterr().out)
+    assert gained is not None
+    assert float(gained[2]) > float(gained[1]) + 0.1
+    assert Path("sharp-refined.png").exists()
     assert main(["show", "sharp.png", "--capture", "sharp-seen.png", "--target", "picture.png"]) == 2
     assert main(["show", "sharp.png", "--seconds", "0"]) == 0
 
@@ -128,3 +140,63 @@ def test_levels_go_through_the_look_up_table_once() -> None:
     assert np.abs(np.angle(np.exp(1j * (shown - wanted)))).max() < 0.06
     ideal = phase_levels(wanted)
     np.testing.assert_array_equal(SlmCorrection.ideal().apply(ideal), ideal)
+
+
+AT_ITS_PLACE = {"shift_um": "[0.0, 0.0]", "z_um": "0.0", "roll_mrad": "0.0", "magnification": "0.0"}
+BENT = "settle_ms = 0.0\nlut_gamma = 1.4\nphase_at_full_level_rad = 7.2"
+
+
+def test_the_look_up_table_is_measured_through_an_unknown_mask() -> None:
+    """The mask is misplaced, and need not be known: interference of two halves of the SLM tells the phase."""
+    text = small().replace("settle_ms = 30.0", BENT)
+    with Bench(parse_config(text, None)).open() as bench:
+        found = measure_look_up_table(DisplayBench(bench, 2), n_levels=17)
+    true = 7.2 * (np.arange(256) / 255) ** 1.4
+    assert np.abs(found.correction.phase_of_level_rad - true).max() < 0.05
+
+
+def test_too_little_phase_is_noticed() -> None:
+    text = small().replace("settle_ms = 30.0", "settle_ms = 0.0\nphase_at_full_level_rad = 0.01")
+    with (
+        Bench(parse_config(text, None)).open() as bench,
+        pytest.raises(InputError, match=r"interference|phase"),
+    ):
+        measure_look_up_table(DisplayBench(bench, 2), n_levels=9)
+
+
+@pytest.mark.slow
+def test_flatness_is_measured_and_taken_off(tmp_path: Path) -> None:
+    text = small(**AT_ITS_PLACE, flatness_rad="5.0").replace("settle_ms = 30.0", BENT)
+    with Bench(parse_config(text, None)).open() as bench:
+        assert bench.slm is not None
+        io = DisplayBench(bench, 2)
+        display = bench_display(bench.config, (bench.slm.shape, bench.slm.pixel_pitch_um))
+        table = measure_look_up_table(io, n_levels=17)
+        found = measure_flatness(io, display, Pose(), table, pictures=6)
+        (world,) = bench.shared.values()
+        assert isinstance(world, DisplayWorld)
+        true = world._flatness_map(bench.slm.shape)
+    assert found.correction.flatness_rad is not None
+    coefficients = [
+        [float((m * error).mean()) for m in (mode(n, error.shape) for n in range(len(MODES)))]
+        for error in (true, found.correction.flatness_rad)
+    ]
+    before = np.linalg.norm(coefficients[0])
+    assert np.linalg.norm(np.subtract(*coefficients)) < 0.6 * before
+    found.correction.save(tmp_path / "slm.json", {})
+    again = load_slm_correction(tmp_path / "slm.json")
+    levels = np.random.default_rng(0).integers(0, 256, bench.slm.shape, dtype=np.uint8)
+    difference = again.apply(levels).astype(int) - found.correction.apply(levels)
+    assert np.isin(difference, (-255, -1, 0, 1, 255)).all()  # the file rounds
+
+
+def test_calibrate_slm_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bench.toml").write_text(small().replace("settle_ms = 30.0", BENT))
+    assert main(["calibrate", "slm", "--levels", "17"]) == 0
+    assert "(SIMULATED): 7.2" in capsys.readouterr().out
+    assert load_slm_correction(Path("slm-calibration.json")).flatness_rad is None
+    assert main(["calibrate", "slm"]) == 2
+    assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,136 @@
+"""Show spots that are hypotheses, and read how bright each of them is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display_io import DisplayBench
+from calibration_routines.hologram_capture import find_camera
+from recon.holography import Display
+from recon.holography.camera_map import CameraMap
+from recon.holography.pose import Pose
+from recon.holography.spots import Spot, SpotMaker, spread_spots
+
+Array = npt.NDArray[Any]
+
+
+class SpotCamera:
+    """The bench as something that says how bright spots are.
+
+    Brightness is in units of the mean intensity over the field of view, at a spot's peak, the mask pixels'
+    envelope taken off; noise is that of an amplitude, from the speckle around the spots.
+
+    Parameters
+    ----------
+    io : DisplayBench
+    display : Display
+    before_frame : callable, optional
+        Called before every photograph; raises to end the work.
+    """
+
+    camera: CameraMap
+    mean_per_ms: float
+
+    def __init__(
+        self, io: DisplayBench, display: Display, *, before_frame: Callable[[], object] | None = None
+    ) -> None:
+        self.io = io
+        self.display = display
+        self.maker = SpotMaker(display)
+        self._before_frame = before_frame
+        self._seed = 0
+        camera = io.bench.camera
+        pitch_um = camera.pixel_pitch_um * camera.binning
+        self._across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
+
+    def register(self) -> None:
+        """Find the camera by the mask's speckle; needed before the first measurement and after a rotation.
+
+        Raises
+        ------
+        InputError
+            When the speckle is not recognised.
+        """
+        self._ask()
+        self.camera, self.mean_per_ms = find_camera(self.io, self.display)
+
+    def ideal(self, count: int) -> float:
+        """Brightness of a right spot among ``count``, the known DC term taken off."""
+        return self.maker.ideal(count) * (1 - self.display.dc.power)
+
+    def measure(self, poses: Sequence[Pose], *, shifts_only: bool = False) -> tuple[Array, float]:
+        """Show one spot for each pose in one picture; returns brightness and noise.
+
+        ``shifts_only`` is for many spots whose poses differ in shift and depth alone.
+        """
+        self._seed += 1
+        spots = self._spots(poses)
+        make = self.maker.shift_pattern if shifts_only else self.maker.pattern
+        return self._look(make(spots, seed=self._seed).slm, spots, 1 if shifts_only else 2)
+
+    def measure_with_phases(self, pose: Pose, phases: Sequence[Array]) -> tuple[Array, float]:
+        """Show one spot for each phase map (radians, the SLM's shape), which its field is lessened by."""
+        self._seed += 1
+        spots = self._spots([pose] * len(phases))
+        rng = np.random.default_rng(self._seed)
+        total = np.zeros(self.display.slm_shape, complex)
+        for spot, phase in zip(spots, phases, strict=True):
+            total += self.maker.field(spot) * np.exp(1j * (rng.uniform(0, 2 * np.pi) - phase))
+        # The peak alone: an aberration spreads a spot, but leaves its light in the neighbourhood.
+        return self._look(np.exp(1j * np.angle(total)), spots, 0)
+
+    def _spots(self, poses: Sequence[Pose]) -> list[Spot]:
+        places = spread_spots(len(poses), self.display.mask.shape, seed=self._seed)
+        return [Spot(row, column, pose) for (row, column), pose in zip(places, poses, strict=True)]
+
+    def _look(self, slm: Array, spots: Sequence[Spot], window: int) -> tuple[Array, float]:
+        """Show a pattern and read its spots."""
+        shape = self.display.mask.shape
+        self._ask()
+        self.io.show(slm)
+        # Ideal spots would reach two thirds of full scale.
+        full = (1 << self.io.bench.camera.significant_bits) - 1
+        peak = max(0.5 * self.maker.ideal(len(spots)) / self._spot_area(), 30.0) * self.mean_per_ms
+        frame = self.io.photograph(0.66 * full / peak)
+        y = np.array([spot.row / shape[0] for spot in spots])
+        x = np.array([spot.column / shape[1] for spot in spots])
+        found, around = _read_spots(frame / self.mean_per_ms, *self.camera.pixels(y, x), window)
+        # From camera pixels to the brightness at the peak: a spot's area is one bin of the mask's spectrum.
+        scale = 1.0 / (self._spot_area() * self._captured(window) * (np.sinc(y) * np.sinc(x)) ** 2)
+        return found * scale, float(np.sqrt(np.median(around) / 2))
+
+    def _ask(self) -> None:
+        if self._before_frame is not None:
+            self._before_frame()
+
+    def _spot_area(self) -> float:
+        """Camera pixels in the area of a spot."""
+        height, width = self.display.mask.shape
+        return (self._across / height) * (self._across / width)
+
+    def _captured(self, window: int) -> float:
+        """Part of a spot's light inside the window that is read."""
+        share = 1.0
+        for n in self.display.mask.shape:
+            reach = (window + 0.5) / (self._across / n)
+            x = np.linspace(-reach, reach, 2001)
+            share *= float((np.sinc(x) ** 2).mean() * 2 * reach)
+        return share
+
+
+def _read_spots(frame: Array, rows: Array, columns: Array, window: int) -> tuple[Array, Array]:
+    """Sum each spot's window above the ring around it; returns sums and the rings' mean."""
+    from scipy.ndimage import map_coordinates
+
+    reach = np.arange(-6, 7)
+    y, x = np.meshgrid(reach, reach, indexing="ij")
+    places = [rows[:, None, None] + y, columns[:, None, None] + x]
+    patches = map_coordinates(frame, places, order=1, mode="nearest")
+    inside = (abs(y) <= window) & (abs(x) <= window)
+    ring = (abs(y) >= 4) | (abs(x) >= 4)
+    around = patches[:, ring].mean(axis=1)
+    return patches[:, inside].sum(axis=1) - around * int(inside.sum()), around
