@@ -186,8 +186,10 @@ def test_flatness_is_measured_and_taken_off(tmp_path: Path) -> None:
     found.correction.save(tmp_path / "slm.json", {})
     again = load_slm_correction(tmp_path / "slm.json")
     levels = np.random.default_rng(0).integers(0, 256, bench.slm.shape, dtype=np.uint8)
-    difference = again.apply(levels).astype(int) - found.correction.apply(levels)
-    assert np.isin(difference, (-255, -1, 0, 1, 255)).all()  # the file rounds
+    # The file rounds, and an SLM of more than a turn has two levels for some phases: compare the phases.
+    phase = found.correction.phase_of_level_rad
+    difference = phase[again.apply(levels)] - phase[found.correction.apply(levels)]
+    assert np.abs(np.angle(np.exp(1j * difference))).max() < 0.07
 
 
 def test_calibrate_slm_from_the_command_line(
