@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from recon.optics.grid import PixelGrid
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 COARSE_STEP = 0.004
 """In tangents of the angle; linear interpolation between is exact to 1e-4 for any pixel's response."""
@@ -91,6 +94,8 @@ def _coarse(
     left = np.clip(place.astype(int), 0, count - 2)
     index = np.arange(len(positions))
     weights = np.concatenate([1 - (place - left), place - left])
+    from scipy import sparse  # late: importing recon stays light
+
     matrix = sparse.csr_array(
         (weights, (np.concatenate([index, index]), np.concatenate([left, left + 1]))),
         shape=(len(positions), count),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -99,6 +102,8 @@ def overlap_matrix(
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < m)
     i, j, lengths = i[inside], j[inside], lengths[inside]
     fractions = lengths / np.diff(source_edges)[i]
+    from scipy import sparse  # late: importing recon stays light
+
     return sparse.csr_array((fractions.astype(dtype), (j, i)), shape=(m, n))
 
 
