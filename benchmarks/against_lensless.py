@@ -182,11 +182,9 @@ class Worker:
     def __init__(self, environment: Path, folder: Path, workers: int) -> None:
         self.folder, self.workers = folder, workers
         script = Path(__file__).with_name("lensless_worker.py")
-        # Its environment is its own: a PYTHONPATH of ours would bring our libraries along.
-        surroundings = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
         self._process = subprocess.Popen(
             [interpreter(environment), str(script)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=surroundings,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=surroundings(),
         )  # fmt: skip
         self.versions = self._answer()
         if f"lensless=={self.versions['lensless']}" != REQUIREMENT:
@@ -284,6 +282,11 @@ def interpreter(environment: Path) -> str:
     return str(environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python"))
 
 
+def surroundings() -> dict[str, str]:
+    """Return the variables without ours of Python: a PYTHONPATH would bring our libraries along."""
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+
+
 def ready(environment: Path | None) -> Path:
     """Return an environment with lensless: the one named, or our own, made when it is missing."""
     if environment is not None:
@@ -295,7 +298,7 @@ def ready(environment: Path | None) -> Path:
         print(f"Installing {REQUIREMENT} in {environment} ...", flush=True)
         venv.create(environment, with_pip=True, clear=True)
         pip = [interpreter(environment), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, REQUIREMENT], check=True)
+        subprocess.run([*pip, REQUIREMENT], check=True, env=surroundings())
         complete.touch()
     return environment
 
