@@ -15,7 +15,8 @@ $(STAMP): pyproject.toml
 	  echo "Install it (Debian: sudo apt install python3 python3-venv) or name one: make demo PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 	  echo "Could not make a virtual environment in '$(VENV)'. On Debian: sudo apt install python3-venv"; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	@echo "Installing diffuserbench and what it needs into $(VENV) (once; a minute or more) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@touch $(STAMP)
 
 demo: $(STAMP) ## the main job on the simulated bench: calibrate, photograph, reconstruct, figure

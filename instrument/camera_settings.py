@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from drivers.camera import Camera, Roi
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, LimitError
 from instrument.config import CameraTable
 
 
@@ -57,19 +57,35 @@ def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
 
 
 def apply_table(wanted: CameraTable, camera: Camera) -> None:
-    """Bring a camera to its configured settings, in the order in which they depend on each other."""
-    if wanted.pixel_format is not None:
-        camera.set_pixel_format(wanted.pixel_format)
-    if wanted.binning is not None:
-        camera.set_binning(wanted.binning)
-    if wanted.roi is not None:
-        camera.set_roi(Roi(*wanted.roi))
-    if wanted.black_level is not None:
-        camera.set_black_level(wanted.black_level)
-    if wanted.gain is not None:
-        camera.set_gain(wanted.gain)
-    if wanted.exposure_ms is not None:
-        camera.set_exposure_ms(wanted.exposure_ms)
+    """Bring a camera to its configured settings, in the order in which they depend on each other.
+
+    Raises
+    ------
+    LimitError
+        Naming every setting that the camera refuses; the others are set.
+    """
+    setters: dict[str, Callable[[Any], object]] = {
+        "pixel_format": camera.set_pixel_format,
+        "binning": camera.set_binning,
+        "roi": lambda roi: camera.set_roi(Roi(*roi)),
+        "black_level": camera.set_black_level,
+        "gain": camera.set_gain,
+        "exposure_ms": camera.set_exposure_ms,
+    }
+    refused = []
+    for name, set_to in setters.items():
+        value = getattr(wanted, name)
+        if value is None:
+            continue
+        try:
+            set_to(value)
+        except LimitError as error:
+            refused.append((name, error))
+    if len(refused) == 1:
+        raise refused[0][1]
+    if refused:
+        listed = "".join(f"\n  {name}: {error.problem} {error.remedy}".rstrip() for name, error in refused)
+        raise LimitError(camera.name, f"does not take {len(refused)} of its configured settings:{listed}")
 
 
 def _same(a: Any, b: Any) -> bool:

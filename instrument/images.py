@@ -251,10 +251,15 @@ def _decode_tiff(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, 
 
 
 def _decode_with_opencv(path: Path, data: bytes) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
+    loudness = cv2.utils.logging.setLogLevel(
+        cv2.utils.logging.LOG_LEVEL_SILENT
+    )  # a damaged file is told of once, in our words
     try:
         array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         array = None
+    finally:
+        cv2.utils.logging.setLogLevel(loudness)
     if array is None:
         raise FileError(path, f"is no image that can be read, or is damaged. Readable: {READABLE}.")
     if array.ndim == 3 and array.shape[-1] >= 3:

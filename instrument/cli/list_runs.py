@@ -11,6 +11,7 @@ from rich.table import Table
 
 from instrument.cli.app import BenchOption, command_app, examples
 from instrument.config_file import load_config
+from instrument.errors import FileError
 from instrument.store import Run, RunError
 from instrument.store.layout import STATE
 
@@ -26,6 +27,8 @@ def list_runs(
     bench: BenchOption = None,
 ) -> None:
     """List the runs in a folder, the newest last: what became of each, its frames, its label."""
+    if folder is not None and not folder.is_dir():
+        raise FileError(folder, "is no folder.", "Name the folder that holds the runs.")
     folder = folder or load_config(bench).data_folder
     if not folder.is_dir():
         typer.echo(f"{folder}: no such folder, so no runs yet.")

@@ -108,6 +108,15 @@ def test_an_unapplied_camera_setting_is_an_error_and_the_camera_is_closed() -> N
     assert calls(bench)[-1] == "camera.close"
 
 
+def test_all_settings_that_the_camera_refuses_are_named_at_once() -> None:
+    camera = '[camera]\ndriver = "simulated"\nexposure_ms = 1e9\nbinning = 3\ngain = 100\n'
+    bench = Bench(parse_config(camera + '[simulated]\npreset = "tiny"\n', None))
+    with pytest.raises(LimitError, match="3 of its configured settings") as caught:
+        bench.open()
+    assert all(name in str(caught.value) for name in ("exposure_ms", "binning", "gain"))
+    assert not bench.camera.is_open
+
+
 def test_snap_averages_and_completes_the_metadata() -> None:
     with bench_with().open() as bench:
         single, mean = bench.snap(), bench.snap(average=3)

@@ -270,3 +270,5 @@ def test_list_says_what_cannot_be_read(here: Path, capsys: pytest.CaptureFixture
     (copy / "state.json").write_text("{}")
     assert main(["list"]) == 0
     assert "UNREADABLE" in capsys.readouterr().out
+    assert main(["list", "no-such-folder"]) == 2
+    assert "no-such-folder: is no folder" in capsys.readouterr().err

@@ -177,6 +177,15 @@ def test_what_is_no_image_is_refused_in_words(tmp_path: Path, name: str, pattern
     assert name in str(caught.value)
 
 
+def test_a_damaged_picture_is_told_of_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cut.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8))
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(FileError, match="damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize(
     ("name", "image", "pattern"),
     [
