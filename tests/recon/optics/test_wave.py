@@ -191,7 +191,8 @@ def test_the_same_seed_gives_the_same_light_and_another_one_does_not(diffuser: D
 
 
 def test_a_psf_changes_with_angle_as_measured(propagator: WavePropagator) -> None:
-    # Kuo 2020, Fig. 5.1: alike within 15 degrees, above 75 % out to 30.
+    # Kuo 2020, Fig. 5.1: alike within 15 degrees, less and less beyond. Measured there: above 75 % out to 30
+    # degrees; this diffuser, drawn at random from the published statistics, keeps 68 %.
     grid = PixelGrid((220, 260), 13.0)
     z = 1e6
     axis = registered(propagator, (0.0, 0.0, z), grid)
