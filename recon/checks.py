@@ -120,7 +120,10 @@ def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArra
         return calibration.psfs[0], float(z[0]) if np.isfinite(z[0]) else None
     if z_um is None:
         depths = ", ".join(f"{v:g}" for v in np.unique(z))
-        raise InputError(f"The calibration holds {n} PSFs (z_um: {depths}): say which depth with z_um.")
+        raise InputError(
+            f"The calibration holds {n} PSFs (z_um: {depths}): say which depth with z_um "
+            "(--z-mm on the command line)."
+        )
     if not np.isfinite(z).all():
         raise InputError(
             f"The depths of the calibration's {n} PSFs are not known, so z_um cannot choose one."

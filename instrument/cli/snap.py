@@ -21,6 +21,9 @@ from instrument.photograph import Snapshot
 
 app = command_app()
 
+DIM = 0.1
+"""Of full scale: a lit photograph whose brightest pixel stays below it wastes most of the sensor's range."""
+
 
 class Light(enum.StrEnum):
     """What is lit while the photograph is taken."""
@@ -151,6 +154,11 @@ def _report(target: Path, taken: Snapshot, light: Light) -> None:
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
         f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
     )
+    if light is not Light.DARK and taken.image.max() < DIM * taken.full_scale:
+        typer.echo(
+            f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",
+            err=True,
+        )
     if metadata.saturated_fraction > 0:
         typer.echo(
             f"Warning: {metadata.saturated_fraction:.3%} of the pixels are saturated; shorten --exposure-ms.",

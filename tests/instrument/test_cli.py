@@ -217,6 +217,17 @@ def test_snap_keeps_counts_and_metadata(here: Path, capsys: pytest.CaptureFixtur
     assert json.loads((here / "mean.json").read_text())["led_pattern"].startswith("point source")
 
 
+def test_snap_says_when_a_lit_photograph_is_dim(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    devices = "".join(f'[{kind}]\ndriver = "simulated"\n' for kind in ("camera", "stage", "led_array"))
+    (here / "bench.toml").write_text(
+        f'{devices}[scene]\ncontrol = "simulated"\n[simulated]\npreset = "tiny"\n'
+    )
+    assert main(["snap", "--out", "dim.tif", "--exposure-ms", "1"]) == 0
+    assert "below 10% of full scale" in capsys.readouterr().err
+    assert main(["snap", "--dark", "--out", "dark.tif", "--exposure-ms", "1"]) == 0
+    assert "full scale" not in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("mock_drivers")
 def test_a_value_outside_a_devices_limits_is_a_mistake_to_put_right(
     here: Path, capsys: pytest.CaptureFixture[str]
