@@ -9,14 +9,15 @@ from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.display_world import DisplayWorld
 from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
-from drivers.simulated.stage import AXES, AxisOptions, CarriageStage, StageOptions, axis_spec
+from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
+from drivers.stage_axes import AXIS_NAMES
 
 
 class DisplayStageOptions(StageOptions):
     """Options of the simulated stage that carries the mask."""
 
     axis_names: tuple[str, ...] = Field(
-        AXES, description="One to six of x_um, y_um, z_um, roll_mrad, pitch_mrad, yaw_mrad."
+        AXIS_NAMES, description="One to six of x_um, y_um, z_um, roll_mrad, pitch_mrad, yaw_mrad."
     )
 
 

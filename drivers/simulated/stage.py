@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -11,13 +10,13 @@ from typing import Annotated, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import Stage, StageAxis
+from drivers.stage_axes import AXIS_NAMES, check_target
 
-AXES = ("x_um", "y_um", "z_um", "roll_mrad", "pitch_mrad", "yaw_mrad")
 POLL_S = 0.002
 REFERENCE_S = 1.0
 Positive = Annotated[float, Field(gt=0)]
@@ -62,8 +61,8 @@ class StageOptions(DriverOptions):
         if not self.axis_names or len(set(self.axis_names)) != len(self.axis_names):
             raise ValueError("axis_names holds one to six different names")
         for name in self.axis_names:
-            if name not in AXES:
-                raise ValueError(f"unknown axis {name!r}; choose from {', '.join(AXES)}")
+            if name not in AXIS_NAMES:
+                raise ValueError(f"unknown axis {name!r}; choose from {', '.join(AXIS_NAMES)}")
         for name in self.axes:
             if name not in self.axis_names:
                 raise ValueError(f"axes.{name} is not among axis_names {self.axis_names}")
@@ -173,7 +172,7 @@ class CarriageStage(SimulatedDevice, Stage):
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
         """Move the named axes to absolute positions."""
         self._require()
-        self._check(target)
+        check_target(self.name, self._axes, target, self._homed)
         with self._lock:
             self._begin(target)
         if wait:
@@ -240,22 +239,6 @@ class CarriageStage(SimulatedDevice, Stage):
             self.carriage.halt()
             self._commanded = self.carriage.reported()
 
-    def _check(self, target: Mapping[str, float]) -> None:
-        if not self._homed:
-            raise LimitError(self.name, "is not homed: its positions mean nothing yet.", "Home it first.")
-        limits = self.limits
-        wrong = []
-        for name, position in target.items():
-            if name not in limits:
-                wrong.append(f"it has no axis {name} (it has {', '.join(limits)})")
-            elif not math.isfinite(position):
-                wrong.append(f"{name} = {position} is no position")
-            elif not limits[name][0] <= position <= limits[name][1]:
-                low, high = limits[name]
-                wrong.append(f"{name} = {position:g} lies outside {low:g} to {high:g}")
-        if wrong:
-            raise LimitError(self.name, f"refuses the move: {'; '.join(wrong)}.", "Nothing moved.")
-
 
 class SimulatedStage(CarriageStage):
     """The stage that carries the point source.
@@ -277,7 +260,7 @@ class SimulatedStage(CarriageStage):
         resting = {"x_um": 0.0, "y_um": 0.0, "z_um": 1e3 * self.world.preset.source_distance_mm}
         x, y, z = (
             true.get(name, resting[name]) + offset
-            for name, offset in zip(AXES[:3], self.options.mount_offset_um, strict=True)
+            for name, offset in zip(AXIS_NAMES[:3], self.options.mount_offset_um, strict=True)
         )
         return x, y, z
 

@@ -10,8 +10,9 @@ from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
-from drivers.simulated.stage import AXES, AxisOptions, SimulatedStage, StageOptions
+from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
 from drivers.simulated.world import SimulatedWorld
+from drivers.stage_axes import AXIS_NAMES
 from tests.drivers.contract_camera import CameraContract
 from tests.drivers.contract_led_array import LedArrayContract
 from tests.drivers.contract_slm import SlmContract
@@ -40,7 +41,7 @@ class TestSimulatedStage(StageContract):
 
 class TestSimulatedStageOfSixAxes(StageContract):
     def make(self) -> Device:
-        return SimulatedStage(StageOptions(axis_names=AXES), tiny_world(time_scale=0.02))
+        return SimulatedStage(StageOptions(axis_names=AXIS_NAMES), tiny_world(time_scale=0.02))
 
 
 class TestSimulatedStageOfOneAxis(StageContract):
