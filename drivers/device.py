@@ -11,6 +11,8 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
+from drivers.discovery import FoundDevice
+
 Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
 
 
@@ -89,6 +91,32 @@ class Device(ABC):
         are the same when driver and options are.
         """
         return (f"{cls.__module__}.{cls.__qualname__} {options.model_dump_json()}",)
+
+    @classmethod
+    def discover(cls) -> tuple[FoundDevice, ...]:
+        """Return the devices that this driver is sure it can use, told by what their bus says of them.
+
+        Nothing is opened that another program may be using, and nothing is written to a serial port.
+
+        Raises
+        ------
+        DeviceError
+            When its bus cannot be looked at: a library that is not installed, with how to install it.
+        """
+        return ()
+
+    @classmethod
+    def probe(cls, port: str) -> FoundDevice | None:
+        """Ask at a serial port, by writing to it, whether this driver's device is there; None when not.
+
+        Only called on the user's request, with the port claimed.
+
+        Raises
+        ------
+        DeviceError
+            When the port cannot be opened. Silence and other devices' answers are no error.
+        """
+        return None
 
     @property
     @abstractmethod

@@ -27,6 +27,9 @@ COMMANDS: Mapping[str, Command] = {
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
     "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
     "drivers": Command(BENCH, "list the installed drivers by kind of device", "instrument.cli.drivers"),
+    "devices": Command(
+        BENCH, "list what is connected: USB, HID, serial, video, GenICam, displays", "instrument.cli.devices"
+    ),
     "calibrate": Command(BENCH, "measure point spread functions, or an SLM", "instrument.cli.calibrate"),
     "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
