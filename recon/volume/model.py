@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.operators.local_convolution import FieldOfPsfs
 from recon.operators.low_rank import principal_psfs
-from recon.registration import displacement, shifted
+from recon.registration import aligned, expected_shift, register, shifted
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -22,6 +22,8 @@ TOLERATED = 0.05
 """Relative PSF error over the field below which one PSF a depth will do."""
 LOW_RANK_ERROR = 0.03
 """Relative PSF error that the low-rank model is built to."""
+_SEARCH_PX, _SEARCH_PART = 16.0, 0.1
+"""A PSF is looked for this many pixels, and this part of its displacement, about where its source says."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Depths:
         """Root mean square difference of the registered PSFs from the central one, relative to it."""
         differences = norms = 0.0
         for central, field in zip(self.central, self.fields, strict=True):
-            seen = np.stack([shifted(shifted(central, *p), *-p) for p in field.points.astype(int)])
+            seen = np.stack([shifted(shifted(central, *p), *-p) for p in np.rint(field.points).astype(int)])
             differences += float(np.sum((field.psfs - seen).astype(np.float64) ** 2))
             norms += float(np.sum(seen.astype(np.float64) ** 2))
         return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
@@ -79,10 +81,46 @@ def sort_by_depth(calibration: Calibration) -> Depths:
         off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
         reference = psfs[group[int(np.argmin(off_axis))]]
         central.append(reference)
-        points = [displacement(psfs[k].mean(axis=0), reference.mean(axis=0)) for k in group]
-        registered = [shifted(psfs[k], -p[0], -p[1]) for k, p in zip(group, points, strict=True)]
-        fields.append(FieldOfPsfs(np.stack(registered), points))
+        fields.append(_registered(calibration, group, reference, group[int(np.argmin(off_axis))]))
     return Depths(z_um, np.stack(central), fields)
+
+
+def _registered(
+    calibration: Calibration, group: npt.NDArray[np.intp], reference: Array, central: int
+) -> FieldOfPsfs:
+    """Register the PSFs of one depth to the central one, between pixels."""
+    registered, points = [], []
+    for k in group:
+        psf = calibration.psfs[k]
+        if k == central:
+            registered.append(psf)
+            points.append((0.0, 0.0))
+            continue
+        near = _expected(calibration, int(k), central)
+        reach = _SEARCH_PX if near is None else _SEARCH_PX + _SEARCH_PART * float(np.hypot(*near))
+        found = register(psf.mean(axis=0), reference.mean(axis=0), near=near, within_px=reach)
+        if not found.reliable:
+            x, y, z = calibration.source_positions_um[k]
+            raise InputError(
+                f"PSF {k} (source at x = {x:g}, y = {y:g}, z = {z:g} um) cannot be registered to PSF "
+                f"{central}: its correlation has no peak that stands out ({found.prominence:.2f} times the "
+                "next). Leave it out, or take it again with more light or nearer to the axis."
+            )
+        registered.append(aligned(psf, found))
+        points.append((found.rows, found.columns))
+    return FieldOfPsfs(np.stack(registered), points)
+
+
+def _expected(calibration: Calibration, k: int, central: int) -> tuple[float, float] | None:
+    """Displacement of PSF ``k`` from the central one by the sources' places; None where not known."""
+    geometry, positions = calibration.geometry, calibration.source_positions_um[[k, central]]
+    if not geometry.diffuser_distance_mm or not geometry.pixel_pitch_um or not np.isfinite(positions).all():
+        return None
+    (row, column), (row_0, column_0) = (
+        expected_shift((x, y, z), 1e3 * geometry.diffuser_distance_mm, geometry.pixel_pitch_um)
+        for x, y, z in positions.tolist()
+    )
+    return row - row_0, column - column_0
 
 
 def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
