@@ -90,7 +90,8 @@ class SerialTransport:
         self._changed = threading.Condition()
         self._awaited: _Awaited | None = None
         self._failure: DeviceError | None = None
-        self._in_step = True
+        self._doubts = 0  # counts what may leave replies behind that nobody awaits
+        self._settled = 0  # how many of those are over
         self._cancelled = 0
         self._last_byte_s = 0.0
         self._restorers: dict[str, Callable[[], None]] = {}
@@ -122,7 +123,8 @@ class SerialTransport:
                 raise port_error(self.device, self.port, error) from error
             self._failure = None
             self.unmatched = 0
-            self._in_step = self._settle_s == 0 and self._probe is None
+            if self._settle_s or self._probe is not None:
+                self._doubts += 1
             self._framer.reset()
             self._reader = threading.Thread(
                 target=self._read, args=(self._serial,), name=f"reader of {self.port}", daemon=True
@@ -199,7 +201,7 @@ class SerialTransport:
         """
         ticket = self._cancelled
         with self._owner:
-            if not self._in_step:
+            if self._settled != self._doubts:
                 self._get_in_step(ticket)
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
             return self._exchange(command, matcher, timeout_s, ticket)
@@ -218,9 +220,16 @@ class SerialTransport:
             self._cancelled += 1
         self._fail_awaited(StoppedError(self.device, "the command was cancelled."))
 
-    def overtake(self, data: bytes) -> None:
-        """Cancel every request made so far and send bytes at once: STOP. Callable from any thread."""
+    def overtake(self, data: bytes, *, answered: bool = False) -> None:
+        """Cancel every request made so far and send bytes at once: STOP. Callable from any thread.
+
+        With ``answered`` the device replies to these bytes; nobody awaits that, and no later command takes it
+        for its own reply.
+        """
         self.cancel()
+        if answered:
+            with self._write:
+                self._doubts += 1
         self.send_now(data)
 
     def _send(self, data: bytes) -> None:
@@ -261,11 +270,23 @@ class SerialTransport:
         finally:
             with self._changed:
                 self._awaited = None
-                if sent and not awaited.done:  # too late, cancelled, Ctrl-C: a reply may still come
-                    self._in_step = False
+            if sent and not awaited.done:  # too late, cancelled, Ctrl-C: a reply may still come
+                with self._write:
+                    self._doubts += 1
 
     def _get_in_step(self, ticket: int) -> None:
         """Wait until old replies have run dry, then have the probe answered."""
+        doubts = self._doubts
+        self._wait_for_quiet()
+        self._framer.reset()
+        if self._probe is not None:
+            unanswered = self._have_probe_answered(*self._probe, ticket)
+            if unanswered:
+                doubts += unanswered
+                self._wait_for_quiet()  # the device may have been late with those replies
+        self._settled = doubts
+
+    def _wait_for_quiet(self) -> None:
         deadline_s = time.monotonic() + max(2.0, 2 * self._timeout_s)
         began_s = time.monotonic()
         while (now := time.monotonic()) - max(self._last_byte_s, began_s) < _QUIET_S:
@@ -274,19 +295,15 @@ class SerialTransport:
                     self.device, f"sends without end on {self.port}.", "Check its baud rate and mode."
                 )
             time.sleep(_QUIET_S / 5)
-        self._framer.reset()
-        if self._probe is not None:
-            self._have_probe_answered(*self._probe, ticket)
-        self._in_step = True
 
-    def _have_probe_answered(self, command: bytes, matcher: Matcher, ticket: int) -> None:
-        for attempt in range(_PROBES):
-            try:
+    def _have_probe_answered(self, command: bytes, matcher: Matcher, ticket: int) -> int:
+        """Return how many attempts were not answered in time before one was."""
+        for unanswered in range(_PROBES - 1):
+            with contextlib.suppress(DeviceTimeoutError):
                 self._exchange(command, matcher, self._timeout_s, ticket)
-                return
-            except DeviceTimeoutError:
-                if attempt == _PROBES - 1:
-                    raise
+                return unanswered
+        self._exchange(command, matcher, self._timeout_s, ticket)
+        return _PROBES - 1
 
     # The reading thread ----------------------------------------------------------------------------
     def _read(self, port: Any) -> None:

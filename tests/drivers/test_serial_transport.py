@@ -287,3 +287,32 @@ def test_replies_of_many_lines() -> None:
         Verdict.END,
         Verdict.END,
     ]
+
+
+def test_the_reply_to_an_overtaking_command_is_nobodys(device: PtyDevice, port: SerialTransport) -> None:
+    device.answer = lambda line: [0.05, b"VALUE 99\r\n"] if line == b"OFF" else value(line)
+    assert get(port, 1) == b"VALUE 1"
+    port.overtake(b"OFF\n", answered=True)
+    assert [get(port, n) for n in (2, 3)] == [b"VALUE 2", b"VALUE 3"]
+    assert port.unmatched == 1
+
+
+def test_replies_to_probes_that_came_late_are_not_taken_for_the_next_commands(device: PtyDevice) -> None:
+    slow = [True]
+
+    def answer(line: bytes) -> list[Answer]:
+        # As a board that boots: what it was sent meanwhile is answered all at once.
+        if slow[0] and line == b"PING":
+            slow[0] = False
+            return [0.5, b"PONG\n"]
+        return value(line)
+
+    device.answer = answer
+    port = SerialTransport(str(device.link), "stage (test)", probe=PROBE, timeout_s=0.2)
+    port.open()
+    try:
+        assert port.request(b"PING\n", PONG) == [b"PONG"]
+        assert port.unmatched == 2  # of the three attempts
+        assert get(port, 5) == b"VALUE 5"
+    finally:
+        port.close()
