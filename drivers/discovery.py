@@ -33,13 +33,16 @@ class FoundDevice:
     """``"camera"``, ``"stage"``, ``"led_array"`` or ``"slm"``, with ``driver``."""
     options: Mapping[str, object] = field(default_factory=dict)
     """The keys of its table in ``bench.toml``, beside ``driver``."""
+    note: str = ""
+    """What the user must add to these lines, if anything."""
 
     def bench_lines(self) -> str:
         """Return the table of ``bench.toml`` that uses the device; empty when no driver claims it."""
         if self.driver is None or self.kind is None:
             return ""
         rows = {"driver": self.driver, **self.options}
-        return "\n".join([f"[{self.kind}]", *(f"{key} = {_toml(value)}" for key, value in rows.items())])
+        lines = [f"[{self.kind}]", *(f"{key} = {_toml(value)}" for key, value in rows.items())]
+        return "\n".join([*lines, f"# {self.note}"] if self.note else lines)
 
 
 def _toml(value: object) -> str:

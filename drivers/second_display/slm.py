@@ -1,0 +1,231 @@
+"""The SLM as a second display: a full-screen window whose pixels are the SLM's, one for one."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import threading
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
+from drivers.discovery import FoundDevice
+from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
+from drivers.second_display.options import SecondDisplayOptions
+from drivers.second_display.outputs import Output
+from drivers.slm import Slm
+
+_INSTALL = 'Install it: pip install "diffuserbench[gui]".'
+
+
+class _Window(Protocol):
+    """What ``WindowProcess`` and ``WindowHere`` have in common."""
+
+    def outputs(self) -> tuple[Output, ...]: ...
+    def open(self, options: SecondDisplayOptions) -> tuple[Output, str]: ...
+    def show(self, levels: npt.NDArray[np.uint8]) -> None: ...
+    def close(self) -> None: ...
+
+
+class SecondDisplaySlm(Slm):
+    """An SLM that takes its picture from an output of this computer (HDMI, DisplayPort, DVI).
+
+    The window is drawn by the Qt program that runs in this process, or else by a process of its own, which
+    ends with this one, however this one ends. When the output is lost, ``display`` raises an error that names
+    it, ``is_open`` turns false, and ``open`` starts over.
+    """
+
+    Options = SecondDisplayOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, SecondDisplayOptions):
+            raise TypeError(
+                f"An SLM as second display takes SecondDisplayOptions, not {type(options).__name__}."
+            )
+        self.options = options
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._window: _Window | None = None
+        self._output: Output | None = None
+        self._inhibited_by = ""
+        self._lost: DeviceError | None = None
+        self._displayed = np.zeros((0, 0), np.uint8)
+
+    @classmethod
+    def claims(cls, options: DriverOptions) -> tuple[str, ...]:
+        """Claim the output by the name that the configuration gives it."""
+        assert isinstance(options, SecondDisplayOptions)
+        given = options.model_dump(include={"output", "model", "serial_number", "index"}, exclude_none=True)
+        return ("display output " + ", ".join(f"{key} {value}" for key, value in given.items()),)
+
+    @classmethod
+    def discover(cls) -> tuple[FoundDevice, ...]:
+        """Return the desktop's outputs; those that are not the primary one with the lines to use them."""
+        window = _window("displays", lambda _error: None)
+        try:
+            found = window.outputs()
+        finally:
+            window.close()
+        return tuple(_found(output) for output in found)
+
+    @property
+    def name(self) -> str:
+        """The device as error messages name it."""
+        return "slm (second_display)"
+
+    def open(self) -> None:
+        """Cover the output with a blank window.
+
+        Raises
+        ------
+        DeviceError
+            When Qt is not installed, there is no desktop, or the output is missing or in a wrong mode.
+        """
+        with self._lock:
+            if self.is_open:
+                return
+            self._end_window()
+            self._lost = None
+            window = _window(self.name, self._on_lost)
+            try:
+                output, inhibited_by = window.open(self.options)
+            except BaseException:
+                window.close()
+                raise
+            self._closing.clear()
+            self._window, self._output, self._inhibited_by = window, output, inhibited_by
+            self._displayed = np.zeros((output.height, output.width), np.uint8)
+
+    def close(self) -> None:
+        """Remove the window: the output shows the desktop again."""
+        self._closing.set()
+        with self._lock:
+            self._end_window()
+            self._lost = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the output is covered by our window."""
+        return self._window is not None and self._lost is None
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """What the display reports about itself (EDID)."""
+        output = self._require()
+        return DeviceIdentity(
+            kind="slm",
+            driver="second_display",
+            vendor=output.manufacturer or "unknown vendor",
+            model=output.model or f"display on {output.name}",
+            serial_number=output.serial_number or "unknown",
+            firmware="unknown",
+            simulated=False,
+        )
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read output, shape, timing, and what keeps the screen saver off."""
+        output = self._require()
+        return {
+            "output": output.name,
+            "shape": self.shape,
+            "refresh_hz": output.refresh_hz,
+            "pixel_pitch_um": self.options.pixel_pitch_um,
+            "settle_ms": self.settle_ms,
+            "screen_saver_kept_off_by": self._inhibited_by,
+            "blank": not self._displayed.any(),
+        }
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the output, pixels."""
+        output = self._require()
+        return output.height, output.width
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Pixel pitch, micrometres."""
+        return self.options.pixel_pitch_um
+
+    @property
+    def settle_ms(self) -> float:
+        """Time from the drawn pattern to settled optics: sending it whole, then the liquid crystal."""
+        output = self._output
+        refresh_ms = 1e3 / output.refresh_hz if output is not None and output.refresh_hz > 0 else 0.0
+        return self.options.refreshes_to_wait * refresh_ms + self.options.settle_ms
+
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Show grey levels: drawn, confirmed by the display server, sent and settled when this returns."""
+        with self._lock:
+            output, window = self._require(), self._window
+            if levels.shape != (output.height, output.width) or levels.dtype != np.uint8:
+                raise LimitError(
+                    self.name,
+                    f"cannot show {levels.dtype} {levels.shape}.",
+                    f"It takes uint8 {(output.height, output.width)}.",
+                )
+            assert window is not None
+            shown = levels.copy()
+            window.show(shown)
+            self._displayed = shown
+        self._closing.wait(self.settle_ms * 1e-3)
+
+    @property
+    def displayed(self) -> npt.NDArray[np.uint8]:
+        """The grey levels shown now, read only."""
+        self._require()
+        view = self._displayed.view()
+        view.flags.writeable = False
+        return view
+
+    def _require(self) -> Output:
+        lost = self._lost
+        if lost is not None:
+            raise lost
+        if self._window is None or self._output is None:
+            raise DeviceNotOpenError(self.name)
+        return self._output
+
+    def _on_lost(self, error: DeviceError) -> None:
+        self._lost = error
+
+    def _end_window(self) -> None:
+        window, self._window = self._window, None
+        if window is not None:
+            window.close()
+
+
+def _window(device: str, on_lost: object) -> _Window:
+    """Return where a window is drawn: by the Qt program in this process, or in a process of its own."""
+    if importlib.util.find_spec("PySide6") is None:
+        raise DeviceError(device, "needs PySide6 (Qt), which is not installed.", _INSTALL)
+    if _qt_program_runs():
+        from drivers.second_display.in_process import WindowHere
+
+        return WindowHere(device, on_lost)  # type: ignore[arg-type]
+    from drivers.second_display.process import WindowProcess
+
+    return WindowProcess(device, on_lost)  # type: ignore[arg-type]
+
+
+def _qt_program_runs() -> bool:
+    gui = sys.modules.get("PySide6.QtGui")  # without importing Qt into a program that has none
+    return gui is not None and isinstance(gui.QGuiApplication.instance(), gui.QGuiApplication)
+
+
+def _found(output: Output) -> FoundDevice:
+    usable = not output.primary
+    return FoundDevice(
+        bus="display",
+        address=output.name,
+        description=str(output).removeprefix(f"{output.name} ").strip("()"),
+        vendor=output.manufacturer,
+        product=output.model,
+        serial_number=output.serial_number,
+        driver="second_display" if usable else None,
+        kind="slm" if usable else None,
+        options={"output": output.name, "shape": [output.height, output.width]} if usable else {},
+        note="pixel_pitch_um = ... must be added, from the SLM's data sheet" if usable else "",
+    )
