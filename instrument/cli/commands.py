@@ -20,6 +20,7 @@ class Command(NamedTuple):
 BENCH = "The bench"
 ACQUISITION = "Acquisition"
 RECONSTRUCTION = "Reconstruction"
+ANALYSIS = "Calibration and analysis"
 DISPLAY = "Holographic display"
 
 COMMANDS: Mapping[str, Command] = {
@@ -46,6 +47,9 @@ COMMANDS: Mapping[str, Command] = {
     ),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"
+    ),
+    "analyze": Command(
+        ANALYSIS, "what a calibration's optics can do: one page and JSON", "instrument.cli.analyze"
     ),
     "hologram": Command(
         DISPLAY, "compute the SLM phase that shows a picture through the mask", "instrument.cli.hologram"

@@ -1,0 +1,179 @@
+"""Two-point and 16-point resolution by reconstructions (Kuo 2020, sec. 4.4, Figs. 4.3c and 4.4).
+
+Images of single points at continuous places are summed, noise is added, and the sum is reconstructed with
+tau = 0. Points count as resolved when the reconstruction dips by 20 % between every two neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.analysis.window import WindowProblem
+from recon.errors import InputError
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+
+DIP = 0.2
+"""Dip between two points that counts as resolved (the Rayleigh criterion's)."""
+TRIALS = 3
+"""Noise draws and sub-pixel positions that all must be resolved."""
+
+PointImage = Callable[[float, float], Array]
+"""Image (height, width) of one point ``columns`` sensor pixels off the axis at a place ``s`` on the depth
+axis, in planes (0 is the first): ``image(columns, s)``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of the test images.
+
+    Attributes
+    ----------
+    electrons : float
+        At the brightest pixel of the image.
+    read_e : float
+        Read noise.
+    """
+
+    electrons: float = 10_000.0
+    read_e: float = 2.0
+
+    def expose(self, light: Array, rng: np.random.Generator) -> Floats:
+        """Return one exposure of an image, in the image's units."""
+        scale = self.electrons / float(light.max())
+        charge = rng.poisson(np.maximum(light, 0) * scale) + rng.normal(0.0, self.read_e, light.shape)
+        return np.asarray(charge / scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One image of points, reconstructed.
+
+    Attributes
+    ----------
+    separation_px, separation_planes : float
+        Between neighbours.
+    dip : float
+        The smallest dip between any two neighbours, of all draws.
+    map : ndarray, (n_z, width)
+        The reconstruction of the last draw, summed over rows.
+    """
+
+    separation_px: float
+    separation_planes: float
+    dip: float
+    map: Floats
+
+    @property
+    def resolved(self) -> bool:
+        """Whether every two neighbours are told apart."""
+        return self.dip >= DIP
+
+
+def try_points(
+    problem: WindowProblem,
+    image: PointImage,
+    *,
+    columns: int,
+    planes: int,
+    separation_px: float,
+    separation_planes: float,
+    noise: Noise,
+    seed: int = 0,
+    trials: int = TRIALS,
+) -> Trial:
+    """Reconstruct a grid of ``columns`` x ``planes`` points at one spacing; see :class:`Trial`."""
+    rng = np.random.default_rng(seed)
+    worst, seen = np.inf, np.empty(0)
+    for _ in range(trials):
+        # Where the grid's points lie between voxels differs from draw to draw.
+        phase_x, phase_z = rng.uniform(-0.5, 0.5, 2)
+        x = (np.arange(columns) - (columns - 1) / 2) * separation_px + phase_x
+        z = (problem.n_z - 1) / 2 + (np.arange(planes) - (planes - 1) / 2) * separation_planes
+        z = z + (phase_z if problem.n_z > 1 else 0.0)
+        if max(abs(x)) > problem.half[1] - 1 or z[0] < 0 or z[-1] > problem.n_z - 1:
+            raise InputError(
+                f"{columns} x {planes} points {separation_px:.3g} px and {separation_planes:.3g} planes "
+                "apart do not fit the window."
+            )
+        light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
+        solution = problem.solve(noise.expose(light, rng))
+        seen = solution.volume.sum(axis=1)
+        places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
+        worst = min(worst, smallest_dip(seen, places))
+    return Trial(separation_px, separation_planes, float(worst), seen)
+
+
+def smallest_dip(seen: Floats, places: Floats) -> float:
+    """Return the smallest dip between neighbours of a grid of points.
+
+    Parameters
+    ----------
+    seen : ndarray, (n_z, width)
+    places : ndarray, (n_planes, n_columns, 2)
+        Where the points are, ``(plane, column)``.
+
+    Returns
+    -------
+    float
+        ``1 - valley / lower peak``; each peak is the largest value nearer to its point than a third of the
+        spacing, the valley the least on the line between two peaks. 0 where a peak is missing.
+    """
+    n_planes, n_columns = places.shape[:2]
+    step_z = float(places[1, 0, 0] - places[0, 0, 0]) if n_planes > 1 else 2.0
+    step_x = float(places[0, 1, 1] - places[0, 0, 1]) if n_columns > 1 else 2.0
+    peaks = np.empty((n_planes, n_columns, 2), int)
+    for j in range(n_planes):
+        for i in range(n_columns):
+            peaks[j, i] = _peak(seen, places[j, i], max(step_z / 3, 0.5), max(step_x / 3, 0.5))
+    dips = []
+    for j in range(n_planes):
+        for i in range(n_columns):
+            for other in ((j + 1, i), (j, i + 1)):
+                if other[0] < n_planes and other[1] < n_columns:
+                    dips.append(_dip(seen, peaks[j, i], peaks[other]))
+    return min(dips)
+
+
+def smallest_resolved(
+    try_one: Callable[[float], Trial], values: Sequence[float]
+) -> tuple[list[Trial], Trial | None]:
+    """Try growing separations; stop at the first that is resolved with the next one resolved as well.
+
+    Returns
+    -------
+    list of Trial
+        All that were made, in order.
+    Trial or None
+        The smallest resolved one.
+    """
+    trials: list[Trial] = []
+    for value in values:
+        trials.append(try_one(value))
+        if len(trials) > 1 and trials[-1].resolved and trials[-2].resolved:
+            return trials, trials[-2]
+    return trials, trials[-1] if trials and trials[-1].resolved else None
+
+
+def _peak(seen: Floats, place: Floats, reach_z: float, reach_x: float) -> tuple[int, int]:
+    (z, x), (n_z, width) = place, seen.shape
+    rows = slice(max(int(np.ceil(z - reach_z)), 0), min(int(np.floor(z + reach_z)), n_z - 1) + 1)
+    columns = slice(max(int(np.ceil(x - reach_x)), 0), min(int(np.floor(x + reach_x)), width - 1) + 1)
+    part = seen[rows, columns]
+    row, column = np.unravel_index(int(np.argmax(part)), part.shape)
+    return int(row) + rows.start, int(column) + columns.start
+
+
+def _dip(seen: Floats, first: npt.NDArray[np.int_], second: npt.NDArray[np.int_]) -> float:
+    steps = int(np.abs(second - first).max())
+    lower = min(float(seen[tuple(first)]), float(seen[tuple(second)]))
+    if steps < 2 or lower <= 0:
+        return 0.0
+    line = [np.rint(first + (second - first) * k / steps).astype(int) for k in range(1, steps)]
+    return 1.0 - min(float(seen[tuple(p)]) for p in line) / lower

@@ -1,0 +1,351 @@
+"""Everything that the analysis tells about a calibration, in one call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.analysis.condition import ConditionCurve, Direction, condition_curve
+from recon.analysis.correlation import INNER_PRODUCT, RESOLUTION_LEVEL, autocorrelate
+from recon.analysis.depth import DepthSimilarity, across_depth
+from recon.analysis.field import (
+    FieldOfView,
+    FieldPoint,
+    across_field,
+    convolution_holds_deg,
+    field_of_view,
+)
+from recon.analysis.point_tests import PointTests, point_tests
+from recon.analysis.points import Noise
+from recon.analysis.resolution import (
+    AxialResolution,
+    LateralResolution,
+    axial_resolution,
+    lateral_resolution,
+    support_extent_px,
+)
+from recon.analysis.sampling import (
+    VoxelGrid,
+    axial_spacing_per_um,
+    gaussian_response,
+    lateral_spacing_um,
+    voxel_grid,
+)
+from recon.errors import InputError
+from recon.refocus import central_psfs, refocus
+from recon.types import Calibration
+from recon.volume.model import choose_model, sort_by_depth
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+Progress = Callable[[str, float], object]
+"""Told what is being done and the share that is done."""
+
+CONDITION_COUNTS: Mapping[Direction, tuple[int, ...]] = {"x": (2, 4, 9, 16), "z": (2, 3, 4), "xz": (4, 9, 16)}
+SEPARATIONS = (1, 2, 3, 4, 5, 6, 8)
+CONDITION_PLANES = 13
+"""Planes for groups in depth: four sources four planes apart."""
+MARGIN_PX = 24
+"""Dark rim kept around the light of cropped PSFs, for shifts."""
+
+
+@dataclass(frozen=True, slots=True)
+class AnalysisSettings:
+    """What the calibration itself does not tell.
+
+    Attributes
+    ----------
+    z_um : float or None
+        Depth at which resolution is stated and tested; default the middle of the calibrated range in 1/z.
+    deflection_deg : float
+        Largest deflection by the diffuser, ``beta`` (dissertation: 0.5 degrees).
+    cutoff_deg : (float, float) or None
+        Angle at which the sensor's response is down to 20 %, along y and x.
+    fall_off_deg : float or None
+        Standard deviation of the sensor's angular response, as a Gaussian, for the lateral sampling; default
+        from ``cutoff_deg`` where known.
+    lenslet_um, wavelength_nm : float or None
+        Of a microlens diffuser, for the axial sampling of Eq. 5.10.
+    points : bool
+        Whether to run the point tests, which take most of the time.
+    noise : Noise
+        Of the point tests' images.
+    """
+
+    z_um: float | None = None
+    deflection_deg: float = 0.5
+    cutoff_deg: tuple[float, float] | None = None
+    fall_off_deg: float | None = None
+    lenslet_um: float | None = None
+    wavelength_nm: float | None = None
+    points: bool = True
+    noise: Noise = field(default_factory=Noise)
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What the optics of a calibration can do.
+
+    Lengths in micrometres, angles in degrees; ``None`` where the calibration cannot tell, with the reason in
+    ``notes``.
+
+    Attributes
+    ----------
+    psf : ndarray, (height, width)
+        The central PSF at ``z_um``, as it was analysed (cut to its light, channels averaged).
+    autocorrelation : ndarray
+        Its cut along the columns, from the peak.
+    """
+
+    z_um: float
+    pitch_um: float
+    distance_um: float
+    sensor_shape: tuple[int, int]
+    psf: Array
+    autocorrelation: Floats
+    support_px: tuple[float, float]
+    lateral: LateralResolution
+    lateral_inner: LateralResolution
+    axial: AxialResolution
+    axial_inner: AxialResolution
+    view_y: FieldOfView
+    view_x: FieldOfView
+    field: tuple[FieldPoint, ...]
+    convolution_holds_deg: float | None
+    depth: DepthSimilarity | None
+    condition: tuple[ConditionCurve, ...]
+    condition_voxel: tuple[float, float]
+    """Voxel of the condition numbers: pixels across, ``1 / um`` along."""
+    points: PointTests | None
+    lateral_spacing_um: float | None
+    axial_spacing_per_um: float | None
+    grid: VoxelGrid
+    model: str
+    model_reason: str
+    settings: AnalysisSettings
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return every figure as JSON-compatible values; images are left out."""
+        record = asdict(self)
+        for name in ("psf", "autocorrelation"):
+            del record[name]
+        result: dict[str, Any] = _plain(record)
+        result["resolution"] = {
+            "angle_deg": self.lateral.angle_deg(self.pitch_um, self.distance_um),
+            "object_um": self.lateral.object_um(self.pitch_um, self.distance_um, self.z_um),
+            "depth_of_field_um": _plain(self.axial.depth_of_field_um(self.z_um)),
+            "hyperfocal_um": _plain(self.axial.hyperfocal_um),
+        }
+        return result
+
+
+def analyse(
+    calibration: Calibration,
+    settings: AnalysisSettings | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Analysis:
+    """Analyse a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With depths and geometry (``pixel_pitch_um``, ``diffuser_distance_mm``). One PSF is enough for most.
+    settings : AnalysisSettings, optional
+    progress : callable, optional
+        Called with what is being done and the share done.
+
+    Raises
+    ------
+    InputError
+        When the geometry or the depths are unknown.
+    """
+    settings = settings or AnalysisSettings()
+    tell = progress or (lambda _what, _share: None)
+    pitch_um, distance_um = _geometry(calibration)
+    notes: list[str] = []
+    small, sensor_shape = _cut_to_light(calibration)
+    depths, stack = central_psfs(small)
+    planes = stack.mean(axis=1)
+    z_um = settings.z_um or float(2 / (1 / depths[0] + 1 / depths[-1]))
+    tell("resolution", 0.0)
+    # Resolution is a matter of measured pixels: of the calibrated PSF nearest to the depth, not of a blend.
+    nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
+    psf = planes[nearest]
+    lateral = lateral_resolution(psf, RESOLUTION_LEVEL)
+    lateral_inner = lateral_resolution(psf, INNER_PRODUCT)
+    axial = axial_resolution(psf, float(depths[nearest]), distance_um, RESOLUTION_LEVEL)
+    axial_inner = axial_resolution(psf, float(depths[nearest]), distance_um, INNER_PRODUCT)
+    correlation = autocorrelate(psf).profile(1)
+
+    support = support_extent_px(psf)
+    cutoff = settings.cutoff_deg or (None, None)
+    if settings.cutoff_deg is None:
+        notes.append("The sensor's angular cut-off is not known: the field of view is the geometric one.")
+    # The support at infinity is the aperture's, which is what Eq. 3.12 wants; a near source's is enlarged.
+    far_support = [s / (1 + distance_um / depths[nearest]) for s in support]
+    view_y, view_x = (
+        field_of_view(
+            n * pitch_um, s * pitch_um, distance_um, deflection_deg=settings.deflection_deg, cutoff_deg=angle
+        )
+        for n, s, angle in zip(sensor_shape, far_support, cutoff, strict=True)
+    )
+    tell("field", 0.1)
+    field_points = across_field(small)
+    if len(field_points) < 2:
+        notes.append(
+            "One place of the field was calibrated: how PSFs vary across it, and how far the convolution "
+            "model holds, is not known."
+        )
+    tell("depths", 0.2)
+    similarity = across_depth(depths, planes) if len(depths) > 1 else None
+    tell("condition numbers", 0.3)
+    grid_step = axial_inner.step_per_um / 2
+    fine = _fine_planes(small, z_um, grid_step)
+    if fine is None:
+        notes.append("The pattern does not change enough along the axis for condition numbers in depth.")
+    condition = _condition(psf[None] if fine is None else fine, with_depth=fine is not None)
+    tell("point tests", 0.5)
+    tests = None
+    if settings.points:
+        tests = point_tests(
+            small,
+            z_um,
+            lateral_px=lateral_inner.mean_px,
+            step_per_um=axial_inner.step_per_um,
+            noise=settings.noise,
+            progress=lambda share: tell("point tests", 0.5 + 0.5 * share),
+        )
+        notes.extend(tests.notes)
+    resolution_px = lateral.mean_px
+    step = axial_inner.step_per_um
+    if tests is not None:
+        resolution_px = tests.lateral_px or resolution_px
+        step = tests.axial_per_um or step
+    model, reason = choose_model(sort_by_depth(small), "auto")
+    tell("done", 1.0)
+    return Analysis(
+        z_um=z_um,
+        pitch_um=pitch_um,
+        distance_um=distance_um,
+        sensor_shape=sensor_shape,
+        psf=psf,
+        autocorrelation=correlation[len(correlation) // 2 :],
+        support_px=support,
+        lateral=lateral,
+        lateral_inner=lateral_inner,
+        axial=axial,
+        axial_inner=axial_inner,
+        view_y=view_y,
+        view_x=view_x,
+        field=field_points,
+        convolution_holds_deg=convolution_holds_deg(field_points),
+        depth=similarity,
+        condition=condition,
+        condition_voxel=(1.0, grid_step),
+        points=tests,
+        lateral_spacing_um=_lateral_spacing(settings, float(depths[0]), notes),
+        axial_spacing_per_um=_axial_spacing(settings, calibration, notes),
+        grid=voxel_grid(
+            resolution_px=resolution_px,
+            step_per_um=step,
+            z_range_um=(float(depths[0]), float(depths[-1])),
+            pitch_um=pitch_um,
+            distance_um=distance_um,
+        ),
+        model=model,
+        model_reason=reason,
+        settings=settings,
+        notes=tuple(notes),
+    )
+
+
+def _geometry(calibration: Calibration) -> tuple[float, float]:
+    geometry = calibration.geometry
+    missing = [n for n in ("pixel_pitch_um", "diffuser_distance_mm") if getattr(geometry, n) is None]
+    if missing:
+        raise InputError(
+            f"The calibration does not say its {' and '.join(missing)}, which the analysis needs: "
+            "give them in [geometry] of bench.toml and calibrate again."
+        )
+    assert geometry.pixel_pitch_um is not None
+    assert geometry.diffuser_distance_mm is not None
+    return geometry.pixel_pitch_um, 1e3 * geometry.diffuser_distance_mm
+
+
+def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int]]:
+    """Cut every PSF to the part, symmetric about the axis, that any of them lights; and the whole shape."""
+    height, width = calibration.psfs.shape[-2:]
+    bright = calibration.psfs.max(axis=(0, 1))
+    cuts = []
+    for axis, size in ((1, height), (0, width)):
+        profile = bright.max(axis=axis)
+        used = np.flatnonzero(profile > 0.01 * float(profile.max()))
+        if not used.size:
+            raise InputError("The calibration's PSFs hold no light.")
+        # From both ends alike, so that the axis stays where it is.
+        trim = max(min(int(used[0]), size - 1 - int(used[-1])) - MARGIN_PX, 0)
+        cuts.append(slice(trim, size - trim))
+    psfs = np.ascontiguousarray(calibration.psfs[..., cuts[0], cuts[1]])
+    return replace(calibration, psfs=psfs, background=None), (height, width)
+
+
+def _fine_planes(calibration: Calibration, z_um: float, step_per_um: float) -> Array | None:
+    """PSFs at planes of the recommended spacing about a depth, refocused where they were not calibrated."""
+    half = CONDITION_PLANES // 2
+    inverse = 1 / z_um + step_per_um * np.arange(half, -half - 1, -1)
+    if not np.isfinite(step_per_um) or inverse[-1] <= 0:
+        return None
+    return np.stack([refocus(calibration, float(1 / v)).psf.mean(axis=0) for v in inverse])
+
+
+def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]:
+    curves = []
+    for direction, counts in CONDITION_COUNTS.items():
+        if direction != "x" and not with_depth:
+            continue
+        stack = planes[len(planes) // 2][None] if direction == "x" else planes
+        for count in counts:
+            curve = condition_curve(stack, direction, count, SEPARATIONS)
+            if curve.separations:
+                curves.append(curve)
+    return tuple(curves)
+
+
+def _lateral_spacing(settings: AnalysisSettings, nearest_um: float, notes: list[str]) -> float | None:
+    sigma = settings.fall_off_deg
+    if sigma is None and settings.cutoff_deg is not None:
+        sigma = min(settings.cutoff_deg) / math.sqrt(2 * math.log(5))  # a Gaussian that falls to 20 % there
+    if sigma is None:
+        notes.append("The sensor's angular fall-off is not known: no lateral calibration spacing follows.")
+        return None
+    return lateral_spacing_um(gaussian_response(sigma), nearest_um)
+
+
+def _axial_spacing(settings: AnalysisSettings, calibration: Calibration, notes: list[str]) -> float | None:
+    wavelength_nm = settings.wavelength_nm or calibration.geometry.wavelength_nm
+    if settings.lenslet_um is None or wavelength_nm is None:
+        notes.append("Eq. 5.10 (axial calibration spacing) needs the lenslet's diameter and the wavelength.")
+        return None
+    return axial_spacing_per_um(settings.lenslet_um, 1e-3 * wavelength_nm)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, strings, lists and mappings only; what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value

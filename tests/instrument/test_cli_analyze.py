@@ -1,0 +1,81 @@
+"""``diffuserbench analyze`` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
+from instrument.calibration_file import save_calibration
+from instrument.cli import main
+from recon.types import Calibration, Geometry
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+    z_um = [25e3, 32e3, 45e3]
+    psfs = np.stack([world.psf((0.0, 0.0, z), (0.0, 1.0, 0.0)) for z in z_um])[:, None]
+    return save_calibration(
+        Calibration(
+            psfs,
+            np.array([(0.0, 0.0, z) for z in z_um]),
+            geometry=world.geometry,
+            provenance={"simulated": True},
+        ),
+        tmp_path_factory.mktemp("analyze") / "calibration",
+    )
+
+
+def test_a_page_and_its_figures(
+    calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "page.png"
+    words = ["analyze", str(calibration), "--out", str(out), "--no-points", "--cutoff-deg", "41.5,30"]
+    assert main(words) == 0
+    assert out.stat().st_size > 50_000
+    record = json.loads((tmp_path / "page.json").read_text())
+    assert record["simulated"] is True
+    found = record["analysis"]
+    # The small sensor, not its pixels, limits the view: (240 x 13 um + 1.5 mm) / 2 over 8.9 mm.
+    assert found["view_y"]["half_deg"] == pytest.approx(0.5 + np.rad2deg(np.arctan(2.31 / 8.9)), abs=0.6)
+    assert found["view_x"]["cutoff_deg"] == 41.5
+    assert found["lateral_spacing_um"] > 0
+    assert found["points"] is None
+    said = capsys.readouterr()
+    assert "SIMULATED" in said.out
+    assert "hyperfocal distance" in said.out
+    assert "One place of the field" in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["--out", "page.txt"], ".pdf"),
+        (["--cutoff-deg", "95"], "between 0 and 90"),
+        (["--cutoff-deg", "a,b"], "41.5,30"),
+        (["--z-mm", "-3"], "above 0"),
+    ],
+)
+def test_mistakes_are_named_before_any_work(
+    words: list[str], part: str, calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["analyze", str(calibration), *words]) == 2
+    assert part in capsys.readouterr().err
+
+
+def test_a_calibration_without_geometry_says_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    psf = np.random.default_rng(0).random((1, 1, 20, 20)).astype(np.float32)
+    folder = save_calibration(
+        Calibration(psf, np.array([(0.0, 0.0, 1e4)]), geometry=Geometry()), tmp_path / "c"
+    )
+    assert main(["analyze", str(folder), "--out", str(tmp_path / "a.png")]) == 2
+    assert "diffuser_distance_mm" in capsys.readouterr().err
+    assert not (tmp_path / "a.png").exists()
+    assert main(["analyze", str(tmp_path / "nothing")]) == 2

@@ -1,0 +1,117 @@
+"""Refocusing a PSF, against PSFs that light makes at the wanted depth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
+from recon.analysis.correlation import similarity
+from recon.errors import InputError
+from recon.refocus import at_depth, paraxial_scale, refocus, refocus_psf, rescaled
+from recon.registration import register
+from recon.types import Calibration, Geometry
+
+WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+GREEN = (0.0, 1.0, 0.0)
+
+
+def true_psf(z_um: float, x_um: float = 0.0) -> np.ndarray:
+    return WORLD.psf((x_um, 0.0, z_um), GREEN)
+
+
+def calibrated(z_um: list[float], x_um: float = 0.0) -> Calibration:
+    psfs = np.stack([true_psf(z, x_um) for z in z_um])[:, None]
+    return Calibration(
+        psfs, np.array([(x_um, 0.0, z) for z in z_um]), geometry=WORLD.geometry, provenance={"a": 1}
+    )
+
+
+def test_scale_and_brightness_follow_light() -> None:
+    near, far = true_psf(60e3), true_psf(90e3)
+    made = refocus_psf(near, 60e3, 90e3, WORLD.distance_um)
+    found = register(near, far, scale=None)
+    assert found.scale == pytest.approx(paraxial_scale(90e3, 60e3, WORLD.distance_um), rel=2e-3)
+    assert made.sum() == pytest.approx(far.sum(), rel=0.01)
+    assert similarity(made, far) > 0.97
+    assert similarity(near, far) < 0.7
+
+
+def test_between_two_depths_is_better_than_from_the_nearest() -> None:
+    calibration = calibrated([40e3, 60e3, 100e3, 200e3])
+    made = refocus(calibration, 75e3)
+    truth = true_psf(75e3)
+    assert made.from_z_um == (60e3, 100e3)
+    from_one = refocus_psf(calibration.psfs[1, 0], 60e3, 75e3, WORLD.distance_um)
+    assert similarity(made.psf[0], truth) > similarity(from_one, truth)
+    assert similarity(made.psf[0], truth) > 0.98
+
+
+def test_the_expected_similarity_is_that_of_the_truth() -> None:
+    calibration = calibrated([30e3, 40e3, 60e3, 100e3, 200e3])
+    for z_um in (35e3, 50e3, 75e3):
+        made = refocus(calibration, z_um)
+        truth = similarity(made.psf[0], true_psf(z_um))
+        assert made.expected_similarity is not None
+        assert 1 - made.expected_similarity == pytest.approx(1 - truth, abs=0.02)
+        assert made.expected_similarity > 0.95
+
+
+def test_a_line_of_motion_beside_the_axis_blurs_nothing() -> None:
+    """The far and the near pattern, scaled, lie apart; they are registered before they are mixed."""
+    calibration = calibrated([60e3, 100e3], x_um=3000.0)
+    made = refocus(calibration, 75e3)
+    assert similarity(made.psf[0], true_psf(75e3, 3000.0)) > 0.97
+
+
+def test_outside_the_calibrated_range_the_nearest_depth_is_scaled() -> None:
+    made = refocus(calibrated([60e3, 100e3]), 150e3)
+    assert made.from_z_um == (100e3,)
+    assert made.expected_similarity is None
+    assert "100 mm" in str(made)
+
+
+def test_a_calibrated_depth_is_left_as_it_is() -> None:
+    calibration = calibrated([60e3, 100e3])
+    same, made = at_depth(calibration, 100e3)
+    assert same is calibration
+    assert made is None
+    other, made = at_depth(calibration, 75e3)
+    assert made is not None
+    assert len(other.psfs) == 1
+    assert other.source_positions_um[0, 2] == 75e3
+    assert other.provenance["refocused_to_um"] == 75e3
+
+
+def test_the_displacement_error_grows_with_distance_and_deflection() -> None:
+    calibration = calibrated([60e3])
+    near, far = (refocus(calibration, z).displacement_error_um for z in (65e3, 120e3))
+    assert near < far
+    assert refocus(calibration, 120e3, deflection_deg=0.5).displacement_error_um == pytest.approx(2 * far)
+    s = paraxial_scale(60e3, 120e3, WORLD.distance_um)
+    assert far == pytest.approx(np.deg2rad(0.25) * WORLD.distance_um * abs(1 - 1 / s))
+
+
+def test_rescaling_keeps_the_centre_and_moves() -> None:
+    image = np.zeros((41, 61), np.float32)
+    image[15:26, 25:36] = 1.0
+    small = rescaled(image, 2.0)
+    assert small.sum() == pytest.approx(image.sum() / 4, rel=0.02)
+    y, x = np.mgrid[:41, :61]
+    assert (small * y).sum() / small.sum() == pytest.approx(20.0, abs=1e-3)
+    moved = rescaled(image, 1.0, shift=(2.0, -3.0))
+    assert (moved * x).sum() / moved.sum() == pytest.approx(27.0, abs=1e-3)
+    assert moved.min() >= 0
+
+
+def test_what_is_not_known_is_refused_in_words() -> None:
+    calibration = calibrated([60e3])
+    with pytest.raises(InputError, match="above 0"):
+        refocus(calibration, -1.0)
+    nowhere = Calibration(calibration.psfs, np.full((1, 3), np.nan), geometry=WORLD.geometry)
+    with pytest.raises(InputError, match="not known"):
+        refocus(nowhere, 50e3)
+    bare = Calibration(calibration.psfs, calibration.source_positions_um, geometry=Geometry(6.5))
+    with pytest.raises(InputError, match="diffuser_distance_mm"):
+        refocus(bare, 50e3)
