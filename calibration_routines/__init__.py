@@ -1,30 +1,43 @@
 """Procedures: a plan, the analysis of its frames, a Calibration."""
 
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose
-from calibration_routines.axial import AxialCalibration, calibrate_axial
 from calibration_routines.axial_exposure import SweepExposures, expose_source, expose_sweep
-from calibration_routines.axial_plan import AxialSweep, axial_plan, check_sweep, planes_needed
+from calibration_routines.axial_plan import AxialSweep, planes_needed
 from calibration_routines.errors import CalibrationError
 from calibration_routines.field_response import FieldResponse, measure_field_response
+from calibration_routines.grid_plan import GridSweep, grid_sweep
 from calibration_routines.photograph import Photograph, expose_scene, photograph
+from calibration_routines.sampling import Sampling, axial_planes, lateral_spacing
+from calibration_routines.sweep import SweepCalibration, calibrate_sweep, finish_sweep
+from calibration_routines.sweep_plan import PointSweep, Sweep, check_sweep, sweep_plan
+from calibration_routines.sweep_record import is_sweep
 
 __all__ = [
     "AutoExposure",
-    "AxialCalibration",
     "AxialSweep",
     "CalibrationError",
     "ExposureOutcome",
     "FieldResponse",
+    "GridSweep",
     "Photograph",
+    "PointSweep",
+    "Sampling",
+    "Sweep",
+    "SweepCalibration",
     "SweepExposures",
     "auto_expose",
-    "axial_plan",
-    "calibrate_axial",
+    "axial_planes",
+    "calibrate_sweep",
     "check_sweep",
     "expose_scene",
     "expose_source",
     "expose_sweep",
+    "finish_sweep",
+    "grid_sweep",
+    "is_sweep",
+    "lateral_spacing",
     "measure_field_response",
     "photograph",
     "planes_needed",
+    "sweep_plan",
 ]

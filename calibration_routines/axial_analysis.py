@@ -1,4 +1,4 @@
-"""From the frames of an axial sweep to PSFs: average, dark, hot pixels, stray light, binning, quality."""
+"""From the frames of a sweep to PSFs: average, dark, hot pixels, stray light, binning, quality."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from calibration_routines.auto_exposure import hot_pixels
 from calibration_routines.background import block_mean, remove_low_frequencies
-from calibration_routines.psf_quality import PsfQuality, judge_sweep, measure_psf, temporal_noise
+from calibration_routines.psf_quality import PsfQuality, measure_psf, temporal_noise
+from calibration_routines.stage_fit import StageFit, judge_points
 from recon.types import Geometry
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -20,7 +21,7 @@ Float = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class PlaneFrames:
-    """The raw frames of one plane.
+    """The raw frames of one point of a sweep.
 
     Attributes
     ----------
@@ -31,12 +32,15 @@ class PlaneFrames:
         All of the same light.
     full_scale : int
         The largest count the camera can report.
+    off_axis : bool
+        Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the pattern.
     """
 
     source_um: tuple[float, float, float]
     exposure_ms: float
     frames: Counts
     full_scale: int
+    off_axis: bool = False
 
 
 class DarkModel:
@@ -74,7 +78,7 @@ class DarkModel:
 
 
 @dataclass(frozen=True, slots=True)
-class AxialAnalysis:
+class SweepAnalysis:
     """PSFs with what was found out about them, sorted as the planes came.
 
     Attributes
@@ -90,17 +94,19 @@ class AxialAnalysis:
     background: Float
     quality: tuple[PsfQuality, ...]
     reference_exposure_ms: float
+    stages: tuple[StageFit, ...] = ()
+    """For each depth with several points: the measured shifts against the stage's."""
 
 
-def analyse_axial(
+def analyse_sweep(
     planes: Iterable[PlaneFrames],
     dark: DarkModel,
     geometry: Geometry,
     *,
     dct_order: int = 0,
     binning: int = 1,
-) -> AxialAnalysis:
-    """Turn the raw frames of an axial sweep into PSFs and judge them.
+) -> SweepAnalysis:
+    """Turn the raw frames of a sweep into PSFs and judge them.
 
     Parameters
     ----------
@@ -108,7 +114,7 @@ def analyse_axial(
         Read one after the other, so that a lazily loaded sweep needs the memory of one plane.
     dark : DarkModel
     geometry : Geometry
-        Its ``diffuser_distance_mm``, where known, is held against the support's scaling.
+        Its ``diffuser_distance_mm``, where known, is held against the support's scaling and the shifts.
     dct_order : int
         Lowest DCT coefficients set to zero along each axis (Kuo 2020, Sec. 6.4: 10); 0 keeps them.
     binning : int
@@ -135,25 +141,27 @@ def analyse_axial(
         light = channels_first(replace_hot(_mean(plane.frames) - dark_frame, dark.hot))
         light = block_mean(light, binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
-        quality.append(
-            measure_psf(
-                light - stray,
-                z_um=plane.source_um[2],
-                noise=_noise(plane.frames) / binning,
-                saturated_pixels=_saturated(plane, dark.hot),
-            )
+        measured = measure_psf(
+            light - stray,
+            z_um=plane.source_um[2],
+            noise=_noise(plane.frames) / binning,
+            saturated_pixels=_saturated(plane, dark.hot),
+            may_be_clipped=plane.off_axis,
         )
+        quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
         psfs.append(cleaned * scale)
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
         backgrounds.append(block_mean(removed, binning) + stray * scale)
     if not psfs:
-        raise ValueError("An axial sweep needs at least one plane.")
-    d_mm = geometry.diffuser_distance_mm
-    return AxialAnalysis(
-        psfs=np.stack(psfs),
+        raise ValueError("A sweep needs at least one point.")
+    stacked = np.stack(psfs)
+    judged, stages = judge_points(quality, stacked, binned(geometry, binning))
+    return SweepAnalysis(
+        psfs=stacked,
         background=np.mean(backgrounds, axis=0, dtype=np.float32),
-        quality=judge_sweep(quality, None if d_mm is None else 1e3 * d_mm),
+        quality=judged,
         reference_exposure_ms=reference_ms,
+        stages=stages,
     )
 
 

@@ -1,4 +1,4 @@
-"""Find the exposures of an axial sweep before it starts."""
+"""Find the exposures of a sweep before it starts."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
-from calibration_routines.axial_plan import AxialSweep
 from calibration_routines.errors import CalibrationError
+from calibration_routines.sweep_plan import Sweep, axis_point, depths_um
 from instrument.bench import Bench
 
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
@@ -16,7 +16,7 @@ _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 @dataclass(frozen=True, slots=True)
 class SweepExposures:
-    """The exposure of every plane and how it was found."""
+    """The exposure of every point of a sweep and how it was found."""
 
     exposures_ms: tuple[float, ...]
     found: tuple[tuple[float, AutoExposure], ...]
@@ -32,30 +32,34 @@ class SweepExposures:
         )
 
 
-def expose_sweep(bench: Bench, sweep: AxialSweep) -> SweepExposures:
-    """Find the exposure of every plane: asked at up to three depths, interpolated between them.
+def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
+    """Find the exposure of every point: asked on the axis at up to three depths, interpolated between them.
 
     Light through the aperture falls off as a power of distance, so exposure against z is nearly a straight
-    line in logarithms. Ends with the light off.
+    line in logarithms. Off the axis less light arrives, and nothing saturates. Ends with the light off.
 
     Raises
     ------
     CalibrationError
         When a PSF saturates at the shortest exposure, stays too dark at the longest, or flickers.
     """
-    depths = sweep.z_um
+    depths = depths_um(sweep)
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
     found: list[tuple[float, AutoExposure]] = []
     try:
         bench.scene_off()
         for z_um in asked:
             if not sweep.by_hand:
-                bench.place_source(sweep.x_um, sweep.y_um, z_um)
+                bench.place_source(*axis_point(sweep, z_um))
             found.append((z_um, expose_source(bench, target=sweep.target)))
     finally:
         bench.source_off()
     exposures = np.exp(
-        np.interp(np.log(depths), np.log(asked), np.log([result.exposure_ms for _, result in found]))
+        np.interp(
+            np.log([z_um for _, _, z_um in sweep.points_um]),
+            np.log(asked),
+            np.log([result.exposure_ms for _, result in found]),
+        )
     )
     return SweepExposures(tuple(float(e) for e in exposures), tuple(found))
 

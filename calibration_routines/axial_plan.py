@@ -1,4 +1,4 @@
-"""What an axial sweep measures: its planes, how many are needed, and its plan.
+"""What an axial sweep measures: its planes, and how many are needed.
 
 A camera behind a diffuser is calibrated by moving a point source along its axis and keeping one PSF a depth
 (Kuo 2020, Sec. 4.3). The planes are evenly spaced in 1/z, because that is how the size of the pattern changes
@@ -7,16 +7,14 @@ A camera behind a diffuser is calibrated by moving a point source along its axis
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from instrument.acquire import abilities_of
-from instrument.bench import Bench
+from calibration_routines.sweep_plan import Position, settings_problems
 from instrument.errors import BenchError
-from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, Span, check
+from instrument.plan import Span
 from recon.types import Geometry
 
 
@@ -45,6 +43,8 @@ class AxialSweep:
         How often planes that saturate or slipped are taken again.
     by_hand : bool
         One plane only: the source stands where it was put by hand, nothing moves.
+    reference_every : int
+        Planes between two visits to the middle plane, which tell whether the source drifts; 0: none.
     """
 
     z_min_um: float
@@ -59,9 +59,12 @@ class AxialSweep:
     binning: int = 1
     retakes: int = 1
     by_hand: bool = False
+    reference_every: int = 16
+
+    kind: ClassVar[str] = "axial"
 
     def __post_init__(self) -> None:
-        problems = []
+        problems: list[str] = []
         if not 0 < self.z_min_um <= self.z_max_um:
             problems.append(
                 f"planes must lie in front of the diffuser, nearest first: 0 < z min <= z max, "
@@ -71,11 +74,7 @@ class AxialSweep:
             problems.append(f"{self.planes} planes between z min and z max: one plane needs z min = z max")
         if self.by_hand and self.planes > 1:
             problems.append(f"{self.planes} planes need a stage; by hand one PSF is taken at a time")
-        for name in ("average", "dark_frames", "binning"):
-            if getattr(self, name) < 1:
-                problems.append(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 0.05 <= self.target <= 0.9:
-            problems.append(f"target must lie between 0.05 and 0.9 of full scale, not {self.target:g}")
+        problems += settings_problems(self)
         if problems:
             raise BenchError("; ".join(problems) + ".")
 
@@ -83,6 +82,11 @@ class AxialSweep:
     def z_um(self) -> tuple[float, ...]:
         """Depths of the planes, nearest first, evenly spaced in 1/z (Kuo 2020, Eq. 4.7)."""
         return Span(start=self.z_min_um, stop=self.z_max_um, number=self.planes, spacing="dioptric").values()
+
+    @property
+    def points_um(self) -> tuple[Position, ...]:
+        """Where the source stands, nearest plane first."""
+        return tuple((self.x_um, self.y_um, z_um) for z_um in self.z_um)
 
 
 def planes_needed(z_min_um: float, z_max_um: float, geometry: Geometry, feature_px: float = 2.0) -> int:
@@ -109,49 +113,3 @@ def planes_needed(z_min_um: float, z_max_um: float, geometry: Geometry, feature_
     edge_um2 = 1e6 * max(geometry.aperture_mm) / 2 * geometry.diffuser_distance_mm
     travel_px = edge_um2 * (1 / z_min_um - 1 / z_max_um) / geometry.pixel_pitch_um
     return 1 + int(np.ceil(travel_px / feature_px - 1e-9))
-
-
-def axial_plan(sweep: AxialSweep, exposures_ms: Sequence[float], label: str = "axial sweep") -> Plan:
-    """Return the plan: dark frames at the shortest and longest exposure, then each plane from near to far."""
-    depths = sweep.z_um
-    if len(exposures_ms) != len(depths):
-        raise ValueError(f"{len(depths)} planes need as many exposures, not {len(exposures_ms)}.")
-    return plan_planes(sweep, list(zip(depths, exposures_ms, strict=True)), label)
-
-
-def plan_planes(sweep: AxialSweep, planes: Sequence[tuple[float, float]], label: str) -> Plan:
-    """Return the plan for planes given as ``(z_um, exposure_ms)``, dark frames first."""
-    exposures_ms = [exposure_ms for _, exposure_ms in planes]
-    dark = Part(
-        label="dark",
-        light=(OFF,),
-        exposures_ms=tuple(sorted({min(exposures_ms), max(exposures_ms)})),
-        repeats=sweep.dark_frames,
-    )
-    psfs = (
-        Part(
-            label="psf",
-            positions=None if sweep.by_hand else SourcePoints(points_um=((sweep.x_um, sweep.y_um, z_um),)),
-            light=(SOURCE,),
-            exposures_ms=(exposure_ms,),
-            repeats=sweep.average,
-        )
-        for z_um, exposure_ms in planes
-    )
-    return Plan(label=label, parts=(dark, *psfs))
-
-
-def check_sweep(bench: Bench, sweep: AxialSweep, folder: Path | None = None) -> Plan:
-    """Refuse a sweep that leaves the bench's limits or the disk, before anything moves; returns a first plan.
-
-    The plan is made with the camera's present exposure; :func:`expose_sweep` finds the right ones. The stage
-    need not be homed yet: limits hold all the same, and the sweep itself is checked again.
-
-    Raises
-    ------
-    PlanError
-        Naming every step that cannot be done.
-    """
-    plan = axial_plan(sweep, [bench.camera.exposure_ms] * sweep.planes)
-    check(plan, replace(abilities_of(bench, folder), stage_homed=True))
-    return plan

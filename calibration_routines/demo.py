@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calibration_routines.axial import AxialCalibration, calibrate_axial
 from calibration_routines.axial_exposure import SweepExposures, expose_sweep
 from calibration_routines.comparison import Comparison, compare
 from calibration_routines.demo_figure import write_pictures
@@ -19,6 +18,7 @@ from calibration_routines.demo_picture import Viewer
 from calibration_routines.demo_settings import DemoSettings
 from calibration_routines.field_response import FieldResponse, measure_field_response
 from calibration_routines.photograph import Photograph, expose_scene, photograph
+from calibration_routines.sweep import SweepCalibration, calibrate_sweep
 from drivers.simulated.world import SimulatedWorld
 from instrument.atomic import write_text
 from instrument.bench import Bench, open_bench
@@ -43,7 +43,7 @@ class Audience(Protocol):
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
         """Learn the exposures, and what the sweep will do and cost, before it starts."""
 
-    def on_sweep(self, done: AxialCalibration) -> None:
+    def on_sweep(self, done: SweepCalibration) -> None:
         """Learn how good the sweep is."""
 
 
@@ -51,7 +51,7 @@ class Audience(Protocol):
 class Measured:
     """What the demo brings home from the bench."""
 
-    calibration: AxialCalibration
+    calibration: SweepCalibration
     response: FieldResponse
     photo: Photograph
     bench_label: str
@@ -168,7 +168,7 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
         exposures = expose_sweep(bench, sweep)
     audience.on_exposures(bench, settings, exposures)
     with stage("dark frames and axial sweep") as advance:
-        done = calibrate_axial(bench, sweep, place, exposures=exposures, on_progress=_reporting(advance))
+        done = calibrate_sweep(bench, sweep, place, exposures=exposures, on_progress=_reporting(advance))
     audience.on_sweep(done)
     with stage("response over the field") as advance:
         height, width = settings.scene_size_um

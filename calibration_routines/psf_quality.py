@@ -52,11 +52,21 @@ class PsfQuality:
     scale_error: float = 0.0
     """Size of the support over what the paraxial law expects from the whole sweep, minus one."""
     step_px: float = 0.0
-    """Distance of the centroid from the sweep's line in 1/z."""
+    """Distance of the pattern from where the sweep's other PSFs, or the stage, say it is."""
     findings: tuple[str, ...] = ()
     """What is wrong, in words; empty when the PSF is good."""
     retake: bool = False
     """Whether taking the plane again (with a shorter exposure if it saturates) can help."""
+    x_um: float = 0.0
+    y_um: float = 0.0
+    """Where the source stood laterally."""
+    similarity: float | None = None
+    """Inner product with the central PSF of its depth once registered; None where that is itself."""
+
+    @property
+    def source_um(self) -> tuple[float, float, float]:
+        """Where the stage said the source was."""
+        return self.x_um, self.y_um, self.z_um
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures as JSON-compatible values."""
@@ -67,7 +77,12 @@ class PsfQuality:
 
 
 def measure_psf(
-    image: npt.NDArray[np.floating], *, z_um: float, noise: float, saturated_pixels: int = 0
+    image: npt.NDArray[np.floating],
+    *,
+    z_um: float,
+    noise: float,
+    saturated_pixels: int = 0,
+    may_be_clipped: bool = False,
 ) -> PsfQuality:
     """Measure one PSF and judge what can be judged without its neighbours.
 
@@ -81,6 +96,8 @@ def measure_psf(
         Standard deviation of one pixel of ``image`` inside the support, counts.
     saturated_pixels : int
         Pixels at full scale in the frames that were averaged.
+    may_be_clipped : bool
+        The source stands so far off the axis that the sensor's edge is expected to cut its pattern.
 
     Returns
     -------
@@ -116,7 +133,7 @@ def measure_psf(
             f"the signal is only {snr:.1f} times the noise ({MIN_SNR:.0f} expected): average more frames, "
             "brighten the source or lengthen the exposure."
         )
-    if clipped > MAX_CLIPPED:
+    if clipped > MAX_CLIPPED and not may_be_clipped:
         findings.append(
             f"the pattern reaches over {clipped:.0%} of the sensor's edge: part of it is lost. "
             "Move the source farther away or centre it, or make the aperture smaller."
@@ -156,7 +173,7 @@ def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None
         for index, step in zip(lit, _centroid_steps([planes[i] for i in lit]), strict=True):
             judged[index] = replace(judged[index], step_px=step)
             if step > MAX_STEP_PX:
-                judged[index] = _with_finding(
+                judged[index] = with_finding(
                     judged[index],
                     f"the pattern lies {step:.1f} pixels beside the line through the other planes (up to "
                     f"{MAX_STEP_PX:g} expected): the stage or the source slipped. Take the plane again.",
@@ -168,7 +185,7 @@ def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None
             judged[index] = replace(judged[index], scale_error=error)
             if abs(error) > MAX_SCALE_ERROR and planes[index].clipped <= MAX_CLIPPED:
                 size = "large" if error > 0 else "small"
-                judged[index] = _with_finding(
+                judged[index] = with_finding(
                     judged[index],
                     f"the support is {abs(error):.1%} too {size} for 1 + d/z (up to {MAX_SCALE_ERROR:.0%} "
                     "expected): check the source's distance from the diffuser and d.",
@@ -235,5 +252,6 @@ def _scale_errors(planes: Sequence[PsfQuality], diffuser_distance_um: float | No
     return [float(error) for error in radii / (law * np.median(radii / law)) - 1.0]
 
 
-def _with_finding(plane: PsfQuality, finding: str, *, retake: bool) -> PsfQuality:
+def with_finding(plane: PsfQuality, finding: str, *, retake: bool) -> PsfQuality:
+    """Return a PSF's quality with one more finding."""
     return replace(plane, findings=(*plane.findings, finding), retake=plane.retake or retake)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration_routines import AxialCalibration, SweepExposures
+from calibration_routines import SweepCalibration, SweepExposures
 from calibration_routines.comparison import compare, scene_field
 from calibration_routines.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo_settings import DemoSettings, read_picture
@@ -76,7 +76,7 @@ class Listener:
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
         assert not exposures.warnings
 
-    def on_sweep(self, done: AxialCalibration) -> None:
+    def on_sweep(self, done: SweepCalibration) -> None:
         assert not done.findings
 
 

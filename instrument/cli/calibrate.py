@@ -2,34 +2,80 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
-from calibration_routines import (
-    AxialCalibration,
-    AxialSweep,
-    SweepExposures,
-    axial_plan,
-    calibrate_axial,
-    check_sweep,
-    expose_sweep,
-    planes_needed,
-)
-from instrument.acquire import abilities_of
+from calibration_routines import AxialSweep, GridSweep, PointSweep, axial_planes, grid_sweep
 from instrument.bench import Bench
 from instrument.cli import calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.cli.progress import one_task
+from instrument.cli.sweeping import take_sweep
 from instrument.errors import BenchError
-from instrument.plan import estimate
-from recon.types import Geometry
+from instrument.plan import Span
+from recon.optics.fall_off import FallOff, gaussian_fall_off
 
 app = command_app("Measure point spread functions (PSFs), or how an SLM answers.")
 _MAX_PLANES = 256
+
+ZMin = Annotated[float, typer.Option("--z-min", metavar="MM", help="Nearest plane, from the diffuser.")]
+Planes = Annotated[
+    int | None,
+    typer.Option(help="Number of planes, evenly spaced in 1/z; left out: as many as the optics need."),
+]
+Average = Annotated[int, typer.Option(help="Frames a PSF.")]
+DarkFrames = Annotated[int, typer.Option(help="Dark frames at the shortest and longest exposure each.")]
+X = Annotated[float, typer.Option(metavar="MM", help="Lateral place of the source, or the grid's centre.")]
+Target = Annotated[
+    float, typer.Option(help="Level of each PSF's 99.9th percentile, as a fraction of full scale.")
+]
+Dct = Annotated[
+    int,
+    typer.Option(metavar="N", help="Remove the N x N lowest DCT coefficients (stray light); 0: none."),
+]
+BinningText = Annotated[
+    str,
+    typer.Option(
+        "--binning",
+        metavar="N|auto",
+        help="Software binning, on top of the camera's; auto: as far as the PSF's finest structure allows.",
+    ),
+]
+Every = Annotated[
+    int,
+    typer.Option(
+        "--reference-every", metavar="N", help="PSFs between two visits to the reference point; 0: none."
+    ),
+]
+Lenslet = Annotated[
+    float | None,
+    typer.Option("--lenslet", metavar="UM", help="Lenslet diameter, for the number of planes."),
+]
+Wavelength = Annotated[
+    float | None, typer.Option("--wavelength", metavar="NM", help="For --lenslet; default: [geometry].")
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Where the run's folder goes; left out: the bench's data folder."),
+]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Only say what would be done, and why; nothing moves.")
+]
+HalfField = Annotated[
+    float | None,
+    typer.Option(metavar="MM", help="Half the grid's width (height); left out: what a reconstruction shows."),
+]
+Spacing = Annotated[
+    float | None,
+    typer.Option("--spacing", metavar="MM", help="Of the points; left out: by Nyquist of the fall-off."),
+]
+FallOffDeg = Annotated[
+    float | None,
+    typer.Option("--fall-off-deg", metavar="DEG", help="Standard deviation of a Gaussian angular response."),
+]
 
 
 @app.callback()
@@ -44,41 +90,31 @@ app.command(epilog=calibrate_slm.EPILOG)(calibrate_slm.slm)
     epilog=examples(
         "diffuserbench calibrate axial --z-min 100 --z-max 300 --planes 12",
         "diffuserbench calibrate axial --z-min 300          one PSF, 300 mm in front of the diffuser",
+        "diffuserbench calibrate axial --z-min 100 --z-max 300 --dry-run",
     )
 )
 def axial(
-    z_min: Annotated[float, typer.Option("--z-min", metavar="MM", help="Nearest plane, from the diffuser.")],
+    z_min: ZMin,
     z_max: Annotated[
         float | None,
         typer.Option("--z-max", metavar="MM", help="Farthest plane; left out: one PSF at --z-min."),
     ] = None,
-    planes: Annotated[
-        int | None,
-        typer.Option(help="Number of planes, evenly spaced in 1/z; left out: as many as the optics need."),
-    ] = None,
-    average: Annotated[int, typer.Option(help="Frames a plane.")] = 4,
-    dark_frames: Annotated[
-        int, typer.Option(help="Dark frames at the shortest and longest exposure each.")
-    ] = 4,
-    x: Annotated[float, typer.Option(metavar="MM", help="Lateral place of the source.")] = 0.0,
-    y: Annotated[float, typer.Option(metavar="MM", help="Lateral place of the source.")] = 0.0,
-    target: Annotated[
-        float, typer.Option(help="Level of each PSF's 99.9th percentile, as a fraction of full scale.")
-    ] = 0.7,
-    dct: Annotated[
-        int,
-        typer.Option(metavar="N", help="Remove the N x N lowest DCT coefficients (stray light); 0: none."),
-    ] = 0,
-    binning: Annotated[int, typer.Option(help="Software binning, on top of the camera's.")] = 1,
+    planes: Planes = None,
+    average: Average = 4,
+    dark_frames: DarkFrames = 4,
+    x: X = 0.0,
+    y: X = 0.0,
+    target: Target = 0.7,
+    dct: Dct = 0,
+    binning: BinningText = "1",
+    reference_every: Every = 16,
+    lenslet: Lenslet = None,
+    wavelength: Wavelength = None,
     by_hand: Annotated[
         bool, typer.Option("--by-hand", help="The source was placed by hand at --z-min; nothing moves.")
     ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Where the run's folder goes; left out: the bench's data folder."
-        ),
-    ] = None,
+    dry_run: DryRun = False,
+    out: Out = None,
     bench: BenchOption = None,
 ) -> None:
     """Move the point source along the axis and measure one PSF a plane.
@@ -87,107 +123,195 @@ def axial(
     planes again, and saves the calibration in the run's folder. Ends with the light off.
     """
     console = Console()
+    far = z_min if z_max is None else z_max
     with open_and_say(bench) as opened:
+        reasons: tuple[str, ...] = ()
+        if planes is None and z_min < far and z_min > 0:
+            planes, reasons = _planes(opened, z_min, far, lenslet, wavelength)
         sweep = AxialSweep(
             z_min_um=1e3 * z_min,
-            z_max_um=1e3 * (z_min if z_max is None else z_max),
-            planes=_number_of_planes(console, planes, z_min, z_max, opened.geometry),
+            z_max_um=1e3 * far,
+            planes=1 if planes is None else planes,
             x_um=1e3 * x,
             y_um=1e3 * y,
             average=average,
             dark_frames=dark_frames,
             target=target,
             dct_order=dct,
-            binning=binning,
+            binning=_binning(binning),
             by_hand=by_hand,
+            reference_every=reference_every,
         )
-        check_sweep(opened, sweep, out)
-        if opened.stage is not None and not by_hand:
-            with one_task("Homing the stage"):
-                opened.stage.home()
-        with one_task("Finding exposures"):
-            exposures = expose_sweep(opened, sweep)
-        describe_exposures(console, exposures)
-        describe_plan(console, opened, sweep, exposures, out)
-        with one_task("Sweeping") as advance:
-            done = calibrate_axial(
-                opened,
-                sweep,
-                out,
-                exposures=exposures,
-                on_progress=lambda status: advance(status.done, status.total),
-            )
-    describe_quality(console, done)
-    console.print(f"Run          {escape(str(done.runs[0].path))}", soft_wrap=True)
-    console.print(f"Calibration  {escape(str(done.path))}", soft_wrap=True)
+        take_sweep(console, opened, sweep, out, reasons=reasons, dry_run=dry_run)
 
 
-def describe_exposures(console: Console, exposures: SweepExposures) -> None:
-    """Print what auto-exposure found, and where it fell short."""
-    for z_um, found in exposures.found:
-        last = found.trace[-1]
-        console.print(
-            f"Exposure at {z_um / 1e3:.4g} mm: {found.exposure_ms:.4g} ms in {len(found.trace)} frames; "
-            f"99.9th percentile at {last.level:.0%}, brightest pixel at {last.brightest:.0%} of full scale, "
-            f"{last.saturated_pixels} saturated ({found.hot_pixels} hot pixels excepted).",
-            soft_wrap=True,
-        )
-    for warning in exposures.warnings:
-        console.print(f"Note: {escape(warning)}", soft_wrap=True)
-
-
-def describe_plan(
-    console: Console, bench: Bench, sweep: AxialSweep, exposures: SweepExposures, folder: Path | None
+@app.command(
+    epilog=examples(
+        "diffuserbench calibrate lateral --z 300 --dry-run          the grid, and why",
+        "diffuserbench calibrate lateral --z 1.7 --fall-off-deg 13 --half-field-x 1.2 --half-field-y 0.8",
+        "diffuserbench calibrate lateral --z 300 --spacing 40",
+    )
+)
+def lateral(
+    z: Annotated[float, typer.Option("--z", metavar="MM", help="Depth of the grid, from the diffuser.")],
+    half_field_x: HalfField = None,
+    half_field_y: HalfField = None,
+    spacing: Spacing = None,
+    fall_off_deg: FallOffDeg = None,
+    average: Average = 4,
+    dark_frames: DarkFrames = 4,
+    x: X = 0.0,
+    y: X = 0.0,
+    target: Target = 0.7,
+    dct: Dct = 0,
+    binning: BinningText = "1",
+    reference_every: Every = 10,
+    dry_run: DryRun = False,
+    out: Out = None,
+    bench: BenchOption = None,
 ) -> None:
-    """Print what the sweep will do and cost, before it starts."""
-    plan = axial_plan(sweep, exposures.exposures_ms)
-    cost = estimate(plan, abilities_of(bench, folder))
-    depths = ", ".join(f"{z_um / 1e3:.4g}" for z_um in sweep.z_um)
-    console.print(f"Planes (mm): {depths}", soft_wrap=True)
-    lit = sweep.planes * sweep.average
-    console.print(
-        f"Plan: {sweep.planes} planes x {sweep.average} frames + {cost.frames - lit} dark frames "
-        f"= {cost.frames} frames, {cost.total_bytes / 1e6:.0f} MB at most, "
-        f"{cost.seconds:.0f} s of exposure and motion.",
-        soft_wrap=True,
+    """Move the point source over a grid at one depth and measure a PSF at each point.
+
+    For a camera whose PSF changes over the field: reconstruct --volume CALIBRATION --model local, lowrank or
+    auto. Each pattern's shift is measured and held against the stage; a reference point is visited again and
+    again to tell whether the source drifts.
+    """
+    blank = _point_sweep("lateral", average, dark_frames, target, dct, binning, reference_every)
+    half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
+    with open_and_say(bench) as opened:
+        grid = grid_sweep(
+            opened,
+            (1e3 * z,),
+            response=_fall_off(fall_off_deg),
+            half_field_um=half_field,
+            spacing_um=spacing_um,
+            x_um=1e3 * x,
+            y_um=1e3 * y,
+        )
+        sweep = replace(blank, points_um=grid.points_um)
+        take_sweep(Console(), opened, sweep, out, reasons=_said(grid), dry_run=dry_run)
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench calibrate volume --z-min 100 --z-max 300 --dry-run",
+        "diffuserbench calibrate volume --z-min 1.7 --z-max 3 --lenslet 250 --wavelength 520 "
+        "--fall-off-deg 13",
+    )
+)
+def volume(
+    z_min: ZMin,
+    z_max: Annotated[float, typer.Option("--z-max", metavar="MM", help="Farthest plane.")],
+    planes: Planes = None,
+    half_field_x: HalfField = None,
+    half_field_y: HalfField = None,
+    spacing: Spacing = None,
+    fall_off_deg: FallOffDeg = None,
+    lenslet: Lenslet = None,
+    wavelength: Wavelength = None,
+    average: Average = 4,
+    dark_frames: DarkFrames = 4,
+    x: X = 0.0,
+    y: X = 0.0,
+    target: Target = 0.7,
+    dct: Dct = 0,
+    binning: BinningText = "1",
+    reference_every: Every = 10,
+    dry_run: DryRun = False,
+    out: Out = None,
+    bench: BenchOption = None,
+) -> None:
+    """Move the point source over a grid at each of several depths, evenly spaced in 1/z.
+
+    As lateral, plane after plane. The number of planes and of points follows from the optics unless given.
+    """
+    blank = _point_sweep("volume", average, dark_frames, target, dct, binning, reference_every)
+    half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
+    with open_and_say(bench) as opened:
+        reasons: tuple[str, ...] = ()
+        if planes is None:
+            planes, reasons = _planes(opened, z_min, z_max, lenslet, wavelength)
+        if not (0 < z_min < z_max and planes >= 2):
+            raise BenchError(
+                f"A volume has two planes or more, 0 < z min < z max; not {planes} between {z_min:g} and "
+                f"{z_max:g} mm."
+            )
+        depths = Span(start=1e3 * z_min, stop=1e3 * z_max, number=planes, spacing="dioptric").values()
+        grid = grid_sweep(
+            opened,
+            depths,
+            response=_fall_off(fall_off_deg),
+            half_field_um=half_field,
+            spacing_um=spacing_um,
+            x_um=1e3 * x,
+            y_um=1e3 * y,
+        )
+        sweep = replace(blank, points_um=grid.points_um)
+        take_sweep(Console(), opened, sweep, out, reasons=(*reasons, *_said(grid)), dry_run=dry_run)
+
+
+def _point_sweep(
+    kind: str, average: int, dark_frames: int, target: float, dct: int, binning: str, every: int
+) -> PointSweep:
+    """Return the settings of a sweep whose points are planned later: mistakes show before the bench opens."""
+    return PointSweep(
+        points_um=((0.0, 0.0, 1.0),),
+        kind=kind,
+        average=average,
+        dark_frames=dark_frames,
+        target=target,
+        dct_order=dct,
+        binning=_binning(binning),
+        reference_every=every,
     )
 
 
-def describe_quality(console: Console, done: AxialCalibration) -> None:
-    """Print the verdict on every plane, or one line when all are good."""
-    lowest = min(done.quality, key=lambda plane: plane.snr)
-    if not done.findings:
-        count = len(done.quality)
-        verdict = [f"signal at least {lowest.snr:.0f} times the noise"]
-        if count >= 4:  # fewer planes give no line to hold a centroid against
-            verdict.append(
-                f"centroids within {max(q.step_px for q in done.quality):.2f} pixels of their line in 1/z"
-            )
-        if count >= 2:
-            verdict.append(f"support within {max(abs(q.scale_error) for q in done.quality):.1%} of 1 + d/z")
-        console.print(
-            f"Quality: {'all ' if count > 1 else ''}{count} PSF{'s' if count > 1 else ''} good. "
-            f"No saturated pixel; {'; '.join(verdict)}.",
-            soft_wrap=True,
-        )
-    for finding in done.findings:
-        console.print(f"Quality: {escape(finding)}", soft_wrap=True)
-
-
-def _number_of_planes(
-    console: Console, planes: int | None, z_min_mm: float, z_max_mm: float | None, geometry: Geometry
-) -> int:
-    if planes is not None or z_max_mm is None or z_max_mm <= z_min_mm or z_min_mm <= 0:
-        return planes if planes is not None else 1
-    needed = planes_needed(1e3 * z_min_mm, 1e3 * z_max_mm, geometry)
-    if needed > _MAX_PLANES:
+def _planes(
+    bench: Bench, z_min_mm: float, z_max_mm: float, lenslet_um: float | None, wavelength_nm: float | None
+) -> tuple[int, tuple[str, ...]]:
+    needed = axial_planes(
+        1e3 * z_min_mm, 1e3 * z_max_mm, bench.geometry, lenslet_um=lenslet_um, wavelength_nm=wavelength_nm
+    )
+    number = int(needed.value)
+    if number > _MAX_PLANES:
         raise BenchError(
-            f"From {z_min_mm:g} to {z_max_mm:g} mm these optics need {needed} planes, more than "
+            f"From {z_min_mm:g} to {z_max_mm:g} mm these optics need {number} planes, more than "
             f"{_MAX_PLANES}. Narrow the range, or say --planes."
         )
-    console.print(
-        f"{needed} planes: the edge of the pattern moves by up to 2 pixels from one to the next "
-        "(Kuo 2020, Eq. 4.7). Choose another number with --planes.",
-        soft_wrap=True,
-    )
-    return max(needed, 2)
+    return number, (f"{needed.reason}. Choose another number with --planes.",)
+
+
+def _said(grid: GridSweep) -> tuple[str, ...]:
+    sizes = dict.fromkeys(f"{rows} x {columns}" for rows, columns in grid.shapes)
+    return (*grid.reasons, f"Grid: {' to '.join(sizes)} points (y x x) at each depth")
+
+
+def _fall_off(sigma_deg: float | None) -> FallOff | None:
+    if sigma_deg is None:
+        return None
+    if not 0 < sigma_deg < 90:
+        raise BenchError(f"--fall-off-deg must lie between 0 and 90 degrees, not {sigma_deg:g}.")
+    return gaussian_fall_off(sigma_deg)
+
+
+def _half_field(x_mm: float | None, y_mm: float | None) -> tuple[float, float] | None:
+    if x_mm is None and y_mm is None:
+        return None
+    if x_mm is None or y_mm is None:
+        raise BenchError("Give both --half-field-x and --half-field-y, or neither.")
+    return 1e3 * y_mm, 1e3 * x_mm
+
+
+def _micrometres(spacing_mm: float | None) -> float | None:
+    if spacing_mm is not None and spacing_mm <= 0:
+        raise BenchError(f"--spacing must be above 0 mm, not {spacing_mm:g}.")
+    return None if spacing_mm is None else 1e3 * spacing_mm
+
+
+def _binning(text: str) -> int:
+    """Return the software binning; 0 stands for automatic."""
+    if text == "auto":
+        return 0
+    if not text.isdecimal() or int(text) < 1:
+        raise BenchError(f"--binning takes a whole number from 1, or auto; not {text!r}.")
+    return int(text)

@@ -11,13 +11,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines import AxialCalibration, SweepExposures
+from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
 from calibration_routines.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo_settings import DemoSettings
 from instrument.bench import Bench
 from instrument.cli.app import command_app, examples
-from instrument.cli.calibrate import describe_exposures, describe_plan, describe_quality
 from instrument.cli.progress import one_task
+from instrument.cli.sweeping import describe_exposures, describe_plan, describe_quality
 
 app = command_app()
 
@@ -60,9 +60,10 @@ class _Terminal:
 
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
         describe_exposures(self._console, exposures)
-        describe_plan(self._console, bench, settings.sweep, exposures, None)
+        plan = sweep_plan(settings.sweep, exposures.exposures_ms)
+        describe_plan(self._console, bench, settings.sweep, plan, None)
 
-    def on_sweep(self, done: AxialCalibration) -> None:
+    def on_sweep(self, done: SweepCalibration) -> None:
         describe_quality(self._console, done)
 
     def verdict(self, result: DemoResult) -> None:

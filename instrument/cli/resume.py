@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
+from calibration_routines import finish_sweep, is_sweep
+from calibration_routines.sweep import FOLDER
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import progress_bar
 from instrument.cli.running import carry_out, home_if_needed
+from instrument.cli.sweeping import describe_result
 from instrument.resume import prepare_resume
 from instrument.store import FinishReason, Run, RunCondition, RunWriter
 from instrument.store.layout import BENCH_TOML
@@ -26,7 +30,8 @@ def resume(
 
     Every frame that the run has is read first and held against its checksum; what was found is said. The
     bench is the run's own bench.toml unless --bench names another. A recording cannot go on; one that was
-    cut off is closed, so that it reads as what it is.
+    cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
+    last frame is there.
     """
     found = Run.open(run)
     if found.plan is None:
@@ -34,6 +39,8 @@ def resume(
         return
     if found.condition is RunCondition.COMPLETED and not found.missing():
         typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
+        if is_sweep(run) and not (run / FOLDER).exists():
+            describe_result(Console(), finish_sweep(run))
         return
     with open_and_say(bench or run / BENCH_TOML) as opened:
         home_if_needed(opened, found.plan)
@@ -43,7 +50,9 @@ def resume(
                 opened, run, on_verify=lambda done, _: bar.update(task, completed=done)
             )
         typer.echo(f"Found {findings}", err=True)
-        carry_out(opened, runner)
+        done = carry_out(opened, runner)
+        if is_sweep(run) and done.condition is RunCondition.COMPLETED:
+            describe_result(Console(), finish_sweep(run, opened))
 
 
 def _close_recording(run: Run) -> None:

@@ -12,10 +12,10 @@ import pytest
 from calibration_routines import (
     AxialSweep,
     CalibrationError,
-    axial_plan,
-    calibrate_axial,
+    calibrate_sweep,
     expose_sweep,
     planes_needed,
+    sweep_plan,
 )
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench import Bench, open_bench
@@ -66,8 +66,12 @@ def slip_at(bench: Bench, z_um: float, shift_um: float) -> Callable[[RunStatus],
     slipped: list[bool] = []
 
     def watch(status: RunStatus) -> None:
+        step = status.step
         here = (
-            status.step is not None and status.step.source_um is not None and status.step.source_um[2] == z_um
+            step is not None
+            and step.label == "psf"
+            and step.source_um is not None
+            and step.source_um[2] == z_um
         )
         if here and not slipped:
             world.carry_source(lambda: (shift_um, 0.0, z_um))
@@ -81,7 +85,7 @@ def slip_at(bench: Bench, z_um: float, shift_um: float) -> Callable[[RunStatus],
 def test_a_sweep_gives_good_psfs_that_scale_with_depth_and_survive_the_disk(
     bench: Bench, tmp_path: Path
 ) -> None:
-    done = calibrate_axial(bench, SWEEP, tmp_path)
+    done = calibrate_sweep(bench, SWEEP, tmp_path)
     assert done.findings == ()
     assert [run.condition for run in done.runs] == [RunCondition.COMPLETED]
     assert done.calibration.psfs.shape == (5, 1, 240, 320)
@@ -105,20 +109,20 @@ def test_a_sweep_gives_good_psfs_that_scale_with_depth_and_survive_the_disk(
 
 def test_psfs_match_the_light_that_fell_on_the_sensor(bench: Bench, tmp_path: Path) -> None:
     sweep = AxialSweep(80e3, 80e3, average=4)
-    psf = calibrate_axial(bench, sweep, tmp_path).calibration.psfs[0, 0]
+    psf = calibrate_sweep(bench, sweep, tmp_path).calibration.psfs[0, 0]
     truth = world_of(bench).psf((0.0, 0.0, 80e3), (0.0, 1.0, 0.0))
     assert np.corrcoef(psf.ravel(), truth.ravel())[0, 1] > 0.995
 
 
 def test_a_source_that_slipped_is_found_and_the_plane_taken_again(bench: Bench, tmp_path: Path) -> None:
-    done = calibrate_axial(bench, SWEEP, tmp_path, on_progress=slip_at(bench, SWEEP.z_um[2], 1000.0))
+    done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=slip_at(bench, SWEEP.z_um[2], 1000.0))
     assert [len(run.steps("psf")) for run in done.runs] == [10, 2]
     assert done.findings == ()
 
 
 def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> None:
     watch = slip_at(bench, SWEEP.z_um[2], 1000.0)
-    done = calibrate_axial(bench, replace(SWEEP, retakes=0), tmp_path, on_progress=watch)
+    done = calibrate_sweep(bench, replace(SWEEP, retakes=0), tmp_path, on_progress=watch)
     assert len(done.findings) == 1
     assert "z = 85.71 mm: the pattern lies" in done.findings[0]
     assert load_calibration(done.path).quality["good"] is False
@@ -127,7 +131,7 @@ def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> N
 def test_a_plane_that_saturates_is_taken_again_with_a_shorter_exposure(bench: Bench, tmp_path: Path) -> None:
     found = expose_sweep(bench, SWEEP)
     too_long = [1.3 * e if i == 1 else e for i, e in enumerate(found.exposures_ms)]
-    done = calibrate_axial(bench, SWEEP, tmp_path, exposures=replace(found, exposures_ms=tuple(too_long)))
+    done = calibrate_sweep(bench, SWEEP, tmp_path, exposures=replace(found, exposures_ms=tuple(too_long)))
     assert len(done.runs) == 2
     assert done.exposures.exposures_ms[1] == pytest.approx(0.7 * too_long[1])
     assert done.findings == ()
@@ -140,7 +144,7 @@ def test_a_source_too_weak_for_the_camera_is_refused_in_words(tmp_path: Path) ->
         assert bench.stage is not None
         bench.stage.home()
         with pytest.raises(CalibrationError, match=r"too dark.*longest exposure"):
-            calibrate_axial(bench, SWEEP, tmp_path)
+            calibrate_sweep(bench, SWEEP, tmp_path)
         assert bench.led_array is not None
         assert bench.led_array.pattern.is_dark
     assert list(tmp_path.iterdir()) == []
@@ -149,7 +153,7 @@ def test_a_source_too_weak_for_the_camera_is_refused_in_words(tmp_path: Path) ->
 def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp_path: Path) -> None:
     before = bench.source_position_um
     with pytest.raises(PlanError, match="outside the stage's limits"):
-        calibrate_axial(bench, AxialSweep(60e3, 900e3, 3), tmp_path)
+        calibrate_sweep(bench, AxialSweep(60e3, 900e3, 3), tmp_path)
     assert bench.source_position_um == before
     assert list(tmp_path.iterdir()) == []
 
@@ -157,7 +161,7 @@ def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp
 def test_a_bench_without_a_stage_takes_one_psf_by_hand(tmp_path: Path) -> None:
     text = TINY.replace('[stage]\ndriver = "simulated"\n', "")
     with open_bench(parse_config(text, None)) as bench:
-        done = calibrate_axial(bench, AxialSweep(100e3, 100e3, by_hand=True), tmp_path)
+        done = calibrate_sweep(bench, AxialSweep(100e3, 100e3, by_hand=True), tmp_path)
     assert done.findings == ()
     assert done.calibration.source_positions_um.tolist() == [[0.0, 0.0, 100e3]]
 
@@ -179,11 +183,11 @@ def test_senseless_sweeps_are_refused(wrong: dict[str, float], message: str) -> 
 
 
 def test_the_plan_counts_its_frames() -> None:
-    plan = axial_plan(SWEEP, [1.0, 2.0, 3.0, 4.0, 5.0])
-    assert len(plan) == 5 * 2 + 2 * 2
-    assert len(axial_plan(SWEEP, [2.0] * 5)) == 5 * 2 + 2  # one exposure: one set of dark frames
+    plan = sweep_plan(SWEEP, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert len(plan) == 2 * 2 + (1 + 5 + 1) * 2  # dark frames; the reference before and after the planes
+    assert len(sweep_plan(SWEEP, [2.0] * 5)) == 2 + 7 * 2  # one exposure: one set of dark frames
     with pytest.raises(ValueError, match="as many exposures"):
-        axial_plan(SWEEP, [1.0])
+        sweep_plan(SWEEP, [1.0])
 
 
 def test_the_number_of_planes_follows_from_the_optics() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.axial_analysis import DarkModel, PlaneFrames, analyse_axial, binned, replace_hot
+from calibration_routines.axial_analysis import DarkModel, PlaneFrames, analyse_sweep, binned, replace_hot
 from recon.types import Geometry
 
 FULL = 4095
@@ -45,7 +45,7 @@ def plane(z_um: float, exposure_ms: float, n: int = 4) -> PlaneFrames:
 
 def test_psfs_are_the_light_alone_in_counts_of_one_exposure() -> None:
     depths = [(100e3, 60.0), (140e3, 120.0), (200e3, 200.0)]
-    result = analyse_axial([plane(z, e) for z, e in depths], dark_model(), GEOMETRY)
+    result = analyse_sweep([plane(z, e) for z, e in depths], dark_model(), GEOMETRY)
     assert result.psfs.shape == (3, 1, *SHAPE)
     assert result.psfs.dtype == np.float32
     assert result.psfs.min() >= 0
@@ -64,10 +64,10 @@ def test_saturated_pixels_are_counted_and_hot_ones_are_not() -> None:
     bright = plane(100e3, 60.0)
     saturated = bright.frames.copy()
     saturated[1, 60:62, 90:93] = FULL  # in one frame of four: still a saturated PSF
-    result = analyse_axial([PlaneFrames(bright.source_um, 60.0, saturated, FULL)], dark_model(), GEOMETRY)
+    result = analyse_sweep([PlaneFrames(bright.source_um, 60.0, saturated, FULL)], dark_model(), GEOMETRY)
     assert result.quality[0].saturated_pixels == 6
     assert result.quality[0].retake
-    assert analyse_axial([bright], dark_model(), GEOMETRY).quality[0].saturated_pixels == 0
+    assert analyse_sweep([bright], dark_model(), GEOMETRY).quality[0].saturated_pixels == 0
 
 
 def test_binning_and_stray_light() -> None:
@@ -76,7 +76,7 @@ def test_binning_and_stray_light() -> None:
     spots = np.zeros(SHAPE)
     spots[20:130:16, 20:180:16] = 40.0
     raw = PlaneFrames((0.0, 0.0, 100e3), 60.0, frames(spots + stray, 60.0), FULL)
-    result = analyse_axial([raw], dark_model(), GEOMETRY, dct_order=4, binning=2)
+    result = analyse_sweep([raw], dark_model(), GEOMETRY, dct_order=4, binning=2)
     assert result.psfs.shape == (1, 1, SHAPE[0] // 2, SHAPE[1] // 2)
     assert result.psfs[0, 0, 10, 10] == pytest.approx(60.0 * 40.0 / 4, rel=0.1)
     assert np.median(result.psfs) < 15.0
@@ -84,7 +84,7 @@ def test_binning_and_stray_light() -> None:
 
 
 def test_a_single_plane_of_a_single_frame_is_a_calibration_too() -> None:
-    result = analyse_axial([plane(100e3, 60.0, n=1)], dark_model(1), GEOMETRY)
+    result = analyse_sweep([plane(100e3, 60.0, n=1)], dark_model(1), GEOMETRY)
     assert len(result.psfs) == 1
     assert np.isfinite(result.quality[0].snr)
 
@@ -94,7 +94,7 @@ def test_colour_frames_become_channels() -> None:
     colour = np.stack([grey.frames] * 3, axis=-1)
     zero = np.zeros(SHAPE)
     dark = DarkModel((60.0,), (np.stack([frames(zero, 60.0, 8)] * 3, axis=-1),), FULL)
-    result = analyse_axial([PlaneFrames(grey.source_um, 60.0, colour, FULL)], dark, GEOMETRY)
+    result = analyse_sweep([PlaneFrames(grey.source_um, 60.0, colour, FULL)], dark, GEOMETRY)
     assert result.psfs.shape == (1, 3, *SHAPE)
     assert np.array_equal(result.psfs[:, 0], result.psfs[:, 2])
 
@@ -107,10 +107,10 @@ def test_hot_pixels_take_their_neighbours_median() -> None:
 
 
 def test_frames_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least one plane"):
-        analyse_axial([], dark_model(), GEOMETRY)
+    with pytest.raises(ValueError, match="at least one point"):
+        analyse_sweep([], dark_model(), GEOMETRY)
     small = PlaneFrames((0.0, 0.0, 1e5), 60.0, np.zeros((2, 10, 10), np.uint16), FULL)
     with pytest.raises(ValueError, match=r"z = 100 mm are \(10, 10\), the dark frames \(144, 192\)"):
-        analyse_axial([small], dark_model(), GEOMETRY)
+        analyse_sweep([small], dark_model(), GEOMETRY)
     with pytest.raises(ValueError, match="one or two exposures"):
         DarkModel((), (), FULL)

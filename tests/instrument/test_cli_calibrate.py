@@ -54,7 +54,7 @@ def test_the_number_of_planes_follows_from_the_optics(
 ) -> None:
     assert main(["calibrate", "axial", "--z-min", "60", "--z-max", "150", "--average", "1"]) == 0
     out = capsys.readouterr().out
-    assert "5 planes: the edge of the pattern moves by up to 2 pixels" in out
+    assert "5 planes every 2.5 per metre: the edge of the pattern moves by up to 2 pixels" in out
     (path,) = tmp_path.glob("runs/*/calibration")
     assert len(load_calibration(path).psfs) == 5
 
