@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 from itertools import count
@@ -10,6 +9,8 @@ from pathlib import Path
 
 from PySide6.QtDBus import QDBusConnection, QDBusMessage
 from PySide6.QtGui import QGuiApplication
+
+from drivers.second_display.x11 import XConnection
 
 _log = logging.getLogger(__name__)
 _SERVICE = "org.freedesktop.ScreenSaver"
@@ -26,7 +27,10 @@ class ScreenSaverInhibition:
 
     def __init__(self) -> None:
         self._bus = _ask_desktop()
-        self._x11 = _XSuspension.begin() if QGuiApplication.platformName() == "xcb" else None
+        self._x11 = XConnection.open() if QGuiApplication.platformName() == "xcb" else None
+        if self._x11 is not None and not self._x11.suspend_screen_saver():
+            self._x11.close()
+            self._x11 = None
         ways = [
             *(["the desktop"] if self._bus is not None else []),
             *(["the X server"] if self._x11 is not None else []),
@@ -42,7 +46,7 @@ class ScreenSaverInhibition:
             QDBusConnection.disconnectFromBus(self._bus)
             self._bus = None
         if self._x11 is not None:
-            self._x11.end()
+            self._x11.close()
             self._x11 = None
 
 
@@ -62,30 +66,3 @@ def _ask_desktop() -> str | None:
             return name
     QDBusConnection.disconnectFromBus(name)
     return None
-
-
-class _XSuspension:
-    """A connection to the X server that suspends its screen saver and DPMS until it is closed."""
-
-    def __init__(self, xlib: ctypes.CDLL, display: int) -> None:
-        self._xlib = xlib
-        self._display: int | None = display
-
-    @classmethod
-    def begin(cls) -> _XSuspension | None:
-        try:
-            xlib, extension = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXss.so.1")
-        except OSError:
-            return None
-        xlib.XOpenDisplay.restype = ctypes.c_void_p
-        display = xlib.XOpenDisplay(None)
-        if not display:
-            return None
-        extension.XScreenSaverSuspend(ctypes.c_void_p(display), 1)
-        xlib.XFlush(ctypes.c_void_p(display))
-        return cls(xlib, display)
-
-    def end(self) -> None:
-        if self._display is not None:
-            self._xlib.XCloseDisplay(ctypes.c_void_p(self._display))
-            self._display = None

@@ -22,6 +22,7 @@ from drivers.errors import DeviceError
 from drivers.second_display.options import SecondDisplayOptions
 from drivers.second_display.outputs import Output, choose
 from drivers.second_display.screen_saver import ScreenSaverInhibition
+from drivers.second_display.x11 import Place, XConnection
 
 _EXPOSE_S = 5.0
 
@@ -122,6 +123,8 @@ class PatternScreen:
         self._lost: DeviceError | None = None
         self._inhibition: ScreenSaverInhibition | None = None
         self._check = False
+        self._x11: XConnection | None = None
+        self._place: Place | None = None
 
     def open(self, options: SecondDisplayOptions) -> tuple[Output, str]:
         """Cover the output that is meant, blank.
@@ -141,11 +144,23 @@ class PatternScreen:
         screen = QGuiApplication.screens()[output.index]
         blank = QImage(output.width, output.height, QImage.Format.Format_Grayscale8)
         blank.fill(0)
-        self._output, self._screen, self._check = output, screen, options.check_by_screenshot
+        self._output, self._check = output, options.check_by_screenshot
         self._lost = None
+        if _x11():
+            self._x11 = XConnection.open()
+            self._place = self._x11.place(output.name) if self._x11 is not None else None
+            if self._place is not None and self._place[2:] != (output.width, output.height):
+                self.close()
+                raise DeviceError(
+                    self._device,
+                    f"{output.name} is {self._place.width} x {self._place.height}, but Qt still takes it for "
+                    f"{output.width} x {output.height}.",
+                    "It changed its mode since this program began: start the program again.",
+                )
         app = _application()
         app.screenRemoved.connect(self._removed)
         screen.geometryChanged.connect(self._changed)
+        self._screen = screen
         self._window = _Window(screen, blank)
         try:
             if not _x11():  # there the window's place and size are enough
@@ -166,6 +181,7 @@ class PatternScreen:
         DeviceError
             When the output is lost, the window is hidden, or (if so configured) the screenshot differs.
         """
+        self._look_at_place()
         if self._lost is not None:
             raise self._lost
         window, output = self._window, self._output
@@ -181,17 +197,21 @@ class PatternScreen:
         window.paint()
         if self._check:
             self._compare(window)
-        if self._lost is not None:  # during the wait
+        self._look_at_place()
+        if self._lost is not None:  # meanwhile
             raise self._lost
 
     def close(self) -> None:
         """Uncover the output; closing twice does nothing."""
+        if self._x11 is not None:
+            self._x11.close()
+            self._x11 = None
         if self._inhibition is not None:
             self._inhibition.end()
             self._inhibition = None
         if self._screen is not None:
             _application().screenRemoved.disconnect(self._removed)
-            if self._lost is None:
+            if self._screen in QGuiApplication.screens():
                 self._screen.geometryChanged.disconnect(self._changed)
             self._screen = None
         self._remove_window()
@@ -247,6 +267,16 @@ class PatternScreen:
                 "Connect it, switch it on, and open the SLM again.",
             )
 
+    def _look_at_place(self) -> None:
+        """Ask the X server whether the output is still where and what it was; see ``XConnection.place``."""
+        place = self._x11.place(self._name()) if self._x11 is not None else None
+        if self._place is None or place is None or place == self._place:
+            return
+        self._lose(
+            f"output {self._name()} changed from {_words(self._place)} to {_words(place)}.",
+            "Set the SLM's own resolution and open the SLM again.",
+        )
+
     def _changed(self, geometry: QRect) -> None:
         screen, output = self._screen, self._output
         if screen is None or output is None:
@@ -254,8 +284,8 @@ class PatternScreen:
         size = _native(geometry.size(), screen.devicePixelRatio())
         if (size.width(), size.height()) != (output.width, output.height):
             self._lose(
-                f"output {self._name()} changed its mode from {output.width} x {output.height} to "
-                f"{size.width()} x {size.height()}.",
+                f"output {self._name()} changed from {output.width} x {output.height} to "
+                f"{size.width()} x {size.height()} pixels.",
                 "Set the SLM's own resolution and open the SLM again.",
             )
         elif self._window is not None:  # only its place on the desktop
@@ -275,6 +305,10 @@ class PatternScreen:
 
     def _name(self) -> str:
         return self._output.name if self._output is not None else "?"
+
+
+def _words(place: Place) -> str:
+    return f"{place.width} x {place.height} pixels at {place.x}, {place.y}"
 
 
 def _x11() -> bool:
