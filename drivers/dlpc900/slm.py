@@ -1,0 +1,334 @@
+"""The DLPC900 as a spatial light modulator that shows one pattern, repeated without end."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Mapping
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
+from drivers.discovery import FoundDevice
+from drivers.dlpc900 import commands
+from drivers.dlpc900.commands import Board, Command
+from drivers.dlpc900.images import encode
+from drivers.dlpc900.link import HidLink, found_controllers
+from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.slm import Slm
+
+_log = logging.getLogger(__name__)
+_START_S = 2.0
+_POLL_S = 0.01
+_FULL = 255
+
+
+class Dlpc900Options(DriverOptions):
+    """Options of a TI LightCrafter 6500 or 9000 (DLPC900) on USB."""
+
+    serial_number: str | None = Field(
+        None, min_length=1, description="USB serial number; left out: the only one connected."
+    )
+    bit_depth: Literal[1, 8] = Field(
+        8, description="8: grey levels, by mirrors that flip during the exposure; 1: levels 0 and 255 only."
+    )
+    exposure_us: int = Field(
+        10_000,
+        le=commands.MAX_EXPOSURE_US,
+        description="Time that the pattern is shown before it is repeated: from 105 with 1 bit, 4046 with 8.",
+    )
+    dark_us: int = Field(0, ge=0, le=commands.MAX_EXPOSURE_US, description="Dark time after each exposure.")
+    led: Literal["off", "red", "green", "yellow", "blue", "magenta", "cyan", "white"] = Field(
+        "white", description="LED enable outputs that are on during the exposure."
+    )
+    compression: Literal["auto", "none", "rle", "enhanced_rle"] = Field(
+        "auto", description="Of uploaded images; auto takes the shortest."
+    )
+    settle_ms: float = Field(
+        20.0, ge=0, description="From the sequence running to settled optics: one exposure and dark time."
+    )
+
+    @model_validator(mode="after")
+    def _exposure_fits_the_depth(self) -> Self:
+        shortest = commands.MIN_EXPOSURE_US[self.bit_depth]
+        if self.exposure_us < shortest:
+            raise ValueError(f"exposure_us must be at least {shortest} with bit_depth = {self.bit_depth}")
+        return self
+
+
+class Dlpc900Slm(Slm):
+    """A DMD that shows one pattern in pattern-on-the-fly mode.
+
+    ``display`` stops the sequence, defines the pattern, uploads its image (of a DLP9000 in two halves),
+    starts the sequence and returns when the controller says that it runs. An upload takes from a tenth of a
+    second (blank) to minutes (noise that does not compress): USB HID carries 64 bytes a millisecond at most.
+    """
+
+    Options = Dlpc900Options
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, Dlpc900Options):
+            raise TypeError(f"A DLPC900 takes Dlpc900Options, not {type(options).__name__}.")
+        self.options = options
+        self._link = HidLink(self.name, options.serial_number)
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._board: Board | None = None
+        self._firmware = ""
+        self._tag = ""
+        self._displayed: npt.NDArray[np.uint8] | None = None
+
+    @classmethod
+    def claims(cls, options: DriverOptions) -> tuple[str, ...]:
+        """Claim the controller by its serial number, or the only one."""
+        assert isinstance(options, Dlpc900Options)
+        return (f"DLPC900 {options.serial_number or 'on USB'}",)
+
+    @classmethod
+    def discover(cls) -> tuple[FoundDevice, ...]:
+        """Return the controllers that are connected, told by their USB id."""
+        return tuple(
+            FoundDevice(
+                bus=device.bus,
+                address=device.address,
+                description=device.description,
+                vendor=device.vendor,
+                product=device.product,
+                serial_number=device.serial_number,
+                usb_id=device.usb_id,
+                driver="dlpc900",
+                kind="slm",
+                options={"serial_number": device.serial_number} if device.serial_number else {},
+            )
+            for device in found_controllers()
+        )
+
+    @property
+    def name(self) -> str:
+        """The device as error messages name it."""
+        return "slm (dlpc900)"
+
+    # Opening and closing ---------------------------------------------------------------------------
+    def open(self) -> None:
+        """Connect, check the hardware, and show a blank pattern.
+
+        Raises
+        ------
+        DeviceError
+            When the controller is missing, faulty, or drives a DMD that this driver does not know.
+        """
+        with self._lock:
+            if self.is_open:
+                return
+            self._closing.clear()
+            self._link.open()
+            try:
+                self._board = self._identify()
+                self._check_hardware(self._board)
+                self._link.write(Command.START_STOP, bytes([commands.STOP]))
+                self._link.write(Command.DISPLAY_MODE, bytes([commands.PATTERN_ON_THE_FLY]))
+                self._check_mode()
+                self._show(np.zeros(self._board.shape, np.uint8))
+            except BaseException:
+                self._link.close()
+                raise
+
+    def close(self) -> None:
+        """Stop the sequence, so that nothing is shown, and disconnect; an upload ends with a StoppedError."""
+        self._closing.set()
+        with self._lock:
+            if self._link.is_open:
+                try:
+                    self._link.write(Command.START_STOP, bytes([commands.STOP]))
+                except DeviceError as error:
+                    _log.warning("%s: was not stopped: %s", self.name, error)
+                self._link.close()
+            self._displayed = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the controller is connected."""
+        return self._link.is_open
+
+    def _identify(self) -> Board:
+        version = self._link.read(Command.FIRMWARE_VERSION, 4)
+        self._firmware = f"{version[3]}.{version[2]}.{int.from_bytes(version[:2], 'little')}"
+        hardware = self._link.read(Command.HARDWARE, 1 + 31)
+        self._tag = hardware[1:].split(b"\0")[0].decode("ascii", errors="replace").strip()
+        board = commands.BOARDS.get(hardware[0])
+        if board is None:
+            what = commands.OTHER_BOARDS.get(hardware[0], f"hardware of unknown kind {hardware[0]}")
+            known = ", ".join(board.model for board in commands.BOARDS.values())
+            raise DeviceError(self.name, f"drives a {what}.", f"This driver knows {known}.")
+        return board
+
+    def _check_hardware(self, board: Board) -> None:
+        status = self._link.read(Command.HARDWARE_STATUS, 1)[0]
+        if faults := commands.hardware_faults(status, board.controllers):
+            raise DeviceError(
+                self.name,
+                f"reports: {'; '.join(faults)} (hardware status 0x{status:02X}).",
+                "Switch it off and on again.",
+            )
+
+    def _check_mode(self) -> None:
+        mode = self._link.read(Command.DISPLAY_MODE, 1)[0] & 0x03
+        if mode != commands.PATTERN_ON_THE_FLY:
+            raise DeviceError(
+                self.name,
+                f"stayed in {commands.MODES[mode]} mode instead of pattern on the fly.",
+                "Switch it off and on again.",
+            )
+
+    # Identity and settings -------------------------------------------------------------------------
+    @property
+    def identity(self) -> DeviceIdentity:
+        """What the controller reports."""
+        board = self._require()
+        found = self._link.found
+        return DeviceIdentity(
+            kind="slm",
+            driver="dlpc900",
+            vendor="Texas Instruments",
+            model=f"DLPC900 with {board.model}",
+            serial_number=(found.serial_number if found else "") or "unknown",
+            firmware=f"{self._firmware} {self._tag}".strip(),
+            simulated=False,
+        )
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read mode and status from the controller, with the configured times."""
+        self._require()
+        mode = self._link.read(Command.DISPLAY_MODE, 1)[0] & 0x03
+        return {
+            "shape": self.shape,
+            "pixel_pitch_um": self.pixel_pitch_um,
+            "settle_ms": self.settle_ms,
+            "mode": commands.MODES[mode],
+            "status": commands.main_status_words(self._link.read(Command.MAIN_STATUS, 1)[0]),
+            "bit_depth": self.options.bit_depth,
+            "exposure_us": self.options.exposure_us,
+            "dark_us": self.options.dark_us,
+            "led": self.options.led,
+        }
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the DMD, mirrors."""
+        return self._require().shape
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Mirror pitch, micrometres."""
+        return self._require().pitch_um
+
+    @property
+    def settle_ms(self) -> float:
+        """Time from the sequence running to settled optics."""
+        return self.options.settle_ms
+
+    # Showing ---------------------------------------------------------------------------------------
+    def display(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Upload and show grey levels; running and settled when this returns.
+
+        Raises
+        ------
+        LimitError
+            When shape or dtype do not fit, or with ``bit_depth = 1`` a level is neither 0 nor 255.
+        StoppedError
+            When ``close`` was called meanwhile.
+        DeviceError
+            When the controller refuses or was unplugged; what is shown is then unknown.
+        """
+        board = self._require()
+        if levels.shape != board.shape or levels.dtype != np.uint8:
+            raise LimitError(
+                self.name, f"cannot show {levels.dtype} {levels.shape}.", f"It takes uint8 {board.shape}."
+            )
+        if self.options.bit_depth == 1 and np.any((levels != 0) & (levels != _FULL)):
+            raise LimitError(
+                self.name,
+                "cannot show grey levels with bit_depth = 1.",
+                "Give uint8 levels 0 and 255 only, or set bit_depth = 8.",
+            )
+        self._show(levels.copy())
+        self._closing.wait(self.settle_ms * 1e-3)
+
+    @property
+    def displayed(self) -> npt.NDArray[np.uint8]:
+        """The grey levels shown now, read only."""
+        self._require()
+        if self._displayed is None:
+            raise DeviceError(self.name, "what it shows is unknown after a failed upload.", "Display again.")
+        view = self._displayed.view()
+        view.flags.writeable = False
+        return view
+
+    def _show(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Section 5.3 of the guide: stop, define, configure, load, start."""
+        board = self._require()
+        images = [encode(half, self.options.compression) for half in np.hsplit(levels, board.controllers)]
+        with self._lock:
+            self._require()
+            self._displayed = None
+            self._link.write(Command.START_STOP, bytes([commands.STOP]))
+            self._link.write(Command.PATTERN_DEFINITION, self._definition())
+            self._link.write(Command.PATTERN_CONFIGURATION, _configuration(patterns=1, repeats=0))
+            # The other half first: the primary controller then has its image last, and starts.
+            for half in reversed(range(board.controllers)):
+                self._upload(images[half], *_LOAD[half])
+            self._link.write(Command.START_STOP, bytes([commands.START]))
+            self._wait_until_running()
+            self._displayed = levels
+
+    def _definition(self) -> bytes:
+        """Return pattern 0, from bit 0 of image 0 (section 2.4.4.3.5)."""
+        o = self.options
+        flags = (o.bit_depth - 1) << 1 | commands.LED_BITS[o.led] << 4
+        return (
+            (0).to_bytes(2, "little")
+            + o.exposure_us.to_bytes(3, "little")
+            + bytes([flags])
+            + o.dark_us.to_bytes(3, "little")
+            + bytes([0])  # trigger output 2 stays enabled; no extended bit depth
+            + (0).to_bytes(2, "little")
+        )
+
+    def _upload(self, image: bytes, initialise: Command, load: Command) -> None:
+        self._link.write(initialise, (0).to_bytes(2, "little") + len(image).to_bytes(4, "little"))
+        for start in range(0, len(image), commands.LOAD_BYTES):
+            if self._closing.is_set():
+                raise StoppedError(self.name, "was closed during an upload.")
+            part = image[start : start + commands.LOAD_BYTES]
+            self._link.write(load, len(part).to_bytes(2, "little") + part)
+
+    def _wait_until_running(self) -> None:
+        board = self._require()
+        deadline_s = time.monotonic() + _START_S
+        while not self._link.read(Command.MAIN_STATUS, 1)[0] & commands.SEQUENCER_RUNS:
+            if time.monotonic() > deadline_s:
+                raise DeviceTimeoutError(
+                    self.name, f"did not start its sequence within {_START_S:g} s.", "Display again."
+                )
+            time.sleep(_POLL_S)
+        self._check_hardware(board)
+
+    def _require(self) -> Board:
+        if not self._link.is_open or self._board is None:
+            raise DeviceNotOpenError(self.name)
+        return self._board
+
+
+_LOAD = (
+    (Command.INITIALISE_PRIMARY_IMAGE, Command.LOAD_PRIMARY_IMAGE),
+    (Command.INITIALISE_SECONDARY_IMAGE, Command.LOAD_SECONDARY_IMAGE),
+)
+
+
+def _configuration(*, patterns: int, repeats: int) -> bytes:
+    """Return how many patterns there are, and how many are shown; 0: without end (section 2.4.4.3.3)."""
+    return patterns.to_bytes(2, "little") + repeats.to_bytes(4, "little")
