@@ -1,0 +1,177 @@
+"""The connection to a GRBL controller: commands, status reports, and what it says unasked."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.grbl.protocol import (
+    ALARMS,
+    ERRORS,
+    SOFT_RESET,
+    STATUS,
+    Report,
+    is_banner,
+    line_matcher,
+    modes_matcher,
+    parse_alarm,
+    parse_error,
+    parse_report,
+    report_matcher,
+)
+from drivers.serial_transport import SerialTransport
+
+_log = logging.getLogger(__name__)
+_RESET_S = 2.0
+_OFFSET_REPORTS = 40  # GRBL sends the offset with every thirtieth report at least
+
+
+class GrblLink:
+    """A serial port with a GRBL controller at its other end.
+
+    Parameters
+    ----------
+    port : str
+    device : str
+        The stage as error messages name it.
+    baud_rate : int
+    timeout_s : float
+        For replies.
+    """
+
+    def __init__(self, port: str, device: str, baud_rate: int, timeout_s: float) -> None:
+        self.device = device
+        self._transport = SerialTransport(
+            port,
+            device,
+            baud_rate=baud_rate,
+            probe=(b"$G\n", modes_matcher()),
+            on_message=self._hear,
+            timeout_s=timeout_s,
+        )
+        self._offset: tuple[float, ...] | None = None
+        self._heard = threading.Condition()
+        self._banners = 0
+        self._alarm: int | None = None
+        self._ends: list[bytes] = []
+        self._said: list[str] = []
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open and was not lost."""
+        return self._transport.is_open
+
+    def open(self) -> None:
+        """Open the port."""
+        self._transport.open()
+        self._offset = None
+
+    def close(self) -> None:
+        """Close the port."""
+        self._transport.close()
+
+    # Asking ----------------------------------------------------------------------------------------
+    def report(self) -> Report:
+        """Ask for a status report; positions are machine coordinates whatever ``$10`` says."""
+        for _ in range(_OFFSET_REPORTS):
+            (line,) = self._transport.request(STATUS, report_matcher)
+            report = parse_report(line)
+            assert report is not None, "the matcher lets nothing else through"
+            if report.offset is not None:
+                self._offset = report.offset
+            if report.machine:
+                return report
+            if self._offset is not None and len(self._offset) == len(report.places):
+                places = tuple(w + o for w, o in zip(report.places, self._offset, strict=True))
+                return Report(report.state, places, True, self._offset, report.pins)
+        raise DeviceError(
+            self.device,
+            "reports work positions ($10) without their offset.",
+            "Send $10=1 to the controller: machine positions.",
+        )
+
+    def command(self, line: bytes) -> list[bytes]:
+        """Send a line and return what came before its ``ok``.
+
+        Raises
+        ------
+        DeviceError
+            When the controller refuses it, with the error's meaning.
+        """
+        *lines, end = self._transport.request(line, line_matcher())
+        code = parse_error(end)
+        if code is not None:
+            raise self.refused(line, code)
+        return lines
+
+    def refused(self, line: bytes, code: int) -> DeviceError:
+        """Return the error for ``error:code``."""
+        meaning = ERRORS.get(code, "see the controller's list of error codes")
+        said = f" It said: {' '.join(self._said)}" if self._said else ""
+        return DeviceError(
+            self.device, f"refuses {line.decode(errors='replace').strip()!r}: {meaning} (error {code}).{said}"
+        )
+
+    # Telling ---------------------------------------------------------------------------------------
+    def begin(self, line: bytes) -> None:
+        """Send a line whose ``ok`` comes much later; ``ended`` tells of it."""
+        self.report()  # from here on, whatever ends a command ends this one
+        with self._heard:
+            self._ends.clear()
+            self._said.clear()
+        self._transport.send_now(line)
+
+    def ended(self) -> bytes | None:
+        """Return ``ok`` or ``error:n`` of the line that was begun; None while it goes on."""
+        with self._heard:
+            return self._ends[0] if self._ends else None
+
+    def send_now(self, byte: bytes) -> None:
+        """Send a real-time command, which has no reply."""
+        self._transport.send_now(byte)
+
+    def overtake(self, byte: bytes) -> None:
+        """Cancel what waits for a reply, and send a real-time command."""
+        self._transport.overtake(byte)
+
+    def reset(self) -> None:
+        """Reset the controller, and wait until it has said so."""
+        with self._heard:
+            before = self._banners
+            self._transport.overtake(SOFT_RESET)
+            if not self._heard.wait_for(lambda: self._banners > before, _RESET_S):
+                raise DeviceTimeoutError(
+                    self.device, "does not answer a reset.", "Switch it off and on, then open it again."
+                )
+
+    # What it says unasked --------------------------------------------------------------------------
+    @property
+    def banners(self) -> int:
+        """How often it was reset, by whomever."""
+        return self._banners
+
+    def take_alarm(self) -> int | None:
+        """Return the code of an alarm since the last call."""
+        with self._heard:
+            alarm, self._alarm = self._alarm, None
+            return alarm
+
+    def alarm_words(self, alarm: int) -> str:
+        """Return what an alarm means."""
+        return f"{ALARMS.get(alarm, 'see the list of alarm codes')} (alarm {alarm})"
+
+    def _hear(self, line: bytes) -> None:
+        alarm = parse_alarm(line)
+        with self._heard:
+            if alarm is not None:
+                self._alarm = alarm
+                _log.warning("%s: %s", self.device, self.alarm_words(alarm))
+            elif is_banner(line):
+                self._banners += 1
+                self._offset = None
+            elif line == b"ok" or parse_error(line) is not None:
+                self._ends.append(line)
+            elif line.startswith(b"[MSG:"):
+                self._said = [*self._said[-2:], line.decode(errors="replace")]
+            self._heard.notify_all()
