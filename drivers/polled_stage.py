@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from abc import abstractmethod
@@ -13,18 +14,22 @@ from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, 
 from drivers.stage import Stage, StageAxis
 from drivers.stage_axes import check_target
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True)
 class StageState:
     """What a controller says at one time.
 
     ``position`` is by axis name, in the bench's units; ``moving`` is true while any axis moves or homes;
-    ``homed`` when every axis knows its reference.
+    ``homed`` when every axis knows its reference. ``faults`` are what axes report after which a move cannot
+    have ended well, each in words that name the axis.
     """
 
     position: Mapping[str, float]
     moving: bool
     homed: bool
+    faults: tuple[str, ...] = ()
 
 
 class _Motion:
@@ -48,7 +53,8 @@ class PolledStage(Stage):
     position taken for the target; a lost connection closes the stage, and ``open`` brings it back.
 
     A subclass implements the methods that begin with an underscore. ``_state``, ``_start`` and
-    ``_start_homing`` return at once; ``_state`` raises DeviceError for a fault (alarm, stall, limit switch).
+    ``_start_homing`` return at once. Faults that ``_state`` reports end moves and refuse new ones, but not
+    the next homing; what lasts through it (some controllers keep faults until they move) is no fault then.
     """
 
     poll_s = 0.02
@@ -69,6 +75,7 @@ class PolledStage(Stage):
         self._stops = 0
         self._counting = threading.Lock()
         self._commanded: dict[str, float] = {}
+        self._excused: frozenset[str] = frozenset()
 
     # The protocol ----------------------------------------------------------------------------------
     @abstractmethod
@@ -113,10 +120,13 @@ class PolledStage(Stage):
         try:
             self._identity, self._axes = self._connect()
             self._motion = None
+            self._excused = frozenset()
             state = self._state()
             if state.moving:
                 self._halt()
                 state = self._wait_for_rest()
+            if state.faults:
+                _log.warning("%s: %s", self.name, "; ".join(state.faults))
             self._commanded = dict(state.position)
         except BaseException:
             self._identity = None
@@ -149,7 +159,7 @@ class PolledStage(Stage):
     def settings(self) -> Mapping[str, Setting]:
         """Read position, limits and speeds."""
         state = self._ask()
-        settings: dict[str, Setting] = {"homed": state.homed}
+        settings: dict[str, Setting] = {"homed": state.homed, "faults": state.faults}
         for axis in self._axes:
             settings[f"position_{axis.name}"] = state.position[axis.name]
             settings[f"limits_{axis.name}"] = (axis.lower_limit, axis.upper_limit)
@@ -186,6 +196,7 @@ class PolledStage(Stage):
         self._require()
         stops = self._stops
         with self._commanding:
+            self._excused = frozenset(self._state().faults)
             motion = self._motion = _Motion(homing=True)
             self._launch(motion, self._start_homing, stops)
         self._follow(motion, None)
@@ -196,6 +207,7 @@ class PolledStage(Stage):
         stops = self._stops
         with self._commanding:
             state = self._state()
+            self._raise_faults(state)
             motion = self._motion
             homing = state.moving and motion is not None and motion.homing
             check_target(self.name, self._axes, target, state.homed and not homing)
@@ -237,6 +249,13 @@ class PolledStage(Stage):
         self._require()
         return self._state()
 
+    def _raise_faults(self, state: StageState) -> None:
+        """Raise the faults that are not excused; an excused one that has gone is excused no more."""
+        self._excused &= frozenset(state.faults)
+        faults = [fault for fault in state.faults if fault not in self._excused]
+        if faults:
+            raise DeviceError(self.name, f"{'; '.join(faults)}.", "Remove the cause, then home again.")
+
     def _launch(self, motion: _Motion, start: Callable[[], None], stops: int) -> None:
         """Begin a motion unless STOP was called since ``stops`` was read; whichever came first, it ends."""
         if self._stops == stops:
@@ -261,6 +280,7 @@ class PolledStage(Stage):
                 break
             try:
                 state = self._ask()
+                self._raise_faults(state)
             except DeviceError as error:
                 if motion.interrupted.is_set():
                     continue

@@ -131,8 +131,6 @@ class ZaberStage(PolledStage):
         self._chain.open()
         devices = sorted({axis.device for axis in self.options.axes.values()})
         self._without_checksums = [device for device in devices if not self._chain.have_checksums(device)]
-        for name, axis in self.options.axes.items():
-            self._clear_old_faults(name, axis)
         axes = tuple(self._axis(name, axis) for name, axis in self.options.axes.items())
         return self._identify(devices), axes
 
@@ -185,7 +183,7 @@ class ZaberStage(PolledStage):
             raise
 
     def _state(self) -> StageState:
-        position, moving, homed = {}, False, True
+        position, moving, homed, faults = {}, False, True, []
         for name, axis in self.options.axes.items():
             reply = self._chain.ask("get pos", axis.device, axis.axis)
             steps = _integer(reply.data)
@@ -195,33 +193,14 @@ class ZaberStage(PolledStage):
             moving |= reply.busy
             flags = self._flags(axis) if reply.flag != "--" else frozenset[str]()
             homed &= not flags & NO_REFERENCE
-            self._raise_faults(name, axis, flags)
-        return StageState(position, moving, homed and not self._lost_reference)
+            if serious := sorted(flags & FAULTS.keys()):
+                self._lost_reference.add(name)
+                faults.append(f"{name} ({self._maps[name].label}): {', '.join(map(flag_words, serious))}")
+        return StageState(position, moving, homed and not self._lost_reference, tuple(faults))
 
     def _flags(self, axis: ZaberAxis) -> frozenset[str]:
         """Return all flags of an axis; a reply carries only the most serious."""
         return frozenset(self._chain.ask("warnings", axis.device, axis.axis).data.split()[1:])
-
-    def _clear_old_faults(self, name: str, axis: ZaberAxis) -> None:
-        """Clear what happened before the stage was opened; what still lasts comes back by itself."""
-        old = sorted(self._flags(axis) & FAULTS.keys())
-        if old:
-            _log.warning("%s: %s had: %s", self.name, name, ", ".join(map(flag_words, old)))
-            self._lost_reference.add(name)
-            self._chain.ask("warnings clear", axis.device, axis.axis)
-
-    def _raise_faults(self, name: str, axis: ZaberAxis, flags: frozenset[str]) -> None:
-        faults = sorted(flags & FAULTS.keys())
-        if not faults:
-            return
-        # Said once: flags of what is over are cleared, those of what lasts come back.
-        self._chain.ask("warnings clear", axis.device, axis.axis)
-        self._lost_reference.add(name)
-        raise DeviceError(
-            self.name,
-            f"{name} ({self._maps[name].label}): {', '.join(map(flag_words, faults))}.",
-            "Remove the cause, then home again.",
-        )
 
     def _start(self, target: Mapping[str, float]) -> None:
         for name, place in target.items():
@@ -231,6 +210,7 @@ class ZaberStage(PolledStage):
 
     def _start_homing(self) -> None:
         for axis in self.options.axes.values():
+            self._chain.ask("warnings clear", axis.device, axis.axis)
             self._chain.ask("home", axis.device, axis.axis)
         self._lost_reference.clear()
 

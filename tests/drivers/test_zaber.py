@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.zaber.protocol import Message, command, flag_words, parse
 from drivers.zaber.stage import ZaberAxis, ZaberOptions, ZaberStage
 from tests.drivers.contract_stage import StageContract
@@ -154,24 +154,26 @@ def test_a_stall_ends_the_move_in_words_and_wants_homing(stage: ZaberStage, chai
         stage.wait(10.0)
     stage.stop()
     assert not chain.devices[2].axes[0].moving
-    with pytest.raises(LimitError, match="not homed"):
+    with pytest.raises(DeviceError, match="stalled and stopped"):
         stage.move_to({"x_um": 0.0})
+    assert not stage.is_homed
     stage.home()
     stage.move_to({"x_um": 10.0})
 
 
-def test_a_stall_of_before_is_cleared_on_opening(chain: ZaberChain, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stall_of_before_is_said_on_opening(chain: ZaberChain, caplog: pytest.LogCaptureFixture) -> None:
     chain.devices[1].axes[0].homed = True
     chain.stall(1, 1)
     with caplog.at_level(logging.WARNING), stage_on(chain) as stage:
         assert not stage.is_homed
-    assert "x_um had: stalled and stopped (FS)" in caplog.text
+        assert stage.settings()["faults"] == ("x_um (device 1 axis 1): stalled and stopped (FS)",)
+    assert "stalled and stopped (FS)" in caplog.text
 
 
-def test_a_fault_that_lasts_is_said_again(chain: ZaberChain) -> None:
+def test_a_fault_that_lasts_refuses_moves(stage: ZaberStage, chain: ZaberChain) -> None:
     chain.devices[2].flags[0].add("FD")
-    with pytest.raises(DeviceError, match=r"z_um \(device 2 axis 1\): driver disabled by a fault"):
-        stage_on(chain).open()
+    with pytest.raises(DeviceError, match=r"z_um \(device 2 axis 1\): driver disabled by a fault \(FD\)"):
+        stage.move_to({"x_um": 10.0})
 
 
 def late(seconds: float) -> Callable[[bytes], list[Answer]]:
