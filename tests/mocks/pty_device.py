@@ -15,15 +15,27 @@ Answer = bytes | float | None
 """Bytes to send, seconds to wait first, or nothing."""
 
 
+def lines(received: bytes) -> tuple[list[bytes], bytes]:
+    """Return the lines received so far, and the rest."""
+    *whole, rest = received.split(b"\n")
+    return whole, rest
+
+
 class PtyDevice:
-    """Reads lines and sends what ``answer(line)`` returns, in order.
+    """Reads messages, by default lines, and sends what ``answer(message)`` returns, in order.
 
     ``link`` is a path that can be unplugged and plugged in again, as a USB adapter's name in /dev.
     """
 
-    def __init__(self, folder: Path, answer: Callable[[bytes], list[Answer]]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        answer: Callable[[bytes], list[Answer]],
+        split: Callable[[bytes], tuple[list[bytes], bytes]] = lines,
+    ) -> None:
         self.link = folder / "ttyTEST"
         self.answer = answer
+        self.split = split
         self.received: list[bytes] = []
         self._stopping = threading.Event()
         self.plug_in()
@@ -59,13 +71,13 @@ class PtyDevice:
             except OSError:  # nobody has the other end open
                 time.sleep(0.01)
                 continue
-            *lines, rest = rest.split(b"\n")
-            for line in lines:
-                self.received.append(line)
-                self._reply(master, line)
+            messages, rest = self.split(rest)
+            for message in messages:
+                self.received.append(message)
+                self._reply(master, message)
 
-    def _reply(self, master: int, line: bytes) -> None:
-        for item in self.answer(line):
+    def _reply(self, master: int, message: bytes) -> None:
+        for item in self.answer(message):
             if isinstance(item, float):
                 time.sleep(item)
             elif item is not None:

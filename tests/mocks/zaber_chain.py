@@ -51,8 +51,8 @@ class ZaberDevice:
 
 def two_devices() -> dict[int, ZaberDevice]:
     """A device of two axes and one of one axis, numbered 1 and 2."""
-    xy = ZaberDevice([MovingAxis(0, 12_000, 40_000, 700), MovingAxis(0, 12_000, 40_000, 500)])
-    z = ZaberDevice([MovingAxis(-3_000, 9_000, 30_000, 100)], {"deviceid": "50081", "system.serial": "777"})
+    xy = ZaberDevice([MovingAxis(0, 12_000, 60_000, 700), MovingAxis(0, 12_000, 60_000, 500)])
+    z = ZaberDevice([MovingAxis(-3_000, 9_000, 60_000, 100)], {"deviceid": "50081", "system.serial": "777"})
     return {1: xy, 2: z}
 
 

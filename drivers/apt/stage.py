@@ -1,0 +1,170 @@
+"""A stage of Thorlabs actuators: one axis a channel, on one or several controllers."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+from drivers.apt.actuators import CONTROLLERS, SETTLING_COUNTS
+from drivers.apt.drives import Drive, InertiaChannel, InertiaUnit, Motor
+from drivers.apt.link import Link
+from drivers.apt.options import AptAxis, AptOptions
+from drivers.buses import serial_ports
+from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
+from drivers.discovery import FoundDevice
+from drivers.errors import DeviceError
+from drivers.polled_stage import PolledStage, StageState
+from drivers.stage import StageAxis
+
+_log = logging.getLogger(__name__)
+_THORLABS_USB = "0403:faf0"
+_SPEED_TOLERANCE = 0.01
+
+
+class AptStage(PolledStage):
+    """Axes on KDC101, TDC001, BSC20x or KIM101 controllers, moved together.
+
+    Each controller has a port of its own. Limits are the actuator's travel, narrowed by ``bench.toml``: these
+    controllers do not know it. An axis of a KIM101 has no reference; homing calls the present place zero, and
+    of its channels one moves at a time.
+    """
+
+    Options = AptOptions
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        if not isinstance(options, AptOptions):
+            raise TypeError(f"A Thorlabs stage takes AptOptions, not {type(options).__name__}.")
+        super().__init__()
+        self.options = options
+        self._maps = {name: axis.axis_map(name) for name, axis in options.axes.items()}
+        controllers = {axis.port: axis.controller for axis in options.axes.values()}
+        self._links = {port: Link(port, self.name, name) for port, name in controllers.items()}
+        units = {port: InertiaUnit(link) for port, link in self._links.items()}
+        self._drives: dict[str, Drive] = {
+            name: InertiaChannel(units[axis.port], axis.channel)
+            if CONTROLLERS[axis.controller].family == "inertia"
+            else Motor(self._links[axis.port], axis.channel)
+            for name, axis in options.axes.items()
+        }
+
+    @classmethod
+    def claims(cls, options: DriverOptions) -> tuple[str, ...]:
+        """Claim the ports of all controllers."""
+        assert isinstance(options, AptOptions)
+        return tuple(sorted({port_claim(axis.port) for axis in options.axes.values()}))
+
+    @classmethod
+    def discover(cls) -> tuple[FoundDevice, ...]:
+        """Return the serial ports whose USB device is one of the controllers, by vendor and serial number."""
+        found = []
+        for port in serial_ports():
+            name = next(
+                (n for n, c in CONTROLLERS.items() if port.serial_number.startswith(c.serial_prefix)), None
+            )
+            if port.usb_id != _THORLABS_USB or name is None:
+                continue
+            # No controller knows its actuator: checking bench.toml will ask for it.
+            axes = {"x_um": {"port": port.address, "controller": name, "actuator": "WHICH?"}}
+            found.append(
+                FoundDevice(
+                    bus="serial",
+                    address=port.address,
+                    description=f"Thorlabs {name}",
+                    vendor="Thorlabs",
+                    product=name,
+                    serial_number=port.serial_number,
+                    usb_id=port.usb_id,
+                    driver="apt",
+                    kind="stage",
+                    options={"axes": axes},
+                )
+            )
+        return tuple(found)
+
+    @property
+    def name(self) -> str:
+        """The stage as error messages name it."""
+        ports = dict.fromkeys(axis.port for axis in self.options.axes.values())
+        return f"stage (apt, {', '.join(ports)})"
+
+    # The protocol ----------------------------------------------------------------------------------
+    @property
+    def _is_connected(self) -> bool:
+        return all(link.is_open for link in self._links.values())
+
+    def _connect(self) -> tuple[DeviceIdentity, tuple[StageAxis, ...]]:
+        for link in self._links.values():
+            link.open()
+        infos = [link.info() for link in self._links.values()]
+        axes = tuple(self._axis(name, axis) for name, axis in self.options.axes.items())
+        identity = DeviceIdentity(
+            kind="stage",
+            driver="apt",
+            vendor="Thorlabs",
+            model=" + ".join(info.model for info in infos),
+            serial_number=" + ".join(info.serial_number for info in infos),
+            firmware=" + ".join(info.firmware for info in infos),
+            simulated=False,
+        )
+        return identity, axes
+
+    def _disconnect(self) -> None:
+        for link in self._links.values():
+            link.close()
+
+    def _axis(self, name: str, axis: AptAxis) -> StageAxis:
+        drive, scale = self._drives[name], abs(self._maps[name].scale)
+        drive.prepare()
+        if axis.speed_per_s is not None:
+            drive.set_speed(axis.speed_per_s / scale)
+        speed = drive.speed()
+        if axis.speed_per_s and not math.isclose(speed * scale, axis.speed_per_s, rel_tol=_SPEED_TOLERANCE):
+            _log.warning(
+                "%s: %s moves at %g a second, not at the %g of bench.toml: its controller decided",
+                self.name, name, speed * scale, axis.speed_per_s,
+            )  # fmt: skip
+        if not speed > 0:
+            raise DeviceError(
+                self.name,
+                f"{name} ({self._maps[name].label}) has no speed set.",
+                f"Set speed_per_s in [stage.axes.{name}].",
+            )
+        return self._maps[name].stage_axis(
+            self.name, axis, ends=axis.ends(name), speed_per_s=speed, resolution=1.0
+        )
+
+    def _state(self) -> StageState:
+        position, moving, homed, faults = {}, False, True, []
+        for name, drive in self._drives.items():
+            state = drive.state()
+            position[name] = self._maps[name].to_bench(state.counts)
+            moving |= state.moving
+            homed &= state.homed
+            if state.faults:
+                faults.append(f"{name} ({self._maps[name].label}): {', '.join(state.faults)}")
+        for link in self._links.values():
+            link.raise_complaint()
+        return StageState(position, moving, homed, tuple(faults))
+
+    def _start(self, target: Mapping[str, float]) -> None:
+        for name, place in target.items():
+            self._drives[name].move(math.floor(self._maps[name].to_controller(place) + 0.5))
+
+    def _start_homing(self) -> None:
+        for drive in self._drives.values():
+            drive.home()
+
+    def _halt(self) -> None:
+        errors = []
+        for drive in self._drives.values():
+            try:
+                drive.stop()
+            except DeviceError as error:  # the others must be stopped all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _tolerance(self, axis: StageAxis) -> float:
+        family = CONTROLLERS[self.options.axes[axis.name].controller].family
+        return (SETTLING_COUNTS[family] + 0.01) * axis.resolution
