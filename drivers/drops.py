@@ -27,7 +27,8 @@ class FrameNumberCounter:
         if previous is None:
             return 0
         step = number - previous
-        if step <= 0 and self._modulus is not None:
+        # A step back by less than half the range is no wrap: a number given twice, or frames out of order.
+        if self._modulus is not None and step < -self._modulus // 2:
             step += self._modulus - self._first
         if step <= 0:
             raise ValueError(f"frame number {number} came after {previous}")

@@ -30,6 +30,10 @@ class DeviceNotOpenError(DeviceError):
         super().__init__(device, "is not open.", "Open it first (Bench does so on entering its context).")
 
 
+class DeviceLostError(DeviceError):
+    """A device that was open is gone: unplugged, switched off, taken by another program."""
+
+
 class DeviceTimeoutError(DeviceError):
     """A device did not answer or finish in the time it was given."""
 

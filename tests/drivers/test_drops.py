@@ -22,6 +22,14 @@ def test_frame_numbers_that_wrap() -> None:
     assert FrameNumberCounter(modulus=2**16, first_after_wrap=1).lost(1) == 0
 
 
+def test_a_number_given_twice_or_out_of_order_is_no_wrap() -> None:
+    for number, then in ((100, 100), (100, 99), (40_000, 10_000)):
+        counter = FrameNumberCounter(modulus=2**16)
+        counter.lost(number)
+        with pytest.raises(ValueError, match="came after"):
+            counter.lost(then)
+
+
 def test_timestamps_count_whole_periods_despite_jitter() -> None:
     counter = TimestampCounter(10e6)
     times = [0, 10_400_000, 19_000_000, 49_000_000, 59_500_000]

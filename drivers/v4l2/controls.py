@@ -1,0 +1,158 @@
+"""The controls of a video device: found with their ranges and menus, set, and read back."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.errors import DeviceError, LimitError
+from drivers.v4l2 import api
+from drivers.v4l2.device import VideoDevice
+
+_log = logging.getLogger(__name__)
+_SETTABLE = (
+    api.CTRL_TYPE_INTEGER,
+    api.CTRL_TYPE_BOOLEAN,
+    api.CTRL_TYPE_MENU,
+    api.CTRL_TYPE_BITMASK,
+    api.CTRL_TYPE_INTEGER_MENU,
+    api.CTRL_TYPE_BUTTON,
+)
+_MOST = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """One control.
+
+    Attributes
+    ----------
+    id : int
+        The kernel's number of it.
+    name : str
+        Its name as ``v4l2-ctl`` writes it: ``"exposure_time_absolute"``.
+    type : int
+        The kernel's ``V4L2_CTRL_TYPE``.
+    minimum, maximum, step, default : int
+    menu : mapping
+        Value to text, for menus.
+    flags : int
+    """
+
+    id: int
+    name: str
+    type: int
+    minimum: int
+    maximum: int
+    step: int
+    default: int
+    menu: Mapping[int, str]
+    flags: int
+
+    @property
+    def readable(self) -> bool:
+        """Whether it has a value to read."""
+        return self.type != api.CTRL_TYPE_BUTTON and not self.flags & api.CTRL_FLAG_WRITE_ONLY
+
+    @property
+    def range_text(self) -> str:
+        """What it takes, in words."""
+        if self.menu:
+            return ", ".join(f"{value} ({text})" for value, text in self.menu.items())
+        if self.type == api.CTRL_TYPE_BUTTON:
+            return "any value"
+        steps = f" in steps of {self.step}" if self.step > 1 else ""
+        return f"{self.minimum} to {self.maximum}{steps}"
+
+
+class Controls:
+    """All controls of an open device that hold a number; read anew at each opening."""
+
+    def __init__(self, device: VideoDevice) -> None:
+        self._device = device
+        self.by_name: dict[str, Control] = {}
+        self.by_id: dict[int, Control] = {}
+        last = 0
+        for _ in range(_MOST):
+            found = api.QueryControl(id=last | api.CTRL_FLAG_NEXT_CTRL)
+            if device.attempt(api.QUERYCTRL, found) or found.id <= last:
+                break
+            last = found.id
+            if found.type in _SETTABLE and not found.flags & api.CTRL_FLAG_DISABLED:
+                control = self._control(found)
+                self.by_id[control.id] = control
+                self.by_name.setdefault(control.name, control)
+
+    def get(self, control: Control) -> int:
+        """Read a control."""
+        value = api.ControlValue(id=control.id)
+        self._device.call(api.G_CTRL, value, f"read its control {control.name}")
+        return value.value
+
+    def set(self, control: Control, value: int) -> int:
+        """Set a control; returns what it reads afterwards (a button: ``value``).
+
+        Raises
+        ------
+        LimitError
+            Outside the control's range, or nothing on its menu.
+        DeviceError
+            When the driver refuses (read only, or inactive while an automatic is on).
+        """
+        inside = value in control.menu if control.menu else control.minimum <= value <= control.maximum
+        if not inside and control.type != api.CTRL_TYPE_BUTTON:
+            raise LimitError(
+                self._device.name,
+                f"control {control.name} does not take {value}.",
+                f"It takes {control.range_text}.",
+            )
+        number = self._device.attempt(api.S_CTRL, api.ControlValue(id=control.id, value=value))
+        if number == errno.ERANGE:
+            raise LimitError(
+                self._device.name, f"refuses {value} for {control.name}.", f"It takes {control.range_text}."
+            )
+        if number in (errno.EACCES, errno.EBUSY):
+            why = "is read only" if number == errno.EACCES else "cannot be set now"
+            raise DeviceError(
+                self._device.name,
+                f"control {control.name} {why}.",
+                "Is an automatic on, or a sequence running?",
+            )
+        if number:
+            self._device.call(
+                api.S_CTRL, api.ControlValue(id=control.id, value=value), f"set its control {control.name}"
+            )
+        if not control.readable:
+            return value
+        now = self.get(control)
+        if now != value:
+            _log.warning("%s: control %s is %d, asked for %d", self._device.name, control.name, now, value)
+        return now
+
+    def text(self, control: Control) -> str | int:
+        """Return a control's value as settings list it: menus with their text."""
+        value = self.get(control)
+        return f"{value} ({control.menu[value]})" if value in control.menu else value
+
+    def _control(self, found: api.QueryControl) -> Control:
+        menu: dict[int, str] = {}
+        if found.type in (api.CTRL_TYPE_MENU, api.CTRL_TYPE_INTEGER_MENU):
+            for index in range(max(found.minimum, 0), min(found.maximum, _MOST) + 1):
+                item = api.QueryMenu(id=found.id, index=index)
+                if self._device.attempt(api.QUERYMENU, item) == 0:  # menus may have gaps
+                    number = found.type == api.CTRL_TYPE_INTEGER_MENU
+                    menu[index] = str(item.u.value) if number else item.u.name.decode(errors="replace")
+        return Control(
+            id=found.id,
+            name=re.sub(r"[^a-z0-9]+", "_", found.name.decode(errors="replace").lower()).strip("_"),
+            type=found.type,
+            minimum=found.minimum,
+            maximum=found.maximum,
+            step=found.step,
+            default=found.default_value,
+            menu=menu,
+            flags=found.flags,
+        )

@@ -1,0 +1,238 @@
+"""What a V4L2 camera's images are: format, size, region, frame rate, trigger."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from drivers.camera import Roi, TriggerMode
+from drivers.device import DriverOptions, Setting, SharedPart
+from drivers.errors import LimitError
+from drivers.v4l2.formats import V4l2Format
+from drivers.v4l2.geometry import (
+    crop,
+    frame_period_s,
+    full_region,
+    largest_shape,
+    offered_formats,
+    set_format,
+)
+from drivers.v4l2.settings import V4l2Settings
+
+_log = logging.getLogger(__name__)
+
+
+class V4l2ImageSettings(V4l2Settings):
+    """The part of a V4L2 camera that decides what its images are."""
+
+    def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
+        super().__init__(options, shared)
+        self._trigger_mode: TriggerMode = "free_run"
+
+    def _open_images(self) -> None:
+        self._trigger_mode = "free_run"
+        self._formats = offered_formats(self._device)
+        self._apply_format(self._formats[0])
+
+    def settings(self) -> Mapping[str, Setting]:
+        """Read all settings, the driver's controls under ``control.NAME``."""
+        self._require()
+        made: dict[str, Setting] = {
+            "exposure_ms": self._read_exposure(),
+            "gain": self._read_gain(),
+            "black_level": self.black_level,
+            "pixel_format": self.pixel_format,
+            "significant_bits": self.significant_bits,
+            "roi": self.roi.as_tuple(),
+            "roi_cut_by": "camera" if self._cropped else "driver",
+            "binning": 1,
+            "trigger_mode": self._trigger_mode,
+            "sensor_shape": self.sensor_shape,
+            "pixel_pitch_um": self.pixel_pitch_um,
+            "frames_per_s": 1 / self._period if self._period else None,
+        }
+        for control in self._controls.by_name.values():
+            if control.readable:
+                made[f"control.{control.name}"] = self._controls.text(control)
+        return made
+
+    # What the sensor is ----------------------------------------------------------------------------
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """``(height, width)`` of the images of the present format without a region."""
+        self._require()
+        return self._whole.height, self._whole.width
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Pitch of the pixels, as configured."""
+        return self.options.pixel_pitch_um
+
+    @property
+    def pixel_formats(self) -> tuple[str, ...]:
+        """Formats that can be decoded, the best for measuring first."""
+        self._require()
+        return tuple(offered.name for offered in self._formats)
+
+    @property
+    def _period_s(self) -> float:
+        return self._period or 0.0
+
+    # Format and region -----------------------------------------------------------------------------
+    @property
+    def pixel_format(self) -> str:
+        """Pixel format by its GenICam name, with the kernel's code where the image is computed from it."""
+        self._require()
+        return self._format.name
+
+    @property
+    def significant_bits(self) -> int:
+        """Bits of the pixel format."""
+        self._require()
+        return self._format.pixels.bits
+
+    @property
+    def frame_shape(self) -> tuple[int, ...]:
+        """Shape of the frames, with 3 channels for colours."""
+        channels = self._format.pixels.channels
+        return (*self.image_shape, channels) if channels > 1 else self.image_shape
+
+    def set_pixel_format(self, pixel_format: str) -> str:
+        """Set the pixel format; a region that the new format's images still have stays."""
+        self._require_idle("pixel format")
+        wanted = next((offered for offered in self._formats if offered.name == pixel_format), None)
+        if wanted is None:
+            raise LimitError(
+                self.name,
+                f"has no pixel format {pixel_format!r}.",
+                f"It offers {', '.join(self.pixel_formats)}.",
+            )
+        roi, whole = self._roi, self._whole
+        self._apply_format(wanted)
+        if roi != whole and self._whole == whole:
+            self.set_roi(roi)
+        self._remember("pixel_format", lambda: self.set_pixel_format(pixel_format))
+        return self._format.name
+
+    def _apply_format(self, wanted: V4l2Format) -> None:
+        """Set a format at the configured or largest size, the whole of it, at the configured frame rate."""
+        region = full_region(self._device)
+        shape = self.options.size or largest_shape(self._device, wanted.code)
+        if region is not None and self.options.size is None:
+            shape = region.height, region.width
+        made = set_format(self._device, wanted, shape)
+        if self.options.size is not None and (made.height, made.width) != self.options.size:
+            _log.warning(
+                "%s: images are %d x %d, asked for %d x %d",
+                self.name,
+                made.height,
+                made.width,
+                *self.options.size,
+            )
+        self._format, self._made = wanted, made
+        self._can_crop = region is not None and (region.height, region.width) == (made.height, made.width)
+        self._origin = (region.top, region.left) if self._can_crop and region is not None else (0, 0)
+        self._roi = self._whole = Roi(0, 0, made.height, made.width)
+        self._cropped = False
+        self._period = frame_period_s(self._device, self.options.frames_per_s)
+        if self._exposure_control is None:
+            self._exposure_ms = self._read_exposure()
+
+    @property
+    def roi(self) -> Roi:
+        """Region of interest."""
+        self._require()
+        return self._roi
+
+    def set_roi(self, roi: Roi | None) -> Roi:
+        """Set the region, by the camera where it can, else cut out of each image by this driver.
+
+        Borders of a Bayer mosaic fall on even pixels, inside the region asked for.
+        """
+        self._require_idle("region of interest")
+        whole = self._whole
+        asked = whole if roi is None else roi
+        wanted = whole if roi is None else _inner(asked, 2 if self._format.pixels.bayer else 1)
+        if not _contains(whole, asked) or wanted.height < 1 or wanted.width < 1:
+            raise LimitError(
+                self.name,
+                f"cannot read the region (top, left, height, width) = {asked.as_tuple()}.",
+                f"Its images have {whole.height} x {whole.width} pixels.",
+            )
+        if self._cropped:
+            self._apply_format(self._format)
+        self._roi = self._crop(wanted) or wanted
+        self._remember("roi", lambda: self.set_roi(roi))
+        return self._roi
+
+    def _crop(self, wanted: Roi) -> Roi | None:
+        """Have the camera cut the region; None, with everything as before, when it cannot."""
+        if not self._can_crop or wanted == self._whole:
+            return None
+        # Drivers move regions to their steps, even out of what was asked: then once more on multiples of 8.
+        for region in (wanted, _inner(wanted, 8)):
+            made = crop(self._device, region, self._origin) if region.height and region.width else None
+            if made is None or not _contains(wanted, made):
+                continue
+            if self._format.pixels.bayer and (made.top % 2 or made.left % 2):
+                continue
+            image = set_format(self._device, self._format, (made.height, made.width))
+            if (image.height, image.width) == (made.height, made.width):
+                self._made, self._cropped = image, True
+                self._period = frame_period_s(self._device, self.options.frames_per_s)
+                return made
+        self._apply_format(self._format)
+        return None
+
+    # Binning and trigger ---------------------------------------------------------------------------
+    @property
+    def binning(self) -> int:
+        """Always 1: V4L2 has no binning, sizes other than the largest may be binned by the camera."""
+        return 1
+
+    @property
+    def binnings(self) -> tuple[int, ...]:
+        """Only 1."""
+        return (1,)
+
+    def set_binning(self, binning: int) -> int:
+        """Take 1, refuse everything else."""
+        self._require_idle("binning")
+        if binning != 1:
+            raise LimitError(self.name, f"has no binning {binning}.", "V4L2 has none: choose a smaller size.")
+        return 1
+
+    @property
+    def trigger_mode(self) -> TriggerMode:
+        """What starts an exposure."""
+        return self._trigger_mode
+
+    def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
+        """Choose free running or software; V4L2 knows no trigger line.
+
+        In mode ``"software"`` the camera runs on, and the driver hands out, for each trigger, the first frame
+        whose exposure began after it: up to a frame's time late.
+        """
+        self._require_idle("trigger mode")
+        if mode not in ("free_run", "software"):
+            raise LimitError(self.name, f"has no trigger mode {mode!r}.", "It offers free_run, software.")
+        self._trigger_mode = mode
+        self._remember("trigger_mode", lambda: self.set_trigger_mode(mode))
+        return mode
+
+
+def _inner(region: Roi, step: int) -> Roi:
+    """Return the largest region inside another with all borders on multiples of ``step``."""
+    top, left = (-(-start // step) * step for start in (region.top, region.left))
+    bottom = (region.top + region.height) // step * step
+    right = (region.left + region.width) // step * step
+    return Roi(top, left, max(0, bottom - top), max(0, right - left))
+
+
+def _contains(outer: Roi, inner: Roi) -> bool:
+    return (
+        inner.top >= outer.top
+        and inner.left >= outer.left
+        and inner.top + inner.height <= outer.top + outer.height
+        and inner.left + inner.width <= outer.left + outer.width
+    )
