@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -67,6 +67,7 @@ def images(draw: st.DrawFn) -> tuple[Packing, np.ndarray, int]:
     return packing, draw(arrays(dtype, shape, elements=st.integers(0, top))), draw(st.integers(0, 5))
 
 
+@settings(deadline=None)
 @given(images())
 def test_lines_with_padding_unpack_to_what_was_packed(case: tuple[Packing, np.ndarray, int]) -> None:
     packing, image, padding = case
@@ -85,6 +86,7 @@ def test_lines_with_padding_unpack_to_what_was_packed(case: tuple[Packing, np.nd
     assert not unpack(np.frombuffer(data[: needed - 1], np.uint8), packing, out, pitch)
 
 
+@settings(deadline=None)
 @given(images())
 def test_lines_without_padding_unpack_to_what_was_packed(case: tuple[Packing, np.ndarray, int]) -> None:
     packing, image, tail = case
@@ -96,6 +98,7 @@ def test_lines_without_padding_unpack_to_what_was_packed(case: tuple[Packing, np
     assert not unpack(np.frombuffer(data[:-1], np.uint8), packing, out)
 
 
+@settings(deadline=None)
 @given(st.sampled_from(sorted(PACKINGS)), st.binary(max_size=64), st.integers(1, 6), st.integers(1, 6))
 def test_arbitrary_bytes_are_unpacked_or_refused(
     packing: Packing, data: bytes, height: int, width: int
