@@ -7,7 +7,7 @@ from recon.operators.convolution3d import Convolution3D
 from recon.operators.erasures import Erasures
 from recon.operators.local_convolution import FieldOfPsfs, local_convolution
 from recon.operators.low_rank import PrincipalPsfs, low_rank, principal_psfs
-from recon.operators.spatially_varying import Group, SpatiallyVarying
+from recon.operators.spatially_varying import Part, SpatiallyVarying, Strip
 from recon.operators.two_part import two_part_field
 
 __all__ = [
@@ -16,11 +16,12 @@ __all__ = [
     "Convolution3D",
     "Erasures",
     "FieldOfPsfs",
-    "Group",
     "LinearOperator",
     "PadCropConvolution",
+    "Part",
     "PrincipalPsfs",
     "SpatiallyVarying",
+    "Strip",
     "estimate_norm",
     "local_convolution",
     "low_rank",

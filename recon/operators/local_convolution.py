@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +10,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.operators.base import Array
 from recon.operators.interpolation import grid_axes, hats, interpolation_weights
-from recon.operators.spatially_varying import Group, SpatiallyVarying, Window
+from recon.operators.spatially_varying import Part, SpatiallyVarying, Strip, Window
 
 
 class FieldOfPsfs:
@@ -47,7 +46,8 @@ def local_convolution(
     """Build the local convolution model of one or many depths.
 
     Where the calibration points form a grid, work is cut along its cells: inside a cell four PSFs are
-    weighted bilinearly, and share the cell's transform grid. Scattered points get a window each.
+    weighted bilinearly, and share the cell's transform grid; cells above one another share their transforms
+    along rows. Scattered points get a window each.
 
     Parameters
     ----------
@@ -72,29 +72,17 @@ def local_convolution(
     channels = max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels
     field_shape, centre = field_of(sensor_shape, (shape[0], shape[1]))
     rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
-    groups: list[Group] = []
+    strips: list[Strip] = []
     for z, field in enumerate(fields):
         if field.psfs.shape[2:] != shape:
             raise InputError(f"Depth {z} has PSFs of {field.psfs.shape[2:]}, depth 0 of {shape}.")
-        psfs, corner = cut_to_support(field.psfs)
-        cells = _cells(field.points, rows, columns)
-        for window, members, weights in cells:
-            cut = _shrink(window, None if support is None else support[z])
-            if cut is None:
-                continue
-            inner = tuple(
-                slice(c.start - w.start, c.stop - w.start) for c, w in zip(cut, window, strict=True)
-            )
-            mask = weights[:, inner[0], inner[1]]
-            if support is not None:
-                mask = mask * support[z][cut]
-            used = mask.any(axis=(1, 2))
-            if used.any():
-                groups.append(
-                    Group(z, cut, mask[used], psfs[members[used]].swapaxes(0, 1), _origin(cut, corner, shape))
-                )
+        needed = np.ones(field_shape, bool) if support is None else support[z]
+        if needed.any():
+            psfs, corner = cut_to_support(field.psfs)
+            offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
+            strips += _strips(z, psfs, field.points, rows, columns, needed, offset)
     return SpatiallyVarying(
-        groups, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
+        strips, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
     )
 
 
@@ -118,58 +106,72 @@ def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[i
     return psfs[..., windows[0], windows[1]], (windows[0].start, windows[1].start)
 
 
-def _origin(window: Window, corner: tuple[int, int], psf_shape: tuple[int, ...]) -> tuple[int, int]:
-    """Sensor position of a full convolution's first pixel: field pixel 0 with PSF pixel 0 is ``1 - psf``."""
-    row, column = (w.start + c - (n - 1) for w, c, n in zip(window, corner, psf_shape, strict=True))
-    return row, column
+Mask = npt.NDArray[np.bool_]
 
 
-def _shrink(window: Window, support: npt.NDArray[np.bool_] | None) -> Window | None:
-    if support is None:
-        return window
-    inside = support[window]
-    if not inside.any():
-        return None
+def bounding_window(mask: Mask) -> Window:
+    """Return the smallest window that holds all of a mask, which must not be empty."""
     cut = []
-    for axis, w in enumerate(window):
-        used = np.flatnonzero(inside.any(axis=1 - axis))
-        cut.append(slice(w.start + int(used[0]), w.start + int(used[-1]) + 1))
+    for axis in (1, 0):
+        used = np.flatnonzero(mask.any(axis=axis))
+        cut.append(slice(int(used[0]), int(used[-1]) + 1))
     return cut[0], cut[1]
 
 
-Cell = tuple[Window, npt.NDArray[np.intp], npt.NDArray[np.float64]]
+def within(mask: Mask, window: Window) -> Window | None:
+    """Return the smallest window that holds a mask's part in ``window``; None where it has none."""
+    inside = mask[window]
+    if not inside.any():
+        return None
+    rows, columns = (
+        slice(w.start + c.start, w.start + c.stop)
+        for w, c in zip(window, bounding_window(inside), strict=True)
+    )
+    return rows, columns
 
 
-def _cells(points: Array, rows: Array, columns: Array) -> Iterator[Cell]:
-    """Yield windows of the field with the PSFs that matter in them and their weights there."""
+def _strips(
+    z: int, psfs: Array, points: Array, rows: Array, columns: Array, needed: Mask, offset: tuple[int, int]
+) -> Iterator[Strip]:
+    """Cut a depth into strips, and leave out what the support does not need."""
     axes = grid_axes(points)
     if axes is None:
-        yield from _scattered_cells(points, rows, columns)
+        yield from _scattered_strips(z, psfs, points, rows, columns, needed, offset)
         return
     grid_y, grid_x, order = axes
-    weights_y, weights_x = hats(grid_y, rows), hats(grid_x, columns)
-    for window_y, members_y in _intervals(grid_y, rows):
-        for window_x, members_x in _intervals(grid_x, columns):
-            index = np.array([order[a * len(grid_x) + b] for a in members_y for b in members_x])
-            product = np.einsum(
-                "ya,xb->abyx", weights_y[window_y][:, members_y], weights_x[window_x][:, members_x]
-            )
-            yield (window_y, window_x), index, product.reshape(len(index), *product.shape[2:])
+    hats_y, hats_x = hats(grid_y, rows), hats(grid_x, columns)
+    for j in range(len(grid_x)):
+        column = within(needed, (slice(0, len(rows)), _span(hats_x[:, j])))
+        if column is None:
+            continue
+        parts = []
+        for i in range(len(grid_y)):
+            cut = within(needed, (_span(hats_y[:, i]), column[1]))
+            if cut is not None:
+                psf = psfs[order[i * len(grid_x) + j]][:, None]
+                parts.append(Part(cut[0], np.zeros(1, int), hats_y[cut[0], i][None], psf))
+        mask = hats_x[column[1], j][None, None]
+        inside = needed[column]
+        yield Strip(z, column, mask if inside.all() else mask * inside, tuple(parts), offset)
 
 
-def _intervals(nodes: Array, positions: Array) -> Iterator[tuple[slice, list[int]]]:
-    """Cut positions at the inner nodes; beyond the outer nodes only the outermost one counts."""
-    edges = np.searchsorted(positions, nodes)
-    bounds = [0, *(int(e) for e in edges), len(positions)]
-    for k, (start, stop) in enumerate(pairwise(bounds)):
-        if stop > start:
-            yield slice(start, stop), [n for n in (k - 1, k) if 0 <= n < len(nodes)]
+def _span(weights: Array) -> slice:
+    """Return where weights along an axis are not zero."""
+    used = np.flatnonzero(weights)
+    return slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
 
 
-def _scattered_cells(points: Array, rows: Array, columns: Array) -> Iterator[Cell]:
-    weights = interpolation_weights(points, np.eye(len(points)), rows, columns)
+def _scattered_strips(
+    z: int, psfs: Array, points: Array, rows: Array, columns: Array, needed: Mask, offset: tuple[int, int]
+) -> Iterator[Strip]:
+    weights = interpolation_weights(points, np.eye(len(points)), rows, columns) * needed
     for i, weight in enumerate(weights):
-        used_y, used_x = np.flatnonzero(weight.any(axis=1)), np.flatnonzero(weight.any(axis=0))
-        if used_y.size:
-            window = slice(int(used_y[0]), int(used_y[-1]) + 1), slice(int(used_x[0]), int(used_x[-1]) + 1)
-            yield window, np.array([i]), weight[window][None]
+        if weight.any():
+            window = bounding_window(weight != 0)
+            yield Strip(z, window, weight[window][None], (whole(window, psfs[i : i + 1]),), offset)
+
+
+def whole(window: Window, psfs: Array) -> Part:
+    """Return the part that all of a window makes, each PSF with a mask of its own."""
+    n, height = len(psfs), window[0].stop - window[0].start
+    return Part(window[0], np.arange(n), np.ones((n, height)), psfs.swapaxes(0, 1))

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.operators.base import Array
 from recon.operators.interpolation import interpolation_weights
-from recon.operators.local_convolution import FieldOfPsfs, cut_to_support, field_of
-from recon.operators.spatially_varying import Group, SpatiallyVarying
+from recon.operators.local_convolution import FieldOfPsfs, bounding_window, cut_to_support, field_of, whole
+from recon.operators.spatially_varying import SpatiallyVarying, Strip
 
 
 @dataclass(frozen=True)
@@ -86,18 +86,19 @@ def low_rank(
     channels = max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels
     field_shape, centre = field_of(sensor_shape, (shape[0], shape[1]))
     rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
-    whole = slice(0, field_shape[0]), slice(0, field_shape[1])
-    groups = []
+    strips = []
     for z, field in enumerate(fields):
-        if support is not None and not support[z].any():
+        needed = np.ones(field_shape, bool) if support is None else support[z]
+        if not needed.any():
             continue
+        window = bounding_window(needed)
         principal = principal_psfs(field, rank=rank, error=error)
         psfs, corner = cut_to_support(principal.components)
-        weights = interpolation_weights(field.points, principal.scores, rows, columns)
-        if support is not None:
-            weights = weights * support[z]
-        origin = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
-        groups.append(Group(z, whole, weights, psfs.swapaxes(0, 1), origin))
+        weights = interpolation_weights(field.points, principal.scores, rows[window[0]], columns[window[1]])
+        if not needed[window].all():
+            weights = weights * needed[window]
+        offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
+        strips.append(Strip(z, window, weights, (whole(window, psfs),), offset))
     return SpatiallyVarying(
-        groups, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
+        strips, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
     )
