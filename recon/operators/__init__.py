@@ -7,7 +7,8 @@ from recon.operators.convolution3d import Convolution3D
 from recon.operators.erasures import Erasures
 from recon.operators.local_convolution import FieldOfPsfs, local_convolution
 from recon.operators.low_rank import PrincipalPsfs, low_rank, principal_psfs
-from recon.operators.spatially_varying import Part, SpatiallyVarying, Strip
+from recon.operators.spatially_varying import SpatiallyVarying
+from recon.operators.strips import Part, Strip
 from recon.operators.two_part import two_part_field
 
 __all__ = [

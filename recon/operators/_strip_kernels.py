@@ -4,6 +4,12 @@ A pass along rows takes a run of rows, a pass along columns a tile of neighbouri
 spectra: small enough for its core's own cache through all of the pass. Half spectra are kept tile by tile,
 (n_tiles, rows, tile width), because columns a whole spectrum's row apart cost a page each. Every output
 element is computed whole by one worker, in a fixed order.
+
+``parts`` has a row a part: its first row in the window, its FFT length, its first row and number of rows on
+the sensor with the first row of the transform that falls there between them, its first and last member.
+``members`` has a row a PSF: the mask it sees the object through, where its weights along the rows begin in
+``weights`` and how many there are, and where its transfer function begins in ``H`` (n_tiles, rows, tile
+width).
 """
 
 from __future__ import annotations
@@ -30,6 +36,30 @@ def _add_masked_row(x: Any, mask: Any, out: Any) -> None:
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
+def _add_row(x: Any, out: Any) -> None:
+    for i in range(out.shape[0]):
+        out[i] += x[i]
+
+
+@njit(nogil=True, cache=True)
+def _to_tiles(rows: Any, tiles: Any, first: int) -> None:
+    """Copy rows of half spectra to where their tiles' rows, from ``first``, lie."""
+    width = tiles.shape[2]
+    for t in range(tiles.shape[0]):
+        part = rows[:, t * width : (t + 1) * width]
+        tiles[t, first : first + len(rows), : part.shape[1]] = part
+
+
+@njit(nogil=True, cache=True)
+def _from_tiles(tiles: Any, first: int, rows: Any) -> None:
+    """Copy rows back."""
+    width = tiles.shape[2]
+    for t in range(tiles.shape[0]):
+        part = rows[:, t * width : (t + 1) * width]
+        part[:] = tiles[t, first : first + len(rows), : part.shape[1]]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
 def _weighted_tile(R: Any, w: Any, out: Any) -> None:
     """``out`` rows ``w R``, and zeros below."""
     n = w.shape[0]
@@ -37,6 +67,13 @@ def _weighted_tile(R: Any, w: Any, out: Any) -> None:
         for i in range(out.shape[1]):
             out[y, i] = w[y] * R[y, i]
     out[n:] = 0
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _product_tile(H: Any, X: Any, out: Any) -> None:
+    for y in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[y, i] = H[y, i] * X[y, i]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -68,69 +105,67 @@ def _add_weighted_tile(X: Any, w: Any, out: Any) -> None:
 
 
 @njit(nogil=True, cache=True)
-def _to_tiles(rows: Any, tiles: Any, first: int) -> None:
-    """Copy rows of half spectra to where their tiles' rows, from ``first``, lie."""
-    width = tiles.shape[2]
-    for t in range(tiles.shape[0]):
-        part = rows[:, t * width : (t + 1) * width]
-        tiles[t, first : first + len(rows), : part.shape[1]] = part
-
-
-@njit(nogil=True, cache=True)
-def _from_tiles(tiles: Any, first: int, rows: Any) -> None:
-    """Copy rows back."""
-    width = tiles.shape[2]
-    for t in range(tiles.shape[0]):
-        part = rows[:, t * width : (t + 1) * width]
-        part[:] = tiles[t, first : first + len(rows), : part.shape[1]]
-
-
-@njit(nogil=True, cache=True)
 def object_rows(
     x: Any, row: int, left: int, mask: Any, first: int, last: int, plane: Any, spectrum: Any, R: Any
 ) -> None:
     """Transform rows ``first`` to ``last`` of the window at (``row``, ``left``), seen through ``mask``."""
     width = mask.shape[1]
-    n = last - first
     plane[:, width:] = 0
-    for y in range(n):
-        m = mask[first + y] if mask.shape[0] > 1 else mask[0]
-        _masked_row(x[row + first + y, left : left + width], m, plane[y])
-    r2c(plane[:n], spectrum[:n], SECOND_AXIS, True, 1.0, 1)
-    _to_tiles(spectrum[:n], R, first)
+    for a in range(first, last, plane.shape[0]):
+        n = min(plane.shape[0], last - a)
+        for y in range(n):
+            m = mask[a + y] if mask.shape[0] > 1 else mask[0]
+            _masked_row(x[row + a + y, left : left + width], m, plane[y])
+        r2c(plane[:n], spectrum[:n], SECOND_AXIS, True, 1.0, 1)
+        _to_tiles(spectrum[:n], R, a)
 
 
 @njit(nogil=True, cache=True)
 def columns_forward(
-    R: Any, tile: int, first: int, members: Any, weights: Any, H: Any, total: Any, scratch: Any, S: Any,
-    sensor: int, local: int, count: int,
+    R: Any, parts: Any, members: Any, weights: Any, H: Any, first: int, last: int, total: Any, scratch: Any,
+    S: Any,
 ) -> None:  # fmt: skip
-    """Convolve one part of a strip along columns: ``S += F^-1 sum_m H_m F (w_m R_m)``, cropped to its rows."""
-    total[:] = 0
-    for m in range(members.shape[0]):
-        w = weights[m]
-        _weighted_tile(R[members[m], tile, first : first + w.shape[0]], w, scratch)
-        c2c(scratch, scratch, FIRST_AXIS, True, 1.0, 1)
-        _add_product_tile(H[m], scratch, total)
-    c2c(total, total, FIRST_AXIS, False, 1.0 / total.shape[0], 1)
-    _add_tile(total[local : local + count], S[sensor : sensor + count])
+    """Convolve a strip along columns, in tiles ``first`` to ``last``.
+
+    For each part ``S += F^-1 sum_m H_m F (w_m R_m)``, cropped to its rows on the sensor.
+    """
+    for t in range(first, last):
+        S[t] = 0
+        for part in parts:
+            at, length, sensor, local, count, m0, m1 = part
+            x, sums = scratch[:length], total[:length]
+            for m in range(m0, m1):
+                mask, w0, n, h0 = members[m]
+                _weighted_tile(R[mask, t, at : at + n], weights[w0 : w0 + n], x)
+                c2c(x, x, FIRST_AXIS, True, 1.0, 1)
+                if m == m0:
+                    _product_tile(H[t, h0 : h0 + length], x, sums)
+                else:
+                    _add_product_tile(H[t, h0 : h0 + length], x, sums)
+            c2c(sums, sums, FIRST_AXIS, False, 1.0 / length, 1)
+            _add_tile(sums[local : local + count], S[t, sensor : sensor + count])
 
 
 @njit(nogil=True, cache=True)
 def columns_adjoint(
-    S: Any, sensor: int, local: int, count: int, H: Any, members: Any, weights: Any, data: Any, scratch: Any,
-    R: Any, tile: int, first: int,
+    S: Any, parts: Any, members: Any, weights: Any, H: Any, first: int, last: int, data: Any, scratch: Any,
+    R: Any,
 ) -> None:  # fmt: skip
-    """``R_m += w_m F^-1 conj(H_m) F S`` for one part of a strip."""
-    data[:local] = 0
-    data[local : local + count] = S[sensor : sensor + count]
-    data[local + count :] = 0
-    c2c(data, data, FIRST_AXIS, True, 1.0, 1)
-    for m in range(members.shape[0]):
-        w = weights[m]
-        _conjugate_product_tile(H[m], data, scratch)
-        c2c(scratch, scratch, FIRST_AXIS, False, 1.0 / data.shape[0], 1)
-        _add_weighted_tile(scratch, w, R[members[m], tile, first : first + w.shape[0]])
+    """Correlate along columns: ``R_m = w_m F^-1 conj(H_m) F S``, summed over the parts."""
+    for t in range(first, last):
+        R[:, t] = 0
+        for part in parts:
+            at, length, sensor, local, count, m0, m1 = part
+            d, x = data[:length], scratch[:length]
+            d[:local] = 0
+            d[local : local + count] = S[t, sensor : sensor + count]
+            d[local + count :] = 0
+            c2c(d, d, FIRST_AXIS, True, 1.0, 1)
+            for m in range(m0, m1):
+                mask, w0, n, h0 = members[m]
+                _conjugate_product_tile(H[t, h0 : h0 + length], d, x)
+                c2c(x, x, FIRST_AXIS, False, 1.0 / length, 1)
+                _add_weighted_tile(x, weights[w0 : w0 + n], R[mask, t, at : at + n])
 
 
 @njit(nogil=True, cache=True)
@@ -139,11 +174,12 @@ def sensor_rows(
     width: int,
 ) -> None:  # fmt: skip
     """Add rows ``first`` to ``last`` of what a strip casts on the sensor; row y is row ``y - shift`` of S."""
-    n = last - first
-    _from_tiles(S, first - shift, spectrum[:n])
-    c2r(spectrum[:n], plane[:n], SECOND_AXIS, False, 1.0 / plane.shape[1], 1)
-    for y in range(n):
-        out[first + y, left : left + width] += plane[y, local : local + width]
+    for a in range(first, last, plane.shape[0]):
+        n = min(plane.shape[0], last - a)
+        _from_tiles(S, a - shift, spectrum[:n])
+        c2r(spectrum[:n], plane[:n], SECOND_AXIS, False, 1.0 / plane.shape[1], 1)
+        for y in range(n):
+            _add_row(plane[y, local : local + width], out[a + y, left : left + width])
 
 
 @njit(nogil=True, cache=True)
@@ -152,13 +188,13 @@ def data_rows(
     spectrum: Any, S: Any,
 ) -> None:  # fmt: skip
     """Transform rows ``first`` to ``last`` of the data that a strip can reach."""
-    n = last - first
-    plane[:, :local] = 0
-    plane[:, local + width :] = 0
-    for y in range(n):
-        plane[y, local : local + width] = data[first + y, left : left + width]
-    r2c(plane[:n], spectrum[:n], SECOND_AXIS, True, 1.0, 1)
-    _to_tiles(spectrum[:n], S, first - shift)
+    plane[:] = 0
+    for a in range(first, last, plane.shape[0]):
+        n = min(plane.shape[0], last - a)
+        for y in range(n):
+            plane[y, local : local + width] = data[a + y, left : left + width]
+        r2c(plane[:n], spectrum[:n], SECOND_AXIS, True, 1.0, 1)
+        _to_tiles(spectrum[:n], S, a - shift)
 
 
 @njit(nogil=True, cache=True)
@@ -167,9 +203,10 @@ def object_rows_back(
 ) -> None:
     """Add rows ``first`` to ``last`` of a strip's window, seen through ``mask``, to the object."""
     width = mask.shape[1]
-    n = last - first
-    _from_tiles(R, first, spectrum[:n])
-    c2r(spectrum[:n], plane[:n], SECOND_AXIS, False, 1.0 / plane.shape[1], 1)
-    for y in range(n):
-        m = mask[first + y] if mask.shape[0] > 1 else mask[0]
-        _add_masked_row(plane[y], m, out[row + first + y, left : left + width])
+    for a in range(first, last, plane.shape[0]):
+        n = min(plane.shape[0], last - a)
+        _from_tiles(R, a, spectrum[:n])
+        c2r(spectrum[:n], plane[:n], SECOND_AXIS, False, 1.0 / plane.shape[1], 1)
+        for y in range(n):
+            m = mask[a + y] if mask.shape[0] > 1 else mask[0]
+            _add_masked_row(plane[y], m, out[row + a + y, left : left + width])

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.operators.base import Array
 from recon.operators.interpolation import grid_axes, hats, interpolation_weights
-from recon.operators.spatially_varying import Part, SpatiallyVarying, Strip, Window
+from recon.operators.spatially_varying import SpatiallyVarying
+from recon.operators.strips import Part, Strip, Window
 
 
 class FieldOfPsfs:

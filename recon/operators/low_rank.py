@@ -11,7 +11,8 @@ from recon.errors import InputError
 from recon.operators.base import Array
 from recon.operators.interpolation import interpolation_weights
 from recon.operators.local_convolution import FieldOfPsfs, bounding_window, cut_to_support, field_of, whole
-from recon.operators.spatially_varying import SpatiallyVarying, Strip
+from recon.operators.spatially_varying import SpatiallyVarying
+from recon.operators.strips import Strip
 
 
 @dataclass(frozen=True)
