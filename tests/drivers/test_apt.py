@@ -27,7 +27,7 @@ from drivers.apt.protocol import (
 from drivers.apt.stage import AptStage
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from tests.drivers.contract_stage import StageContract
+from drivers.testing.stage import StageContract
 from tests.mocks.apt_controller import STATUS_WITHOUT_SIGN_OF_LIFE, AptController
 from tests.mocks.moving_axis import MovingAxis
 from tests.mocks.pty_device import Answer

@@ -22,7 +22,7 @@ from drivers.dlpc900.images import encode
 from drivers.dlpc900.packets import parse_reply, reports
 from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from tests.drivers.contract_slm import SlmContract
+from drivers.testing.slm import SlmContract
 from tests.mocks.dlpc900_device import BadImageError, Dlpc900Emulator, FakeHidraw, decode_image
 
 SMALL = (24, 40)

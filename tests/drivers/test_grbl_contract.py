@@ -9,7 +9,7 @@ import pytest
 
 from drivers.device import Device
 from drivers.grbl.stage import GrblOptions, GrblStage
-from tests.drivers.contract_stage import StageContract
+from drivers.testing.stage import StageContract
 from tests.mocks.grbl_controller import GrblController
 
 SIX = {name: {} for name in ("x_um", "y_um", "z_um", "roll_mrad", "pitch_mrad", "yaw_mrad")}

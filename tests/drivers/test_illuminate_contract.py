@@ -9,7 +9,7 @@ import pytest
 
 from drivers.device import Device
 from drivers.illuminate.led_array import IlluminateLedArray, IlluminateOptions
-from tests.drivers.contract_led_array import LedArrayContract
+from drivers.testing.led_array import LedArrayContract
 from tests.mocks.illuminate_emulator import IlluminateEmulator
 
 

@@ -12,7 +12,7 @@ from drivers.device import DeviceIdentity, DriverOptions
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.polled_stage import PolledStage, StageState
 from drivers.stage import StageAxis
-from tests.drivers.contract_stage import StageContract
+from drivers.testing.stage import StageContract
 
 SPEED_PER_S = 400.0
 AXES = (StageAxis("x_um", -50.0, 50.0, SPEED_PER_S, 0.5), StageAxis("y_um", -50.0, 50.0, SPEED_PER_S, 0.5))

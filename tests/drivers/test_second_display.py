@@ -24,7 +24,7 @@ from drivers.second_display.options import SecondDisplayOptions
 from drivers.second_display.outputs import Output, choose
 from drivers.second_display.process import WindowProcess
 from drivers.second_display.slm import SecondDisplaySlm
-from tests.drivers.contract_slm import SlmContract
+from drivers.testing.slm import SlmContract
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,10 +13,10 @@ from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage_axes import AXIS_NAMES
-from tests.drivers.contract_camera import CameraContract
-from tests.drivers.contract_led_array import LedArrayContract
-from tests.drivers.contract_slm import SlmContract
-from tests.drivers.contract_stage import StageContract
+from drivers.testing.camera import CameraContract
+from drivers.testing.led_array import LedArrayContract
+from drivers.testing.slm import SlmContract
+from drivers.testing.stage import StageContract
 
 
 def tiny_world(time_scale: float = 0.0) -> SimulatedWorld:

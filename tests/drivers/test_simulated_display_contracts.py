@@ -7,11 +7,11 @@ from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.display import DisplayCamera, DisplaySlm, DisplayStage, DisplayStageOptions
 from drivers.simulated.display_world import DisplayOptions, DisplayWorld
 from drivers.simulated.slm import SlmOptions
+from drivers.testing.camera import CameraContract
+from drivers.testing.slm import SlmContract
+from drivers.testing.stage import StageContract
 from instrument.bench import Bench
 from instrument.config_file import display_text, parse_config
-from tests.drivers.contract_camera import CameraContract
-from tests.drivers.contract_slm import SlmContract
-from tests.drivers.contract_stage import StageContract
 
 
 class TestDisplayCamera(CameraContract):

@@ -22,10 +22,10 @@ from drivers.errors import (
     LimitError,
     StoppedError,
 )
+from drivers.testing.camera import CameraContract
 from drivers.v4l2 import api
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.formats import FORMATS, decode
-from tests.drivers.contract_camera import CameraContract
 from tests.mocks import v4l2_kernel as fake
 from tests.mocks.v4l2_kernel import FakeKernel
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.testing.stage import StageContract
 from drivers.zaber.protocol import Message, command, flag_words, parse
 from drivers.zaber.stage import ZaberAxis, ZaberOptions, ZaberStage
-from tests.drivers.contract_stage import StageContract
 from tests.mocks.pty_device import Answer
 from tests.mocks.zaber_chain import ZaberChain
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from drivers.registry import KINDS, driver_names, load_driver
 from instrument.cli import COMMANDS
 from instrument.config import DEVICE_TABLES, PLAIN_TABLES
 from instrument.config_file import default_text, parse_config
@@ -55,3 +56,22 @@ def test_every_commented_key_of_the_default_configuration_is_understood() -> Non
 def test_the_overview_of_commands_is_complete() -> None:
     page = (DOCS / "command-line.md").read_text("utf-8")
     assert [name for name in COMMANDS if f"diffuserbench {name}" not in page] == []
+
+
+def test_every_driver_of_this_project_is_in_the_table_of_drivers() -> None:
+    page = (DOCS / "drivers.md").read_text("utf-8")
+    own = [
+        f"{name}.{kind}"
+        for kind in KINDS
+        for name in driver_names(kind)
+        if load_driver(kind, name).__module__.startswith("drivers.")
+    ]
+    assert len(own) > 10
+    missing = [driver for driver in own if f"`{driver}`" not in page]
+    assert missing == [], "add a row to docs/reference/drivers.md"
+
+
+def test_every_link_of_the_table_of_drivers_leads_somewhere() -> None:
+    page = (DOCS / "drivers.md").read_text("utf-8")
+    links = re.findall(r"\]\(([^)#]+)\)", page)
+    assert [link for link in links if not (DOCS / link).exists()] == []
