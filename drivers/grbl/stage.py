@@ -227,6 +227,7 @@ class GrblStage(PolledStage):
         except DeviceTimeoutError:
             self._raise_what_happened()
             raise
+        self._raise_what_happened()  # whatever was said before this report
         if len(report.places) != len(self._zero):
             raise DeviceError(
                 self.name, f"reports {len(report.places)} axes, not {len(self._zero)}.", "Open it again."

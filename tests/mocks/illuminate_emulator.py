@@ -178,6 +178,7 @@ class IlluminateEmulator(PtyDevice):
             "trs": self._set_trigger,
         }
         if self.old:
+            commands["setMaxCurrent"] = lambda _: b""
             commands["ssz"] = lambda rest: self._append([()] * int(rest[0]))
         if name not in commands:
             raise RefusedError(16)
