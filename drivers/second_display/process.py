@@ -157,19 +157,19 @@ class WindowProcess:
         if text:
             _log.debug("%s: its window's process said:\n%s", self._device, text)
         last = text.splitlines()[-1] if text else f"status {self._process.returncode}"
-        if "display" in text or "platform plugin" in text:
-            return DeviceError(
-                self._device,
-                f"Qt cannot open a window here: {text.splitlines()[0]}",
-                "Start it from a desktop session (DISPLAY or WAYLAND_DISPLAY must be set); under X11 "
-                "install libxcb-cursor0, libxcb-icccm4 and libxcb-keysyms1.",
-            )
         if "cannot open shared object file" in text:
             return DeviceError(
                 self._device,
                 f"Qt cannot be loaded: {last}.",
                 "Debian: sudo apt install libegl1 libgl1 libdbus-1-3 libfontconfig1 libglib2.0-0 "
                 "libxkbcommon0.",
+            )
+        if "platform plugin" in text or "connect to display" in text:
+            return DeviceError(
+                self._device,
+                f"Qt cannot open a window here ({text.splitlines()[0].strip()}).",
+                "Start it from a desktop session (DISPLAY or WAYLAND_DISPLAY must be set); under X11 "
+                "install libxcb-cursor0, libxcb-icccm4 and libxcb-keysyms1.",
             )
         return DeviceError(
             self._device, f"its window's process ended: {last}.", "Close the SLM and open it again."

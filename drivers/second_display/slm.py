@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -64,7 +64,7 @@ class SecondDisplaySlm(Slm):
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
         """Return the desktop's outputs; those that are not the primary one with the lines to use them."""
-        window = _window("displays", lambda _error: None)
+        window = _window("display", lambda _error: None)
         try:
             found = window.outputs()
         finally:
@@ -197,17 +197,17 @@ class SecondDisplaySlm(Slm):
             window.close()
 
 
-def _window(device: str, on_lost: object) -> _Window:
+def _window(device: str, on_lost: Callable[[DeviceError], None]) -> _Window:
     """Return where a window is drawn: by the Qt program in this process, or in a process of its own."""
     if importlib.util.find_spec("PySide6") is None:
         raise DeviceError(device, "needs PySide6 (Qt), which is not installed.", _INSTALL)
     if _qt_program_runs():
         from drivers.second_display.in_process import WindowHere
 
-        return WindowHere(device, on_lost)  # type: ignore[arg-type]
+        return WindowHere(device, on_lost)
     from drivers.second_display.process import WindowProcess
 
-    return WindowProcess(device, on_lost)  # type: ignore[arg-type]
+    return WindowProcess(device, on_lost)
 
 
 def _qt_program_runs() -> bool:

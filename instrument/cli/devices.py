@@ -49,7 +49,9 @@ def _words(listing: Listing) -> str:
     others = sorted({device.bus for device in listing.found} - set(BUSES))
     for bus in (*BUSES, *others):
         found = [device for device in listing.found if device.bus == bus]
-        lines.append(f"{bus}:" if found else f"{bus}: none found")
+        unseen = any(sentence.startswith(f"{bus}:") for sentence in listing.unavailable)
+        nothing = "could not be looked at, see below" if unseen else "none found"
+        lines.append(f"{bus}:" if found else f"{bus}: {nothing}")
         for device in found:
             lines.append(f"  {_line(device)}")
             lines += [f"      {row}" for row in device.bench_lines().splitlines()]

@@ -19,7 +19,8 @@ from drivers.claim import Claim
 from drivers.device import Device, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
-from drivers.listing import list_devices
+from drivers.listing import Listing, list_devices
+from instrument.cli.devices import _words
 
 
 def usb_device(**changes: Any) -> SimpleNamespace:
@@ -208,6 +209,20 @@ def test_a_table_of_options_is_written_inline() -> None:
     options = {"axes": {"z_um": {"scale": 0.5}}}
     found = FoundDevice("HID", "there", "thing", driver="x", kind="slm", options=options)
     assert tomllib.loads(found.bench_lines())["slm"]["axes"] == options["axes"]
+
+
+def test_a_note_is_a_comment_after_the_lines() -> None:
+    found = FoundDevice("display", "DP-1", "SLM", driver="x", kind="slm", note="pitch_um must be added")
+    assert found.bench_lines() == '[slm]\ndriver = "x"\n# pitch_um must be added'
+
+
+def test_the_command_tells_nothing_found_from_not_looked_at(capsys: pytest.CaptureFixture[str]) -> None:
+    found = FoundDevice("serial", "/dev/ttyUSB0", "FT232R", usb_id="0403:6001", serial_number="A5")
+    print(_words(Listing((found,), ("USB: libusb is not installed. Install it.",))))
+    shown = capsys.readouterr().out
+    assert "USB: could not be looked at, see below\nHID: none found\n" in shown
+    assert "serial:\n  /dev/ttyUSB0  FT232R, 0403:6001, serial A5\n" in shown
+    assert shown.endswith("Could not be looked at:\n  USB: libusb is not installed. Install it.\n")
 
 
 def test_without_a_driver_there_are_no_lines() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from drivers.second_display.slm import SecondDisplaySlm
 from drivers.testing.slm import SlmContract
 
 ROOT = Path(__file__).parents[2]
+pytest.importorskip("PySide6.QtGui", reason="Qt cannot be loaded here", exc_type=ImportError)
 
 
 def screens(tmp_path: Path) -> str:
@@ -151,6 +153,18 @@ def test_without_qt_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPat
         SecondDisplaySlm(options()).open()
 
 
+def test_without_qts_libraries_the_error_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "PySide6").mkdir()
+    (tmp_path / "PySide6" / "__init__.py").write_text("")
+    text = "libEGL.so.1: cannot open shared object file: No such file or directory"
+    (tmp_path / "PySide6" / "QtCore.py").write_text(f"raise ImportError({text!r})")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DeviceError, match=r"Qt cannot be loaded: .*libEGL.*apt install libegl1"):
+        SecondDisplaySlm(options()).open()
+
+
 def test_waits_for_the_output_then_for_the_liquid_crystal() -> None:
     with SecondDisplaySlm(options(settle_ms=30.0, refreshes_to_wait=3)) as slm:
         assert slm.settle_ms == pytest.approx(3e3 / slm.settings()["refresh_hz"] + 30.0)
@@ -257,6 +271,44 @@ def test_nothing_is_left_behind(slm: SecondDisplaySlm) -> None:
         slm.open()
     assert process.poll() is not None
     assert open_files() == before
+
+
+DESKTOP = """\
+import sys
+from PySide6.QtCore import ClassInfo, QCoreApplication, QObject, Slot
+from PySide6.QtDBus import QDBusConnection, QDBusServiceWatcher
+@ClassInfo({"D-Bus Interface": "org.freedesktop.ScreenSaver"})
+class Desktop(QObject):
+    @Slot(str, str, result="uint")
+    def Inhibit(self, program, reason):
+        print(f"{program}: {reason}", flush=True)
+        return 1
+app, desktop, bus = QCoreApplication([]), Desktop(), QDBusConnection.sessionBus()
+bus.registerObject("/org/freedesktop/ScreenSaver", desktop, QDBusConnection.RegisterOption.ExportAllSlots)
+assert bus.registerService("org.freedesktop.ScreenSaver")
+print("ready", flush=True)
+app.exec()
+"""
+
+
+@pytest.mark.skipif(shutil.which("dbus-run-session") is None, reason="dbus-run-session is not installed")
+def test_the_desktop_is_asked_to_keep_its_screen_saver_off() -> None:
+    code = (
+        "import subprocess, sys\n"
+        f"program = [sys.executable, '-c', {DESKTOP!r}]\n"
+        "desktop = subprocess.Popen(program, stdout=subprocess.PIPE, text=True)\n"
+        "assert desktop.stdout.readline() == 'ready\\n'\n"
+        "from tests.drivers.test_second_display import SecondDisplaySlm, options\n"
+        "with SecondDisplaySlm(options()) as slm:\n"
+        "    assert slm.settings()['screen_saver_kept_off_by'] == 'the desktop'\n"
+        "    print(desktop.stdout.readline())\n"
+        "desktop.kill(); desktop.communicate()\n"
+    )
+    done = subprocess.run(
+        ["dbus-run-session", "--", sys.executable, "-c", code],
+        capture_output=True, text=True, cwd=ROOT, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.stdout.strip() == "diffuserbench: a pattern is shown on the SLM", done.stderr
 
 
 # In a Qt program ---------------------------------------------------------------------------------------

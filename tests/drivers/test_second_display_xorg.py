@@ -25,6 +25,7 @@ from drivers.second_display import slm as slm_module
 from drivers.second_display.options import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
 
+pytest.importorskip("PySide6.QtGui", reason="Qt cannot be loaded here", exc_type=ImportError)
 XORG = shutil.which("Xorg") or "/usr/lib/xorg/Xorg"
 DUMMY = Path("/usr/lib/xorg/modules/drivers/dummy_drv.so")
 pytestmark = pytest.mark.skipif(
