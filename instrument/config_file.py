@@ -202,7 +202,7 @@ class _Reader:
             # Strict JSON mode: no text taken for a number, yet arrays may be tuples and text may be enums.
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
-            self.mistakes.add_all(error, model, path, tuple(known))
+            self.mistakes.add_all(error, model, path, tuple(known), table)
             return None
 
 

@@ -45,9 +45,14 @@ class Mistakes:
         self.problems.append(ConfigProblem(self._lines.get(path), where, text))
 
     def add_all(
-        self, error: ValidationError, model: type[BaseModel], table: tuple[str, ...], known: Sequence[str]
+        self,
+        error: ValidationError,
+        model: type[BaseModel],
+        table: tuple[str, ...],
+        known: Sequence[str],
+        content: Mapping[str, Any],
     ) -> None:
-        """Note every mistake that a model found in a table.
+        """Note every mistake that a model found in a table with this content.
 
         ``known`` are the keys allowed at the table's top level, which may be more than the model's own.
         """
@@ -56,8 +61,8 @@ class Mistakes:
             name = _spell((*path[1:], *_unplaced(table, detail, path)))
             where = f"[{table[0]}] {name}".rstrip()
             names_in_loc = [i for i, step in enumerate(detail["loc"]) if isinstance(step, str)]
-            inner = _model_at(model, detail["loc"][: max(names_in_loc, default=0)])
-            names = tuple(known) if inner is model else tuple(inner.model_fields) if inner else ()
+            inner = _models_at(model, detail["loc"][: max(names_in_loc, default=0)], content)
+            names = tuple(known) if inner == (model,) else tuple(key for m in inner for key in m.model_fields)
             self.add(path, where, _sentence(detail, names, inner))
 
     def _place(self, table: tuple[str, ...], loc: Iterable[str | int]) -> KeyPath:
@@ -84,14 +89,14 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f" Did you mean {close!r}?" if close else ""
 
 
-def _sentence(detail: ErrorDetails, names: Sequence[str], model: type[BaseModel] | None) -> str:
+def _sentence(detail: ErrorDetails, names: Sequence[str], models: Sequence[type[BaseModel]]) -> str:
     kind, key, value = detail["type"], detail["loc"][-1] if detail["loc"] else "", detail["input"]
     if kind == "extra_forbidden":
         hint = _other_unit(str(key), value, names) or nearest(str(key), names)
         return f"there is no such key.{hint}" + (f" Keys here: {', '.join(names)}." if names else "")
     if kind == "missing":
         what = "this value" if isinstance(key, int) else "this key"
-        return f"{what} is missing.{_about(detail, model)}"
+        return f"{what} is missing.{_about(detail, models)}"
     message = detail["msg"]
     for start, instead in (
         ("Input should be a valid ", "must be a "),
@@ -101,18 +106,20 @@ def _sentence(detail: ErrorDetails, names: Sequence[str], model: type[BaseModel]
         if message.startswith(start):
             message = instead + message.removeprefix(start)
             break
-    return f"{_article(message)}, not {value!r}.{_about(detail, model)}"
+    found = "" if isinstance(value, Mapping) else f", not {value!r}"  # a whole table is in the file to see
+    return f"{_article(message)}{found}.{_about(detail, models)}"
 
 
-def _about(detail: ErrorDetails, model: type[BaseModel] | None) -> str:
+def _about(detail: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
     """Return a space and the description of the key that a mistake is about, or nothing."""
     names = [step for step in detail["loc"] if isinstance(step, str)]
-    field = model.model_fields.get(names[-1]) if model and names else None
-    return f" {field.description}" if field and field.description else ""
+    fields = [model.model_fields[names[-1]] for model in models if names and names[-1] in model.model_fields]
+    return f" {fields[0].description}" if fields and fields[0].description else ""
 
 
 def _article(message: str) -> str:
-    for wrong, right in (("a array", "an array"), ("a integer", "an integer"), ("a object", "a table")):
+    articles = (("a array", "an array"), ("a integer", "an integer"), ("an object", "a table"))
+    for wrong, right in (*articles, ("a object", "a table")):
         message = message.replace(wrong, right)
     return message.replace("string", "text").replace("boolean", "true or false")
 
@@ -150,26 +157,42 @@ def _unplaced(table: tuple[str, ...], detail: ErrorDetails, path: KeyPath) -> Ke
     return (detail["loc"][-1],) if missing else ()
 
 
-def _model_at(model: type[BaseModel], loc: Iterable[str | int]) -> type[BaseModel] | None:
-    """Return the model that a place inside ``model`` belongs to, as far as annotations tell."""
-    current: Any = model
+def _models_at(
+    model: type[BaseModel], loc: Iterable[str | int], content: object
+) -> tuple[type[BaseModel], ...]:
+    """Return the models that the keys at a place inside ``model`` belong to, as far as annotations tell.
+
+    It is one, or two where a model has an ``options_model``: a classmethod that tells from the content of its
+    table what checks the keys that it does not know itself.
+    """
+    current: tuple[Any, ...] = (model,)
+    in_table_of_models = False
     for step in loc:
+        content = content.get(step) if isinstance(content, Mapping) else None
         if isinstance(step, int):
             continue  # an element of an array belongs to the model that the array holds
-        if current is None:
-            return None
-        field = current.model_fields.get(step)
-        if field is None:
-            return None
-        current = _only_model(field.annotation)
-    return current if isinstance(current, type) and issubclass(current, BaseModel) else None
+        if in_table_of_models:
+            in_table_of_models = False
+        else:
+            field = next((m.model_fields[step] for m in current if step in m.model_fields), None)
+            inner = None if field is None else _only_model(field.annotation)
+            if field is None or inner is None:
+                return ()
+            in_table_of_models = typing.get_origin(field.annotation) is dict
+            current = (inner,)
+            if in_table_of_models:
+                continue
+        options_model = getattr(current[0], "options_model", None)
+        more = options_model(content) if options_model else None
+        current = (*current, more) if more else current
+    return current
 
 
 def _only_model(annotation: Any) -> Any:
     """Return the one model in an annotation such as ``Model | None`` or ``tuple[Model, ...]``, else None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    if typing.get_origin(annotation) in (Union, types.UnionType, tuple, list):
+    if typing.get_origin(annotation) in (Union, types.UnionType, tuple, list, dict):
         models = {found for part in typing.get_args(annotation) if (found := _only_model(part))}
         return models.pop() if len(models) == 1 else None
     return None
