@@ -355,7 +355,14 @@ class PolledStage(Stage):
 
     def _wait_for_rest(self) -> StageState:
         deadline_s = time.monotonic() + self.stop_s
-        while (state := self._state()).moving:
+        while True:
+            try:
+                state = self._state()
+                if not state.moving:
+                    return state
+            except StoppedError:  # another STOP cancelled the question
+                if not self._is_connected:
+                    raise
             if time.monotonic() > deadline_s:
                 raise DeviceTimeoutError(
                     self.name,
@@ -363,7 +370,6 @@ class PolledStage(Stage):
                     "Switch off its power.",
                 )
             time.sleep(self.poll_s)
-        return state
 
     def _halt_after(self, error: DeviceError) -> None:
         """Stop every axis because one failed; that this fails too becomes a note."""
