@@ -39,9 +39,13 @@ class AptController:
     """A KDC101, TDC001, BSC20x or KIM101; ``spoil`` holds what is to be done to the next replies."""
 
     def __init__(
-        self, folder: Path, model: str, motions: list[MovingAxis], serial_number: int = 27_000_001
+        self,
+        port: Path | Callable[[Callable[[bytes], list[Answer]]], PtyDevice],
+        model: str,
+        motions: list[MovingAxis],
+        serial_number: int = 27_000_001,
     ) -> None:
-        folder.mkdir(exist_ok=True)
+        """``port`` is a folder for a pseudo-terminal, or makes another port for what answers messages."""
         self.model = model
         self.serial_number = serial_number
         self.axes = [AptAxis(motion) for motion in motions]
@@ -51,7 +55,11 @@ class AptController:
         self._unacknowledged = 0
         self._servo = model[:3] in ("KDC", "TDC")
         self._scale = 65_536 * 2048 / 6e6 if self._servo else 53.68
-        self.port = PtyDevice(folder, self.answer, split_messages)
+        if isinstance(port, Path):
+            port.mkdir(exist_ok=True)
+            self.port = PtyDevice(port, self.answer, split_messages)
+        else:
+            self.port = port(self.answer)
 
     def close(self) -> None:
         self.port.unplug()
