@@ -8,9 +8,11 @@ import numpy as np
 
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
 from calibration_routines.errors import CalibrationError
-from calibration_routines.sweep_plan import Sweep, axis_point, depths_um
+from calibration_routines.sweep_plan import Position, Sweep, axis_point, depths_um
 from instrument.bench import Bench
 
+_MOST_BOOST = 10.0  # exposure off the axis over that on it: beyond, a wrong guess would cost too much time
+_BESIDE = 2 / 3  # of the field's radius: where the exposure off the axis is asked
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 
@@ -33,10 +35,11 @@ class SweepExposures:
 
 
 def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
-    """Find the exposure of every point: asked on the axis at up to three depths, interpolated between them.
+    """Find the exposure of every point: asked at up to three depths, interpolated between them.
 
     Light through the aperture falls off as a power of distance, so exposure against z is nearly a straight
-    line in logarithms. Off the axis less light arrives, and nothing saturates. Ends with the light off.
+    line in logarithms. Where a depth has points off the axis, one of them about two thirds out is asked as
+    well: the logarithm of a Gaussian response goes with the square of the tangent. Ends with the light off.
 
     Raises
     ------
@@ -46,22 +49,45 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
     depths = depths_um(sweep)
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
     found: list[tuple[float, AutoExposure]] = []
+    slopes: list[float] = []
     try:
         bench.scene_off()
         for z_um in asked:
+            axis = axis_point(sweep, z_um)
             if not sweep.by_hand:
-                bench.place_source(*axis_point(sweep, z_um))
+                bench.place_source(*axis)
             found.append((z_um, expose_source(bench, target=sweep.target)))
+            beside = _beside(sweep, axis)
+            slopes.append(0.0)
+            if beside is not None:
+                bench.place_source(*beside)
+                dimmer = expose_source(bench, target=sweep.target)
+                more = np.log(dimmer.exposure_ms / found[-1][1].exposure_ms)
+                slopes[-1] = max(0.0, float(more)) / _tangent_squared(beside, axis)
     finally:
         bench.source_off()
-    exposures = np.exp(
-        np.interp(
-            np.log([z_um for _, _, z_um in sweep.points_um]),
-            np.log(asked),
-            np.log([result.exposure_ms for _, result in found]),
-        )
-    )
-    return SweepExposures(tuple(float(e) for e in exposures), tuple(found))
+    longest = bench.camera.exposure_limits_ms[1]
+    exposures = []
+    for point in sweep.points_um:
+        axis = axis_point(sweep, point[2])
+        on_axis = np.interp(np.log(point[2]), np.log(asked), np.log([one.exposure_ms for _, one in found]))
+        slope = float(np.interp(np.log(point[2]), np.log(asked), slopes))
+        boost = min(slope * _tangent_squared(point, axis), np.log(_MOST_BOOST))
+        exposures.append(min(float(np.exp(on_axis + boost)), longest))
+    return SweepExposures(tuple(exposures), tuple(found))
+
+
+def _beside(sweep: Sweep, axis: Position) -> Position | None:
+    """Return the point of the axis point's depth about two thirds out; None where it is alone."""
+    others = [p for p in sweep.points_um if p[2] == axis[2] and p != axis]
+    if not others:
+        return None
+    farthest = max(_tangent_squared(p, axis) for p in others)
+    return min(others, key=lambda p: abs(_tangent_squared(p, axis) - _BESIDE**2 * farthest))
+
+
+def _tangent_squared(point: Position, axis: Position) -> float:
+    return ((point[0] - axis[0]) ** 2 + (point[1] - axis[1]) ** 2) / point[2] ** 2
 
 
 def expose_source(bench: Bench, *, target: float = 0.7) -> AutoExposure:

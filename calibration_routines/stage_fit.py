@@ -31,6 +31,7 @@ _OUTLIER_PX = 0.3  # residuals beyond this count less and less in the fit
 _LARGEST_PX = 500_000  # larger images are binned for the registration: a twentieth of a pixel still
 _LEAST_POINTS = 4  # fewer determine the map exactly: nothing is left to judge
 _NEAR_PX, _NEAR_PART = 40.0, 0.2  # where a pattern is looked for: pixels, and part of its shift
+_FAR_PROMINENCE = 3.0  # a pattern found elsewhere must stand out more: few spots resemble many places
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +235,8 @@ def _registered(
         found = register(psf, reference, near=(row, column), within_px=reach)
         if found.reliable:
             return found
-    return register(psf, reference)
+    found = register(psf, reference)
+    return found if nominal_px_per_um is None or found.prominence >= _FAR_PROMINENCE else None
 
 
 def _nominal(geometry: Geometry, z_um: float) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -38,11 +38,14 @@ class Depths:
         The PSF nearest to the axis at each depth.
     fields : list of FieldOfPsfs
         All PSFs of each depth, registered to the central one.
+    warnings : tuple of str
+        Which PSFs could not be registered by their images, and were by their sources' places.
     """
 
     z_um: npt.NDArray[np.float64]
     central: npt.NDArray[np.float32]
     fields: list[FieldOfPsfs]
+    warnings: tuple[str, ...] = ()
 
     @property
     def varies(self) -> bool:
@@ -76,20 +79,22 @@ def sort_by_depth(calibration: Calibration) -> Depths:
         z_um = depths[order]
     else:
         members, z_um = [np.array([k]) for k in range(len(psfs))], np.full(len(psfs), np.nan)
-    central, fields = [], []
+    central, fields, warnings = [], [], []
     for group in members:
         off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
         reference = psfs[group[int(np.argmin(off_axis))]]
         central.append(reference)
-        fields.append(_registered(calibration, group, reference, group[int(np.argmin(off_axis))]))
-    return Depths(z_um, np.stack(central), fields)
+        field, unseen = _registered(calibration, group, reference, group[int(np.argmin(off_axis))])
+        fields.append(field)
+        warnings += unseen
+    return Depths(z_um, np.stack(central), fields, tuple(warnings))
 
 
 def _registered(
     calibration: Calibration, group: npt.NDArray[np.intp], reference: Array, central: int
-) -> FieldOfPsfs:
-    """Register the PSFs of one depth to the central one, between pixels."""
-    registered, points = [], []
+) -> tuple[FieldOfPsfs, list[str]]:
+    """Register the PSFs of one depth to the central one, between pixels; say which needed help."""
+    registered, points, warnings = [], [], []
     for k in group:
         psf = calibration.psfs[k]
         if k == central:
@@ -101,14 +106,20 @@ def _registered(
         found = register(psf.mean(axis=0), reference.mean(axis=0), near=near, within_px=reach)
         if not found.reliable:
             x, y, z = calibration.source_positions_um[k]
-            raise InputError(
+            trouble = (
                 f"PSF {k} (source at x = {x:g}, y = {y:g}, z = {z:g} um) cannot be registered to PSF "
                 f"{central}: its correlation has no peak that stands out ({found.prominence:.2f} times the "
-                "next). Leave it out, or take it again with more light or nearer to the axis."
+                "next)"
             )
+            if near is None:
+                raise InputError(
+                    f"{trouble}. Leave it out, or take it again with more light or nearer to the axis."
+                )
+            warnings.append(f"{trouble}; it was placed by its source's position (Kuo 2020, Eq. 5.2).")
+            found = replace(found, rows=near[0], columns=near[1])
         registered.append(aligned(psf, found))
         points.append((found.rows, found.columns))
-    return FieldOfPsfs(np.stack(registered), points)
+    return FieldOfPsfs(np.stack(registered), points), warnings
 
 
 def _expected(calibration: Calibration, k: int, central: int) -> tuple[float, float] | None:

@@ -184,7 +184,7 @@ def _prepare(
             "channels or one for each."
         )
     require_same_pixels(psfs[0], data)
-    warnings = saturated
+    warnings = [*saturated, *depths.warnings]
     for z, psf in enumerate(psfs):
         warnings += [f"Depth {z}: {text}" for text in check_psf(psf)]
     deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
