@@ -81,6 +81,8 @@ class Dlpc900Slm(Slm):
         self._firmware = ""
         self._tag = ""
         self._displayed: npt.NDArray[np.uint8] | None = None
+        self._uploaded: npt.NDArray[np.uint8] | None = None
+        """What ``start`` shows again, while it is stopped."""
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -147,7 +149,7 @@ class Dlpc900Slm(Slm):
                 except DeviceError as error:
                     _log.warning("%s: was not stopped: %s", self.name, error)
                 self._link.close()
-            self._displayed = None
+            self._displayed = self._uploaded = None
 
     @property
     def is_open(self) -> bool:
@@ -268,13 +270,38 @@ class Dlpc900Slm(Slm):
         view.flags.writeable = False
         return view
 
+    # More than the interface ----------------------------------------------------------------------
+    def stop(self) -> None:
+        """Stop the sequence: nothing is shown until ``start`` or the next pattern. Waits for an upload."""
+        with self._lock:
+            board = self._require()
+            self._link.write(Command.START_STOP, bytes([commands.STOP]))
+            if self._displayed is not None and self._uploaded is None:
+                self._uploaded, self._displayed = self._displayed, np.zeros(board.shape, np.uint8)
+
+    def start(self) -> None:
+        """Show the pattern that ``stop`` ended again, from its beginning, without another upload.
+
+        Raises
+        ------
+        DeviceError
+            When no pattern was stopped, or the controller does not start it.
+        """
+        with self._lock:
+            self._require()
+            if self._uploaded is None:
+                raise DeviceError(self.name, "has no stopped pattern to start.", "Display one.")
+            self._link.write(Command.START_STOP, bytes([commands.START]))
+            self._wait_until_running()
+            self._displayed, self._uploaded = self._uploaded, None
+
     def _show(self, levels: npt.NDArray[np.uint8]) -> None:
         """Section 5.3 of the guide: stop, define, configure, load, start."""
         board = self._require()
         images = [encode(half, self.options.compression) for half in np.hsplit(levels, board.controllers)]
         with self._lock:
             self._require()
-            self._displayed = None
+            self._displayed = self._uploaded = None
             self._link.write(Command.START_STOP, bytes([commands.STOP]))
             self._link.write(Command.PATTERN_DEFINITION, self._definition())
             self._link.write(Command.PATTERN_CONFIGURATION, _configuration(patterns=1, repeats=0))

@@ -189,6 +189,25 @@ def test_binary_patterns_are_binary(board: Dlpc900Emulator) -> None:
         np.testing.assert_array_equal(device.displayed, binary)
 
 
+def test_a_stopped_pattern_starts_again_without_another_upload(board: Dlpc900Emulator) -> None:
+    with slm() as device:
+        with pytest.raises(DeviceError, match="no stopped pattern"):
+            device.start()
+        device.display(pattern())
+        device.stop()
+        assert board.shown is None
+        assert not device.displayed.any()
+        board.commands.clear()
+        device.stop()
+        device.start()
+        np.testing.assert_array_equal(board.shown, pattern())
+        np.testing.assert_array_equal(device.displayed, pattern())
+        assert 0x1A2B not in board.commands
+        device.display(pattern(1))
+        with pytest.raises(DeviceError, match="no stopped pattern"):
+            device.start()
+
+
 @pytest.mark.parametrize(
     ("given", "text"),
     [
