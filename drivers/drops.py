@@ -29,7 +29,7 @@ class FrameNumberCounter:
         step = number - previous
         # A step back by less than half the range is no wrap: a number given twice, or frames out of order.
         if self._modulus is not None and step < -self._modulus // 2:
-            step += self._modulus - self._first
+            step += self._modulus - min(self._first, number)  # some use 0 all the same
         if step <= 0:
             raise ValueError(f"frame number {number} came after {previous}")
         return step - 1

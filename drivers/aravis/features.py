@@ -1,0 +1,199 @@
+"""The features of a GenICam camera by their names, with errors in words."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from drivers.errors import DeviceError, DeviceLostError, LimitError
+
+FeatureValue = str | bool | int | float
+
+EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
+"""SFNC's name and the one of cameras before it; both count microseconds."""
+GAIN = ("Gain", "GainAbs", "GainRaw")
+BLACK_LEVEL = ("BlackLevel", "BlackLevelAbs", "BlackLevelRaw")
+FRAME_RATE = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+FRAME_RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+FRAME_TRIGGERS = ("FrameStart", "FrameTrigger", "AcquisitionStart")
+FIRMWARE = ("DeviceFirmwareVersion", "DeviceVersion")
+AUTOMATICS = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto")
+
+
+class Features:
+    """Reads and writes features of an open device.
+
+    Parameters
+    ----------
+    aravis
+        The library's namespace.
+    device
+        Its device.
+    name : str
+        The device as error messages name it.
+    error : type
+        What the library's calls raise.
+    on_lost : callable
+        Called with the error when the device turns out to be gone.
+    """
+
+    def __init__(
+        self,
+        aravis: Any,
+        device: Any,
+        name: str,
+        error: type[Exception],
+        on_lost: Callable[[DeviceLostError], None],
+    ) -> None:
+        self._aravis = aravis
+        self._device = device
+        self._name = name
+        self._error = error
+        self._on_lost = on_lost
+
+    @contextlib.contextmanager
+    def words(self, doing: str) -> Iterator[None]:
+        """Turn the library's errors into DeviceError: "it did not ``doing``"."""
+        try:
+            yield
+        except self._error as error:
+            raise self._in_words(error, doing) from error
+
+    def _in_words(self, error: Any, doing: str) -> DeviceError:
+        codes = self._aravis.DeviceError
+        here = error.domain == "arv-device-error-quark"
+        if here and error.code in (
+            codes.TIMEOUT,
+            codes.NOT_CONNECTED,
+            codes.TRANSFER_ERROR,
+            codes.NOT_CONTROLLER,
+        ):
+            lost = DeviceLostError(
+                self._name,
+                f"does not answer any more ({error.message}).",
+                "Check cable and power; another program may have taken it over. Then open it again.",
+            )
+            self._on_lost(lost)
+            return lost
+        if here and error.code == codes.PROTOCOL_ERROR_ACCESS_DENIED:
+            return DeviceError(
+                self._name,
+                f"did not {doing}: access denied ({error.message}).",
+                "Another program controls it: close that one.",
+            )
+        return DeviceError(self._name, f"did not {doing}: {error.message}.")
+
+    # Which there are -------------------------------------------------------------------------------
+    def find(self, *names: str) -> str | None:
+        """Return the first of some names that the camera has now; None when it has none of them."""
+        for name in names:
+            try:
+                if self._device.get_feature(name) is not None and self._device.is_feature_available(name):
+                    return name
+            except self._error as error:
+                lost = self._in_words(error, f"say whether it has {name}")
+                if isinstance(lost, DeviceLostError):
+                    raise lost from error
+        return None
+
+    def _is_float(self, name: str) -> bool:
+        return isinstance(self._device.get_feature(name), self._aravis.GcFloat)
+
+    # Numbers ---------------------------------------------------------------------------------------
+    def number(self, name: str) -> float:
+        """Read a whole or real number."""
+        with self.words(f"say its {name}"):
+            if self._is_float(name):
+                return float(self._device.get_float_feature_value(name))
+            return float(self._device.get_integer_feature_value(name))
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Return the smallest and largest value that a number takes now."""
+        with self.words(f"say the limits of its {name}"):
+            if self._is_float(name):
+                low, high = self._device.get_float_feature_bounds(name)
+            else:
+                low, high = self._device.get_integer_feature_bounds(name)
+        return float(low), float(high)
+
+    def increment(self, name: str) -> int:
+        """Return the steps of a whole number."""
+        with self.words(f"say the steps of its {name}"):
+            return max(1, int(self._device.get_integer_feature_increment(name)))
+
+    def set_number(self, name: str, value: float) -> float:
+        """Set a number (a whole one to the nearest of its steps); returns what it reads afterwards."""
+        with self.words(f"take {value:g} for its {name}"):
+            if self._is_float(name):
+                self._device.set_float_feature_value(name, value)
+            else:
+                low, high = self.bounds(name)
+                step = self.increment(name)
+                whole = int(low) + round((value - low) / step) * step
+                self._device.set_integer_feature_value(name, min(max(whole, int(low)), int(high)))
+        return self.number(name)
+
+    def unit(self, name: str) -> str:
+        """Return the unit that the camera's description gives a number; empty where it gives none."""
+        return self._device.get_feature(name).get_unit() or ""
+
+    # Words and commands ----------------------------------------------------------------------------
+    def text(self, name: str) -> str:
+        """Read a text or the entry of an enumeration."""
+        with self.words(f"say its {name}"):
+            return str(self._device.get_string_feature_value(name))
+
+    def entries(self, name: str) -> tuple[str, ...]:
+        """Return the entries that an enumeration offers now."""
+        with self.words(f"say what its {name} offers"):
+            return tuple(self._device.dup_available_enumeration_feature_values_as_strings(name))
+
+    def choose(self, name: str, entry: str) -> str:
+        """Choose the entry of an enumeration; returns what it reads afterwards."""
+        offered = self.entries(name)
+        if entry not in offered:
+            raise LimitError(
+                self._name, f"has no {name} {entry!r}.", f"It offers {', '.join(offered) or 'none'}."
+            )
+        with self.words(f"take {entry} for its {name}"):
+            self._device.set_string_feature_value(name, entry)
+        return self.text(name)
+
+    def execute(self, name: str) -> None:
+        """Execute a command."""
+        with self.words(f"execute {name}"):
+            self._device.execute_command(name)
+
+    def set_any(self, name: str, value: FeatureValue) -> None:
+        """Set a feature of any kind by what its description says it is.
+
+        Raises
+        ------
+        LimitError
+            No such feature, or a value it does not take.
+        """
+        node = self._device.get_feature(name)
+        if node is None:
+            raise LimitError(self._name, f"has no feature {name!r}.", "arv-tool-0.8 features lists them.")
+        aravis = self._aravis
+        if isinstance(node, aravis.GcEnumeration):
+            self.choose(name, str(value))
+        elif isinstance(node, aravis.GcCommand):
+            self.execute(name)
+        elif isinstance(node, aravis.GcBoolean):
+            with self.words(f"take {value} for its {name}"):
+                self._device.set_boolean_feature_value(name, bool(value))
+        elif isinstance(node, aravis.GcFloat | aravis.GcInteger) and not isinstance(value, str):
+            low, high = self.bounds(name)
+            if not low <= value <= high:
+                raise LimitError(self._name, f"takes no {name} {value:g}.", f"It takes {low:g} to {high:g}.")
+            self.set_number(name, value)
+        else:
+            with self.words(f"take {value!r} for its {name}"):
+                self._device.set_string_feature_value(name, str(value))
+
+    def any_text(self, name: str) -> str:
+        """Read a feature of any kind as text."""
+        with self.words(f"say its {name}"):
+            return str(self._device.get_feature(name).get_value_as_string())
