@@ -114,7 +114,12 @@ class ControllerSettings:
             When settings of an axis are missing or make no sense, or positions come in inches.
         """
         for axis in range(axes):
-            for base, what in ((_STEPS, "steps per mm"), (_RATE, "maximum rate"), (_TRAVEL, "travel")):
+            for base, what in (
+                (_STEPS, "steps per mm"),
+                (_RATE, "maximum rate"),
+                (_ACCELERATION, "acceleration"),
+                (_TRAVEL, "travel"),
+            ):
                 value = self.values.get(base + axis)
                 if not value:
                     raise DeviceError(

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.discovery import FoundDevice
-from drivers.errors import DeviceError, DeviceTimeoutError
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
 from drivers.grbl.options import GrblAxis, GrblOptions
 from drivers.grbl.protocol import (
@@ -33,7 +33,7 @@ _OLDEST = (1, 1)
 _UNUSABLE = {
     "Door": "its safety door is open",
     "Sleep": "it sleeps",
-    "Check": "it only checks G-code and does not move",
+    "Check": "it only checks G-code and does not move ($C ends that)",
     "Tool": "it waits for a tool change",
 }
 
@@ -63,6 +63,8 @@ class GrblStage(PolledStage):
         self._planned: dict[str, float] = {}
         self._banners = 0
         self._homed = self._homing = self._halting = False
+        self._fault = ""
+        """What happened since the last homing that ended it."""
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -103,7 +105,7 @@ class GrblStage(PolledStage):
         found = dict(super().settings())
         for name in self.options.axes:
             axis, unit = self._index(name), abs(self._maps[name].scale)
-            found[f"acceleration_{name}_per_s2"] = unit * self._controller.acceleration_per_s2(axis)
+            found[f"acceleration_{name}_per_s2"] = self._acceleration_per_s2(name)
             found[f"resolution_{name}"] = unit / self._controller.steps_per_unit(axis)
             backlash = self._controller.backlash(axis)
             if backlash is not None:
@@ -119,6 +121,7 @@ class GrblStage(PolledStage):
 
     def _connect(self) -> tuple[DeviceIdentity, tuple[StageAxis, ...]]:
         self._homed = self._homing = self._halting = False
+        self._fault = ""
         self._link.open()
         report = self._first_report()
         info = parse_info(self._link.command(b"$I\n"))
@@ -196,6 +199,24 @@ class GrblStage(PolledStage):
             resolution=max(1 / self._controller.steps_per_unit(index), REPORTED_STEP),
         )
 
+    def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
+        """Estimated seconds for a move, with acceleration; axes move together, so the slowest counts."""
+        longest_s = 0.0
+        for axis in self._axes:
+            if axis.name in start and axis.name in target:
+                way = abs(target[axis.name] - start[axis.name])
+                acceleration = self._acceleration_per_s2(axis.name)
+                ramp_s = axis.speed_per_s / acceleration
+                reaches_speed = way > axis.speed_per_s * ramp_s
+                took_s = (
+                    way / axis.speed_per_s + ramp_s if reaches_speed else 2 * math.sqrt(way / acceleration)
+                )
+                longest_s = max(longest_s, took_s)
+        return longest_s
+
+    def _acceleration_per_s2(self, name: str) -> float:
+        return abs(self._maps[name].scale) * self._controller.acceleration_per_s2(self._index(name))
+
     def _letter(self, name: str) -> str:
         return self._maps[name].label.removeprefix("axis ")
 
@@ -212,71 +233,65 @@ class GrblStage(PolledStage):
 
     # Moving ----------------------------------------------------------------------------------------
     def _state(self) -> StageState:
-        self._raise_what_happened()
+        self._note_what_happened()
         if self._homing:
             end = self._link.ended()
             if end is None and self._link.is_open:
                 return self._seen(moving=True)  # GRBL answers nothing while it homes
             self._homing = False
             code = None if end is None else parse_error(end)
+            self._homed = end is not None and code is None
             if code is not None:
-                raise self._link.refused(b"$H", code)
-            self._homed = end is not None
+                self._fault = self._link.refused(b"$H", code).problem
         try:
             report = self._link.report()
-        except DeviceTimeoutError:
-            self._raise_what_happened()
-            raise
-        self._raise_what_happened()  # whatever was said before this report
+        except (DeviceTimeoutError, StoppedError):
+            self._note_what_happened()
+            if not self._fault:
+                raise
+            report = self._link.report()  # a critical alarm: it is heard again since it was reset
+        self._note_what_happened()  # whatever was said before this report
         if len(report.places) != len(self._zero):
             raise DeviceError(
                 self.name, f"reports {len(report.places)} axes, not {len(self._zero)}.", "Open it again."
             )
         if report.state == "Alarm" and self._homed:
-            self._homed = False
-            raise DeviceError(self.name, "is in alarm.", "Remove the cause, then home again.")
-        unusable = _UNUSABLE.get(report.state.partition(":")[0])
-        if unusable is not None:
-            raise DeviceError(self.name, f"cannot be used: {unusable} ({report.state}).", "End that state.")
+            self._homed, self._fault = False, self._fault or "it is in alarm"
         if self._halting:
             self._press_on(report.state)
         self._places = report.places
         moving = report.state in MOVING_STATES or (self._halting and report.state == "Hold:0")
         if not moving:
             self._planned.clear()
-        return self._seen(moving=moving)
+        return self._seen(moving=moving, unusable=_UNUSABLE.get(report.state.partition(":")[0], ""))
 
-    def _seen(self, *, moving: bool) -> StageState:
+    def _seen(self, *, moving: bool, unusable: str = "") -> StageState:
         position = {}
         for name, axis in self._maps.items():
             index = self._index(name)
             position[name] = axis.to_bench(self._places[index] - self._zero[index])
-        return StageState(position, moving, self._homed)
+        faults = tuple(fault for fault in (self._fault, unusable) if fault)
+        return StageState(position, moving, self._homed, faults)
 
-    def _raise_what_happened(self) -> None:
-        """Raise, once, for an alarm or a reset that nobody here asked for."""
+    def _note_what_happened(self) -> None:
+        """Take note of an alarm or a reset that nobody here asked for."""
         alarm = self._link.take_alarm()
         if alarm is not None:
             self._homed = self._homing = False
-            error = DeviceError(
-                self.name, f"{self._link.alarm_words(alarm)}.", "Remove the cause, then home again."
-            )
+            self._fault = self._link.alarm_words(alarm)
             if alarm in CRITICAL_ALARMS:
                 try:
                     self._link.reset()
-                except DeviceError as another:
-                    error.add_note(str(another))
+                except DeviceTimeoutError as error:  # an emergency stop that is still pressed
+                    _log.warning("%s", error)
             self._banners = self._link.banners
-            raise error
-        if self._link.banners != self._banners:
+        elif self._link.banners != self._banners:
             self._banners = self._link.banners
-            lost, self._homed, self._homing = self._homed or self._homing, False, False
-            if lost:
-                raise DeviceError(
-                    self.name,
-                    "was reset (its button, its supply, another program): its position is not to be trusted.",
-                    "Check its power, then home again.",
+            if self._homed or self._homing:
+                self._fault = (
+                    "was reset (its button, its supply, another program): its position is not to be trusted"
                 )
+            self._homed = self._homing = False
 
     def _start(self, target: Mapping[str, float]) -> None:
         self._halting = False
@@ -298,6 +313,7 @@ class GrblStage(PolledStage):
 
     def _start_homing(self) -> None:
         self._halting = False
+        self._fault = ""
         if self.options.homing == "here":
             self._zero, self._homed = self._places, True
             return

@@ -17,9 +17,9 @@ from drivers.serial_transport import SerialTransport
 BAUD_RATE = 115_200
 _POWER_CODES = (3,)
 _SHOWN_BYTES = 60
-# The first newline ends a half-sent command and interrupts a running sequence; firmware that throws away
-# what came during a command may swallow the x behind it, which is why ``darken`` asks again.
-_DARK_AT_ONCE = b"\nx\n"
+# Any byte interrupts a running sequence; firmware that throws away what came meanwhile may swallow the
+# command with it, which is why ``off`` asks for a confirmation.
+_DARK_AT_ONCE = b"x\n"
 
 
 class Link:

@@ -34,6 +34,12 @@ def plain(tmp_path: Path) -> Iterator[GrblController]:
     board.unplug()
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of silence: less of it."""
+    monkeypatch.setattr(GrblStage, "reply_s", 0.4)
+
+
 def stage_on(board: GrblController, **options: object) -> GrblStage:
     return GrblStage(GrblOptions.model_validate({"port": str(board.link), **options}))
 
@@ -145,10 +151,12 @@ def test_a_limit_switch_ends_the_move_and_the_reference(
     assert "limit switch was hit" in str(outcome[0])
     assert "home again" in str(outcome[0])
     assert not stage.is_homed
-    with pytest.raises(LimitError, match="not homed"):
+    with pytest.raises(DeviceError, match="limit switch was hit"):
         stage.move_to({"x_um": -5000.0})
+    assert stage.position()["x_um"] == pytest.approx(true_um(board))  # it can still be asked
     stage.home()
     assert stage.move_to({"x_um": -5000.0})["x_um"] == pytest.approx(true_um(board))
+    assert stage.settings()["faults"] == ()
     assert "alarm 1" in caplog.text
 
 
@@ -176,19 +184,31 @@ def test_homing_takes_no_longer_than_allowed(plain: GrblController) -> None:
 def test_a_controller_that_was_reset_is_not_trusted(board: GrblController, stage: GrblStage) -> None:
     stage.move_to({"x_um": -5000.0})
     board.press_reset()
-    with pytest.raises(DeviceError, match=r"was reset .* not to be trusted"):
-        wait_until(lambda: stage.position() is None)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=r"was reset .* not to be trusted.*home again"):
+            stage.move_to({"x_um": -6000.0})
     assert not stage.is_homed
-    with pytest.raises(LimitError, match="not homed"):
-        stage.move_to({"x_um": -6000.0})
-
-
-def test_an_alarm_at_rest_is_told_once(board: GrblController, stage: GrblStage) -> None:
-    board._raise_alarm(2, critical=True)
-    with pytest.raises(DeviceError, match="soft limits"):
-        wait_until(lambda: stage.position() is None)
-    assert not stage.is_homed
+    assert not any(line.startswith(b"$J=") and b"-6." in line for line in board.received)
     stage.home()
+    assert stage.move_to({"x_um": -6000.0})["x_um"] == pytest.approx(true_um(board))
+
+
+def test_an_alarm_at_rest_is_a_fault_until_homed(board: GrblController, stage: GrblStage) -> None:
+    board._raise_alarm(2, critical=True)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="soft limits"):
+            stage.move_to({"x_um": -5000.0})
+    assert not stage.is_homed
+    assert "alarm 2" in str(stage.settings()["faults"])
+    stage.home()
+    stage.move_to({"x_um": -5000.0})
+
+
+def test_homing_is_the_way_out_of_an_alarm_nobody_saw(board: GrblController, stage: GrblStage) -> None:
+    board._raise_alarm(1, critical=True)
+    stage.home()
+    assert stage.is_homed
+    assert stage.settings()["faults"] == ()
 
 
 def test_an_open_door_is_said(plain: GrblController, plain_stage: GrblStage) -> None:
@@ -268,6 +288,12 @@ def test_no_axis_is_faster_than_it_may(plain: GrblController) -> None:
         assert float(match[1]) == pytest.approx(60 * math.hypot(0.4, 0.3) / 0.4, abs=0.11)
     with pytest.raises(DeviceError, match=r"x_um \(axis X\) goes at most 20000 a second \(\$110\)"):
         stage_on(plain, axes={"x_um": {"speed_per_s": 1e6}}).open()
+
+
+def test_a_move_takes_as_long_as_it_accelerates(plain_stage: GrblStage) -> None:
+    # 20 mm/s and 10 mm/s^2: 40 mm until it has its speed.
+    assert plain_stage.move_duration_s({"x_um": 0.0}, {"x_um": 10_000.0}) == pytest.approx(2.0)
+    assert plain_stage.move_duration_s({"x_um": 0.0}, {"x_um": 90_000.0}) == pytest.approx(6.5)
 
 
 def test_settings_tell_what_the_controller_has(tmp_path: Path) -> None:
@@ -354,6 +380,7 @@ def test_probe_recognises_a_controller(board: GrblController, monkeypatch: pytes
 
 
 # Faults ------------------------------------------------------------------------------------------
+@pytest.mark.usefixtures("quick")
 def test_spoilt_reports_are_never_a_position(plain: GrblController, plain_stage: GrblStage) -> None:
     plain_stage.move_to({"x_um": -5000.0})
     spoilt = iter(
@@ -376,8 +403,9 @@ def test_spoilt_reports_are_never_a_position(plain: GrblController, plain_stage:
     assert plain_stage.position()["x_um"] == -5000.0
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_late_ok_is_not_taken_for_the_next_moves(plain: GrblController, plain_stage: GrblStage) -> None:
-    late = [[1.2, b"ok\r\n"]]
+    late = [[0.6, b"ok\r\n"]]
 
     def fault(asked: bytes, reply: bytes) -> list[Answer]:
         return late.pop() if late and asked.startswith(b"$J=") else [reply]
@@ -397,6 +425,7 @@ def test_silence_is_an_error_in_words(plain: GrblController, monkeypatch: pytest
         stage_on(plain).open()
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_board_stuck_in_an_alarm_is_brought_back(plain: GrblController) -> None:
     plain._raise_alarm(1, critical=True)
     with stage_on(plain) as stage:

@@ -16,12 +16,15 @@ SIX = {name: {} for name in ("x_um", "y_um", "z_um", "roll_mrad", "pitch_mrad", 
 
 
 class GrblContract(StageContract):
+    rate = 6000.0
+
     def controller(self, folder: Path) -> GrblController:
         raise NotImplementedError
 
     @pytest.fixture(autouse=True)
     def _controller(self, tmp_path: Path) -> Iterator[None]:
         self.board = self.controller(tmp_path)
+        self.board.settings |= {110 + axis: self.rate for axis in range(len(self.board.letters))}
         yield
         self.board.unplug()
 
@@ -44,10 +47,12 @@ class TestGrblHalOfSixAxes(GrblContract):
         return board
 
     def options(self) -> dict[str, object]:
-        return {"axes": SIX | {"y_um": {"reverse": True, "speed_per_s": 9000.0}}}
+        return {"axes": SIX | {"y_um": {"reverse": True, "speed_per_s": 60_000.0}}}
 
 
 class TestGrblWithoutSwitches(GrblContract):
+    rate = 2000.0  # short ways: slow enough to be stopped
+
     def controller(self, folder: Path) -> GrblController:
         board = GrblController(folder, axes=4)
         board.settings |= {20: 0, 21: 0, 22: 0}

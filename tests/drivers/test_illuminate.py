@@ -313,15 +313,17 @@ def test_no_power_says_what_to_check(new_array: IlluminateEmulator, new_leds: Il
     assert new_leds.pattern.is_dark
 
 
-def test_late_replies_and_garbage(array: IlluminateEmulator, leds: IlluminateLedArray) -> None:
-    array.fault = spoil(b"na", 1.3, b"NA.99\n-==-\n")
-    with pytest.raises(DeviceTimeoutError):
-        leds.settings()
-    assert leds.settings()["objective_na"] == 0.25
-    array.fault = spoil(b"na", b"\xff\x00\xfeN", b"\n-==-\n")
-    with pytest.raises(DeviceError, match=r"NA\.NUMBER was expected"):
-        leds.settings()
-    assert leds.settings()["objective_na"] == 0.25
+def test_late_replies_and_garbage(array: IlluminateEmulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(IlluminateLedArray, "reply_s", 0.4)
+    with driver_of(array) as leds:
+        array.fault = spoil(b"na", 0.6, b"NA.99\n-==-\n")
+        with pytest.raises(DeviceTimeoutError):
+            leds.settings()
+        assert leds.settings()["objective_na"] == 0.25
+        array.fault = spoil(b"na", b"\xff\x00\xfeN", b"\n-==-\n")
+        with pytest.raises(DeviceError, match=r"NA\.NUMBER was expected"):
+            leds.settings()
+        assert leds.settings()["objective_na"] == 0.25
 
 
 def test_levels_that_are_not_what_was_asked_are_an_error(
