@@ -66,9 +66,10 @@ class _Child:
 
     def _answer(self, request: dict[str, Any]) -> None:
         try:
-            self._send({"reply": self._carry_out(request)})
+            answer = {"reply": self._carry_out(request)}
         except DeviceError as error:
-            self._send({"error": [error.problem, error.remedy]})
+            answer = {"error": [error.problem, error.remedy]}
+        self._send({"number": request["number"], **answer})
 
     def _carry_out(self, request: dict[str, Any]) -> Any:
         if request["do"] == "list":

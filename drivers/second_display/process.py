@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,7 @@ _log = logging.getLogger(__name__)
 _START_S = 30.0
 _ANSWER_S = 10.0
 _END_S = 3.0
+_ERROR_BYTES = 65536
 _SCALING = ("QT_SCALE_FACTOR", "QT_SCREEN_SCALE_FACTORS", "QT_ENABLE_HIGHDPI_SCALING")
 
 
@@ -47,6 +49,7 @@ class WindowProcess:
         self._lock = threading.Lock()
         self._replies: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._closing = False
+        self._number = 0
         self._memory: mmap.mmap | None = None
         self._memory_fd = os.memfd_create("diffuserbench-slm")
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with this object
@@ -110,9 +113,10 @@ class WindowProcess:
 
     def _ask(self, request: dict[str, Any], timeout_s: float) -> Any:
         with self._lock:
+            self._number += 1
             try:
-                self._socket.sendall(json.dumps(request).encode() + b"\n")
-                reply = self._replies.get(timeout=timeout_s)
+                self._socket.sendall(json.dumps(request | {"number": self._number}).encode() + b"\n")
+                reply = self._reply(self._number, timeout_s)
             except OSError:
                 reply = None
             except queue.Empty:
@@ -127,6 +131,14 @@ class WindowProcess:
             if "error" in reply:
                 raise DeviceError(self._device, *reply["error"])
             return reply["reply"]
+
+    def _reply(self, number: int, timeout_s: float) -> dict[str, Any] | None:
+        """Return the reply to a request, past late ones to those before; None when the process ended."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            reply = self._replies.get(timeout=max(0.0, deadline_s - time.monotonic()))
+            if reply is None or reply["number"] == number:
+                return reply
 
     def _read(self) -> None:
         received = b""
@@ -152,8 +164,8 @@ class WindowProcess:
             return DeviceError(self._device, "its window was closed.")
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
-        self._errors.seek(0)
-        text = self._errors.read().decode(errors="replace").strip()
+        # At a place of its own: two threads may come here.
+        text = os.pread(self._errors.fileno(), _ERROR_BYTES, 0).decode(errors="replace").strip()
         if text:
             _log.debug("%s: its window's process said:\n%s", self._device, text)
         last = text.splitlines()[-1] if text else f"status {self._process.returncode}"

@@ -52,7 +52,7 @@ class SecondDisplaySlm(Slm):
         self._output: Output | None = None
         self._inhibited_by = ""
         self._lost: DeviceError | None = None
-        self._displayed = np.zeros((0, 0), np.uint8)
+        self._displayed: npt.NDArray[np.uint8] | None = None
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -135,7 +135,6 @@ class SecondDisplaySlm(Slm):
             "pixel_pitch_um": self.options.pixel_pitch_um,
             "settle_ms": self.settle_ms,
             "screen_saver_kept_off_by": self._inhibited_by,
-            "blank": not self._displayed.any(),
         }
 
     @property
@@ -168,14 +167,17 @@ class SecondDisplaySlm(Slm):
                 )
             assert window is not None
             shown = levels.copy()
+            self._displayed = None
             window.show(shown)
             self._displayed = shown
         self._closing.wait(self.settle_ms * 1e-3)
 
     @property
     def displayed(self) -> npt.NDArray[np.uint8]:
-        """The grey levels shown now, read only."""
+        """The grey levels shown now, read only; after a pattern that failed an error until the next one."""
         self._require()
+        if self._displayed is None:
+            raise DeviceError(self.name, "what it shows is unknown after a failure.", "Display again.")
         view = self._displayed.view()
         view.flags.writeable = False
         return view

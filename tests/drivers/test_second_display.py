@@ -210,6 +210,25 @@ def test_a_window_that_hangs_is_an_error_and_closing_ends_it(
     assert process.poll() is not None
 
 
+def test_a_late_answer_is_not_taken_for_the_next_one(
+    slm: SecondDisplaySlm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window = slm._window
+    assert isinstance(window, WindowProcess)
+    process = process_of(slm)
+    monkeypatch.setattr("drivers.second_display.process._ANSWER_S", 0.2)
+    process.send_signal(signal.SIGSTOP)
+    with pytest.raises(DeviceError, match="did not answer within"):
+        slm.display(np.ones(slm.shape, np.uint8))
+    with pytest.raises(DeviceError, match="unknown after a failure"):
+        _ = slm.displayed
+    process.send_signal(signal.SIGCONT)
+    monkeypatch.setattr("drivers.second_display.process._ANSWER_S", 20.0)
+    assert [output.name for output in window.outputs()] == ["DESK-1", "SLM-1"]
+    slm.display(np.ones(slm.shape, np.uint8))
+    assert (slm.displayed == 1).all()
+
+
 def test_ctrl_c_does_not_reach_the_window(slm: SecondDisplaySlm) -> None:
     process = process_of(slm)
     assert os.getpgid(process.pid) != os.getpgrp()
@@ -253,7 +272,7 @@ def test_closing_ends_the_wait_for_settling() -> None:
     levels = np.ones(slm.shape, np.uint8)
     waiting = threading.Thread(target=lambda: slm.display(levels))
     waiting.start()
-    until(lambda: slm._displayed.any())
+    until(lambda: slm._displayed is not None and bool(slm._displayed.any()))
     slm.close()
     waiting.join(20)
     assert not waiting.is_alive()
