@@ -18,6 +18,7 @@ _MAX_RLE_RUN = 255
 _END_OF_LINE = b"\x00\x00"
 
 Levels = npt.NDArray[np.uint8]
+Numbers = npt.NDArray[np.intp]
 
 
 def encode(levels: Levels, compression: str = "auto") -> bytes:
@@ -55,36 +56,53 @@ def _uncompressed(levels: Levels) -> bytes:
 
 def _rle(levels: Levels) -> bytes:
     """Compress by runs of up to 255 pixels; lines begin at multiples of four bytes (section 2.4.3.1)."""
+    width = levels.shape[1]
+    pixels = levels.ravel()
     out = bytearray()
-    for row in levels:
-        for start, stop, is_run in _segments(row, np.zeros(row.size, bool)):
-            for at in range(start, stop, _MAX_RLE_RUN):
-                n = min(_MAX_RLE_RUN, stop - at)
-                # A literal of one pixel does not exist: its code ends the image.
-                head = bytes([n]) if is_run or n == 1 else bytes([0, n])
-                out += head + _pixels(row[at : at + (1 if is_run else n)])
-        out += _END_OF_LINE
-        out += bytes(-len(out) % 4)
+    segments = _segments(levels, np.zeros(levels.shape, bool))
+    for start, n, kind in zip(*(part.tolist() for part in segments), strict=True):
+        for at in range(start, start + n, _MAX_RLE_RUN):
+            count = min(_MAX_RLE_RUN, start + n - at)
+            # A literal of one pixel does not exist: its code ends the image.
+            is_run = kind == _RUN or count == 1
+            out += bytes([count]) if is_run else bytes([0, count])
+            out += np.repeat(pixels[at : at + (1 if is_run else count)], 3).tobytes()
+        if (start + n) % width == 0:
+            out += _END_OF_LINE
+            out += bytes(-len(out) % 4)
     return bytes(out) + b"\x00\x01"
 
 
 def _enhanced_rle(levels: Levels) -> bytes:
-    """Compress by runs of any length, and by runs of the line above (section 2.4.3.2)."""
-    out = bytearray()
-    above = None
-    for row in levels:
-        copied = np.zeros(row.size, bool) if above is None else row == above
-        for start, stop, is_run in _segments(row, copied):
-            n = stop - start
-            if copied[start]:
-                out += b"\x00\x01" + _length(n)
-            elif is_run or n == 1:
-                out += _length(n) + _pixels(row[start : start + 1])
-            else:
-                out += b"\x00" + _length(n) + _pixels(row[start:stop])
-        out += _END_OF_LINE
-        above = row
-    return bytes(out) + b"\x00\x01\x00"
+    """Compress by runs of any length, and by runs of the line above (section 2.4.3.2).
+
+    A copy of n pixels from above is ``00 01 n``, a run ``n pixel``, a literal ``00 n pixels``; n is one byte
+    below 128, else two: its low seven bits with a mark, then the rest. All segments are written at once.
+    """
+    above = np.zeros(levels.shape, bool)
+    above[1:] = levels[1:] == levels[:-1]
+    start, n, kind = _segments(levels, above)
+    pixels = levels.ravel()
+    head = np.array([0, 1, 2])[kind]  # bytes before the length, by kind
+    long = n >= 128
+    n_pixels = np.where(kind == _COPY, 0, np.where(kind == _LITERAL, n, 1))
+    ends_line = (start + n) % levels.shape[1] == 0
+    size = head + 1 + long + 3 * n_pixels + len(_END_OF_LINE) * ends_line
+    stop = np.cumsum(size)
+    out = np.zeros(int(stop[-1]), np.uint8)
+    at = stop - size
+    out[at[kind == _COPY] + 1] = 1
+    at += head
+    out[at] = np.where(long, n & 0x7F | 0x80, n)
+    out[at[long] + 1] = n[long] >> 7
+    at += 1 + long
+    # Every pixel that is written out, by its number within its segment.
+    within = np.arange(int(n_pixels.sum())) - np.repeat(np.cumsum(n_pixels) - n_pixels, n_pixels)
+    place = np.repeat(at, n_pixels) + 3 * within
+    values = pixels[np.repeat(start, n_pixels) + within]
+    for color in range(3):
+        out[place + color] = values
+    return out.tobytes() + b"\x00\x01\x00"
 
 
 _COMPRESSIONS: Mapping[str, tuple[int, Callable[[Levels], bytes]]] = {
@@ -94,31 +112,30 @@ _COMPRESSIONS: Mapping[str, tuple[int, Callable[[Levels], bytes]]] = {
 }
 
 
-def _segments(row: Levels, copied: npt.NDArray[np.bool_]) -> list[tuple[int, int, bool]]:
-    """Cut a line into ``(start, stop, is_run)``: pixels copied from above, runs of one level, the rest.
+_RUN, _LITERAL, _COPY = range(3)
 
-    A segment is all copied or not at all; a run has at least two pixels that are not copied.
+
+def _segments(levels: Levels, copied: npt.NDArray[np.bool_]) -> tuple[Numbers, Numbers, Numbers]:
+    """Cut an image into runs of one level, literals, and copies of what is above, none beyond its line.
+
+    Returns
+    -------
+    start, n, kind : ndarray
+        First pixel, counted along the lines; number of pixels; ``_RUN``, ``_LITERAL`` or ``_COPY``.
     """
-    size = row.size
-    # A border lies before a pixel where its level changes, or whether it is copied.
-    changes = np.ones(size + 1, bool)
-    same_kind = copied[1:] == copied[:-1]
-    changes[1:-1] = ~(same_kind & (copied[1:] | (row[1:] == row[:-1])))
-    borders = np.flatnonzero(changes)
-    starts, lengths = borders[:-1], np.diff(borders)
-    # Single pixels in a row become one literal.
-    single = (lengths == 1) & ~copied[starts]
-    joins = np.zeros(starts.size, bool)
-    joins[1:] = single[1:] & single[:-1]
+    width = levels.shape[1]
+    pixels, copy = levels.ravel(), copied.ravel()
+    # A border lies before a pixel where a line begins, its level changes, or whether it is copied.
+    border = np.ones(pixels.size, bool)
+    border[1:] = (copy[1:] != copy[:-1]) | (~copy[1:] & (pixels[1:] != pixels[:-1]))
+    border[::width] = True
+    start = np.flatnonzero(border)
+    single = (np.diff(start, append=pixels.size) == 1) & ~copy[start]
+    # Single pixels beside each other in a line become one literal.
+    joins = np.zeros(start.size, bool)
+    joins[1:] = single[1:] & single[:-1] & (start[1:] % width != 0)
     kept = np.flatnonzero(~joins)
-    stops = np.append(starts[kept[1:]], size)
-    return list(zip(starts[kept].tolist(), stops.tolist(), (~single[kept]).tolist(), strict=True))
-
-
-def _length(n: int) -> bytes:
-    """Return a length as one byte below 128, else as two: low seven bits with a mark, then the rest."""
-    return bytes([n]) if n < 128 else bytes([(n & 0x7F) | 0x80, n >> 7])
-
-
-def _pixels(levels: Levels) -> bytes:
-    return np.repeat(levels, 3).tobytes()
+    start, single = start[kept], single[kept]
+    n = np.diff(start, append=pixels.size)
+    kind = np.where(copy[start], _COPY, np.where(single & (n > 1), _LITERAL, _RUN))
+    return start, n, kind
