@@ -31,6 +31,7 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
+from recon.refocus import at_depth
 from recon.types import Calibration
 
 DarkChoice = Literal["auto"] | float | Path
@@ -198,6 +199,36 @@ def job_with(
             "erased": erased.reason,
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
+    )
+
+
+def refocused(job: Job, z_um: float) -> Job:
+    """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
+
+    Where the calibration has the depth, or does not know its depths or the distance from diffuser to sensor,
+    the job is returned as it is: the reconstruction then takes the nearest PSF.
+    """
+    calibration = job.calibration
+    z = calibration.source_positions_um[:, 2]
+    known = calibration.geometry.diffuser_distance_mm is not None and bool((z > 0).all())
+    if not (known and z_um > 0):
+        return job
+    calibration, made = at_depth(calibration, z_um)
+    if made is None:
+        return job
+    return replace(
+        job,
+        calibration=calibration,
+        notes={**job.notes, "PSF": f"refocused to {z_um / 1e3:g} mm: {made}"},
+        provenance={
+            **job.provenance,
+            "refocused": {
+                "z_um": made.z_um,
+                "from_z_um": list(made.from_z_um),
+                "displacement_error_um": made.displacement_error_um,
+                "expected_similarity": made.expected_similarity,
+            },
+        },
     )
 
 

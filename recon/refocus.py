@@ -24,6 +24,8 @@ Floats = npt.NDArray[np.float32]
 SAME_DEPTH = 1e-3
 """Relative difference of the scale below which a calibrated PSF serves as it is: a hundredth of a pixel or
 so at the edge of a pattern of some hundred pixels would be interpolation for nothing."""
+LEAST_LIKENESS = 0.5
+"""Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
 TYPICAL_DEFLECTION_DEG = 0.25
 """Half width of the deflection of the dissertation's 0.5 degree diffuser (A.2), where nothing is known."""
 
@@ -128,7 +130,8 @@ def refocus(
     """Return the PSF at a depth that need not have been calibrated.
 
     The central PSFs of the calibrated depths on both sides are scaled to ``z_um``, registered to each other,
-    and mixed by distance in 1/z (sec. 5.2); outside the calibrated range the nearest one is scaled.
+    and mixed by distance in 1/z (sec. 5.2); outside the calibrated range, or where the neighbours are too
+    unlike to be mixed, the nearest one is scaled.
 
     Parameters
     ----------
@@ -222,17 +225,21 @@ def _mixed(
     # The stage's line need not pass through the sensor's centre: what is left between the two scaled
     # patterns grows evenly in 1/z, so each goes its share of the way.
     rows, columns = displacement(scaled[1].mean(axis=0), scaled[0].mean(axis=0))
-    first = rescaled(scaled[0], 1.0, shift=(share * rows, share * columns)) if rows or columns else scaled[0]
-    second = (
-        rescaled(scaled[1], 1.0, shift=((share - 1) * rows, (share - 1) * columns))
-        if rows or columns
-        else scaled[1]
-    )
-    return (
-        np.asarray((1 - share) * first + share * second, np.float32),
-        [near, far],
-        [1 - share, share],
-    )
+    if rows or columns:
+        scaled = [
+            rescaled(psf, 1.0, shift=(part * rows, part * columns))
+            for psf, part in zip(scaled, (share, share - 1), strict=True)
+        ]
+    if _likeness(*scaled) < LEAST_LIKENESS:
+        nearest = near if share <= 0.5 else far
+        return refocus_psf(psfs[nearest], depths[nearest], z_um, distance_um), [nearest], [1.0]
+    mixed = (1 - share) * scaled[0] + share * scaled[1]
+    return np.asarray(mixed, np.float32), [near, far], [1 - share, share]
+
+
+def _likeness(first: Array, second: Array) -> float:
+    a, b = (np.asarray(image, np.float64).ravel() for image in (first, second))
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300))
 
 
 def _expected_similarity(
@@ -253,8 +260,7 @@ def _expected_similarity(
         predicted, used, _ = _mixed(depths[rest], psfs[rest], float(depths[k]), distance_um)
         rows, columns = displacement(psfs[k].mean(axis=0), predicted.mean(axis=0))
         moved = rescaled(predicted, 1.0, shift=(rows, columns))
-        a, b = moved.astype(np.float64).ravel(), psfs[k].astype(np.float64).ravel()
-        likeness = float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+        likeness = _likeness(moved, psfs[k])
         gap = min(abs(1 / depths[rest][j] - 1 / depths[k]) for j in used)
         missed.append((1 - likeness) * (wanted / gap) ** 2)
     return float(np.clip(1 - np.mean(missed), 0.0, 1.0))

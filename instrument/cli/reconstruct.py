@@ -16,7 +16,13 @@ from instrument.erasures import Choice
 from instrument.errors import BenchError
 from instrument.preparation import Crop
 from instrument.reconstruction_file import Outputs, write_reconstruction
-from instrument.reconstruction_job import DarkChoice, Job, job_from_calibration, job_from_files
+from instrument.reconstruction_job import (
+    DarkChoice,
+    Job,
+    job_from_calibration,
+    job_from_files,
+    refocused,
+)
 from recon import reconstruct as solve
 from recon.result import Reconstruction
 from recon.solvers.stopping import IterationRecord, StopReason
@@ -102,7 +108,10 @@ def reconstruct(
     z_mm: Annotated[
         float | None,
         typer.Option(
-            "--z-mm", metavar="MM", help="Distance of the scene: takes the nearest PSF.", show_default=False
+            "--z-mm",
+            metavar="MM",
+            help="Distance of the scene; a PSF is refocused to it.",
+            show_default=False,
         ),
     ] = None,
     dark: Annotated[
@@ -256,6 +265,8 @@ def reconstruct(
             allow_saturated=allow_saturated,
             mixed_depth=mixed_depth,
         )
+        if z_mm is not None:
+            job = refocused(job, 1e3 * z_mm)
         outputs.check(job.measurement.size, overwrite=force)
         for name, text in job.notes.items():
             typer.echo(f"{name:<12}{text}")

@@ -1,0 +1,265 @@
+"""Two calibrations of one camera compared: what moved, and whether to calibrate again.
+
+The new PSF is laid on the old one in blocks; from the blocks' displacements follow shift, scale and rotation
+by least squares. What is left then is a change of the pattern itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate, cut_to_light, similarity
+from recon.errors import InputError
+from recon.refocus import central_psfs, refocus
+from recon.registration import register
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+
+BLOCKS = 4
+"""Blocks along each side of the pattern."""
+ROUNDS = 3
+"""Times the blocks are measured, each time on what the last fit left."""
+WIDER = 1.1
+"""Spot that the old PSF makes of the new camera's light, over the sharpest: above this, calibrate again."""
+EDGE_PX = 0.5
+"""Displacement at the pattern's edge by scale or rotation that counts: a quarter of the smallest features."""
+SHIFT_PX = 1.0
+"""Shift from which pictures and depths of one calibration no longer lie on those of the other."""
+DIMMER = 0.2
+"""Relative change of brightness that is worth a word."""
+FRESH = 0.98
+"""Inner product after alignment below which the pattern has changed, if the spot has not grown as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What became of one PSF.
+
+    Attributes
+    ----------
+    z_um : float
+    rows, columns : float
+        By how much the pattern moved, pixels.
+    scale : float
+        Size of the new pattern over that of the old one.
+    rotation_deg : float or None
+        From the image's right towards its bottom; None where too few parts of the pattern were recognised.
+    as_is, aligned : float
+        Inner product at the best whole-pixel shift, and after shift, scale and rotation are undone.
+    spot : float
+        Spot size of the new camera with the old PSF over that with its own.
+    edge_px : float
+        How far scale and rotation move the pattern's edge.
+    brightness : float
+        Light of the new PSF over the old, at equal exposure where both calibrations know theirs.
+    """
+
+    z_um: float
+    rows: float
+    columns: float
+    scale: float
+    rotation_deg: float | None
+    as_is: float
+    aligned: float
+    spot: float
+    edge_px: float
+    brightness: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two calibrations compared.
+
+    Attributes
+    ----------
+    changes : tuple of Change
+        At up to three depths of the new calibration.
+    due : bool
+        Whether to calibrate again (to use the new calibration instead of the old).
+    reasons : tuple of str
+        Why, or why not, in sentences.
+    """
+
+    changes: tuple[Change, ...]
+    due: bool
+    reasons: tuple[str, ...]
+
+
+def compare(old: Calibration, new: Calibration) -> Comparison:
+    """Compare a calibration with an older one of the same camera.
+
+    Depths that the old one does not have are refocused. Shift alone moves pictures without blurring them; it
+    counts when it differs between depths, or for the position in space.
+
+    Raises
+    ------
+    InputError
+        When the PSFs differ in size, or depths are not known.
+    """
+    if old.psfs.shape[1:] != new.psfs.shape[1:]:
+        raise InputError(
+            f"The old PSFs are {old.psfs.shape[1:]} (channels, height, width), the new ones "
+            f"{new.psfs.shape[1:]}: only calibrations with the same region of interest and binning compare."
+        )
+    depths, planes = central_psfs(new)
+    chosen = sorted({0, len(depths) // 2, len(depths) - 1})
+    exposure = _exposure_ratio(old, new)
+    changes = []
+    for k in chosen:
+        reference = _at(old, float(depths[k]))
+        changes.append(compare_psfs(planes[k].mean(axis=0), reference, float(depths[k]), exposure))
+    distance_mm = new.geometry.diffuser_distance_mm
+    due, reasons = _verdict(changes, None if distance_mm is None else 1e3 * distance_mm)
+    return Comparison(tuple(changes), due, reasons)
+
+
+def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: float = 1.0) -> Change:
+    """Compare two PSFs (height, width); ``exposure`` is the new one's over the old one's."""
+    whole = register(new, old)
+    light = cut_to_light(old)
+    extent = 0.5 * float(np.hypot(*light.shape))
+    factor, shift, recognised = _fit(new, old, complex(whole.rows, whole.columns))
+    moved = _undone(new, factor, shift)
+    correlation = correlate(old, new)
+    own = autocorrelate(new)
+    return Change(
+        z_um=z_um,
+        rows=shift.real,
+        columns=shift.imag,
+        scale=abs(factor),
+        rotation_deg=float(-np.rad2deg(np.angle(factor))) if recognised else None,
+        as_is=correlation.maximum,
+        aligned=similarity(moved, old),
+        spot=_spot(correlation) / _spot(own),
+        edge_px=abs(factor - 1) * extent,
+        brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
+    )
+
+
+def _fit(new: Array, old: Array, shift: complex) -> tuple[complex, complex, bool]:
+    """Fit ``p_new = factor p_old + shift``, positions being ``row + i column`` from the image's centre."""
+    factor, found = 1.0 + 0j, False
+    for _ in range(ROUNDS):
+        places, displacements = _block_displacements(_undone(new, factor, shift), old)
+        if len(places) < 4:
+            break
+        found = True
+        # On the undone image: q = c p + t; q in the new image is factor q + shift.
+        matrix = np.stack([places, np.ones_like(places)], axis=1)
+        (c, t), *_ = np.linalg.lstsq(matrix, places + displacements, rcond=None)
+        shift, factor = shift + factor * t, factor * c
+    return complex(factor), complex(shift), found
+
+
+def _block_displacements(
+    moved: Array, old: Array
+) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
+    rows, columns = (np.flatnonzero(old.max(axis=1 - a) > 0.01 * old.max()) for a in (0, 1))
+    places, displacements = [], []
+    height, width = old.shape
+    edges_y = np.linspace(rows[0], rows[-1] + 1, BLOCKS + 1).astype(int)
+    edges_x = np.linspace(columns[0], columns[-1] + 1, BLOCKS + 1).astype(int)
+    for top, bottom in pairwise(edges_y):
+        for left, right in pairwise(edges_x):
+            one, two = (image[top:bottom, left:right] for image in (moved, old))
+            if min(one.shape) < 8 or not (np.ptp(one) > 0 and np.ptp(two) > 0):
+                continue
+            found = register(one, two)
+            if found.reliable and max(abs(found.rows), abs(found.columns)) < 0.25 * min(one.shape):
+                places.append(complex((top + bottom - height) / 2, (left + right - width) / 2))
+                displacements.append(complex(found.rows, found.columns))
+    return np.array(places, np.complex128), np.array(displacements, np.complex128)
+
+
+def _undone(image: Array, factor: complex, shift: complex) -> npt.NDArray[np.float32]:
+    """Return ``image(factor p + shift)``: cubic splines, zero beyond the border."""
+    from scipy import ndimage
+
+    # (r + i c)(a + i b) = (a r - b c) + i (b r + a c)
+    matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    centre = (np.array(image.shape) - 1) / 2
+    offset = centre + np.array([shift.real, shift.imag]) - matrix @ centre
+    result: npt.NDArray[np.float32] = ndimage.affine_transform(
+        np.asarray(image, np.float32), matrix, offset, order=3
+    )
+    return np.maximum(result, 0)
+
+
+def _spot(correlation: Any) -> float:
+    return float(
+        np.sqrt(correlation.half_width(0, RESOLUTION_LEVEL) * correlation.half_width(1, RESOLUTION_LEVEL))
+    )
+
+
+def _at(old: Calibration, z_um: float) -> Array:
+    depths, planes = central_psfs(old)
+    nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
+    if abs(depths[nearest] / z_um - 1) < 1e-6:
+        return np.asarray(planes[nearest].mean(axis=0))
+    return np.asarray(refocus(old, z_um).psf.mean(axis=0))
+
+
+def _exposure_ratio(old: Calibration, new: Calibration) -> float:
+    before, after = (c.provenance.get("reference_exposure_ms") for c in (old, new))
+    if isinstance(before, int | float) and isinstance(after, int | float) and min(before, after) > 0:
+        return after / before
+    return 1.0
+
+
+def _verdict(changes: list[Change], distance_um: float | None) -> tuple[bool, tuple[str, ...]]:
+    due, reasons = False, []
+    spot = max(c.spot for c in changes)
+    edge = max(changes, key=lambda c: c.edge_px)
+    if spot > WIDER:
+        due = True
+        reasons.append(f"With the old PSFs, spots come out {spot:.2f} times as wide as they could be.")
+    if edge.edge_px > EDGE_PX:
+        due = True
+        turned = "" if not edge.rotation_deg else f" and turned by {edge.rotation_deg:+.2f} degrees"
+        cause = ""
+        if distance_um is not None and np.isfinite(edge.z_um) and abs(edge.scale - 1) > 1e-4:
+            # scale = (1 + d'/z) / (1 + d/z)
+            change_um = (edge.scale - 1) * (edge.z_um + distance_um)
+            cause = (
+                f" If the diffuser moved, it is {abs(change_um):.3g} um "
+                f"{'farther from' if change_um > 0 else 'nearer to'} the sensor."
+            )
+        reasons.append(
+            f"The pattern is {edge.scale - 1:+.2%} in size{turned}, {edge.edge_px:.2g} pixels at its "
+            f"edge.{cause}"
+        )
+    least = min(c.aligned for c in changes)
+    if least < FRESH:
+        due = due or spot > WIDER or least < FRESH - 0.08
+        reasons.append(
+            f"Even aligned, the patterns are only {least:.3f} alike: noise, dust, or another tilt or place "
+            "of the diffuser."
+        )
+    shifts = np.array([[c.rows, c.columns] for c in changes])
+    largest = float(np.hypot(*shifts.T).max())
+    spread = float(np.hypot(*np.ptp(shifts, axis=0)))
+    if spread > SHIFT_PX:
+        due = True
+        reasons.append(
+            f"The shift differs by {spread:.2g} pixels between depths: the line of the source or the "
+            "diffuser moved sideways, and volumes would be sheared."
+        )
+    elif largest > SHIFT_PX:
+        reasons.append(
+            f"The pattern moved by {largest:.3g} pixels: pictures move by as much, and stay as sharp."
+        )
+    brightness = float(np.median([c.brightness for c in changes]))
+    if abs(brightness - 1) > DIMMER:
+        reasons.append(
+            f"The light is {brightness:.2f} times what it was: check lamp and exposure; sharpness does not "
+            "depend on it."
+        )
+    if not due:
+        reasons.insert(0, "The old calibration still serves.")
+    return due, tuple(reasons)

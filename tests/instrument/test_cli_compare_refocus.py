@@ -1,0 +1,106 @@
+"""``diffuserbench compare`` and ``refocus``, and ``reconstruct --z-mm`` between calibrated depths."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
+from instrument.calibration_file import load_calibration, save_calibration
+from instrument.cli import main
+from recon.types import Calibration
+
+WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+GREEN = (0.0, 1.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Hold a calibration at 60 and 100 mm, another camera's, and a photograph of a point at 75 mm."""
+    here = tmp_path_factory.mktemp("refocus")
+    for name, world in (
+        ("calibration", WORLD),
+        ("other", SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0, diffuser_seed=3))),
+    ):
+        psfs = np.stack([world.psf((0.0, 0.0, z), GREEN) for z in (60e3, 100e3)])[:, None]
+        save_calibration(
+            Calibration(
+                psfs * np.float32(1e3 / psfs.max()),
+                np.array([(0.0, 0.0, z) for z in (60e3, 100e3)]),
+                geometry=world.geometry,
+                provenance={"simulated": True},
+            ),
+            here / name,
+        )
+    light = WORLD.psf((0.0, 0.0, 75e3), GREEN)
+    tifffile.imwrite(here / "photo.tif", (light * (50_000 / light.max())).astype(np.uint16))
+    return here
+
+
+def test_a_psf_at_another_depth_is_a_calibration(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "at75"
+    words = ["refocus", str(folder / "calibration"), "--z-mm", "75", "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "60 and 100 mm" in said
+    assert "SIMULATED" in said
+    made = load_calibration(out)
+    assert made.source_positions_um[0, 2] == 75e3
+    assert made.quality["refocused"][0]["from_z_um"] == [60e3, 100e3]
+    truth = WORLD.psf((0.0, 0.0, 75e3), GREEN)
+    psf = made.psfs[0, 0]
+    assert np.vdot(psf, truth) / np.linalg.norm(psf) / np.linalg.norm(truth) > 0.98
+    assert main(words) == 2  # it is there already
+    assert main([*words, "--force"]) == 0
+
+
+@pytest.mark.parametrize("depths", [["--z-mm", "0"], ["--z-mm", "75", "--z-mm", "75"]])
+def test_depths_that_make_no_sense_are_refused(depths: list[str], folder: Path, tmp_path: Path) -> None:
+    assert main(["refocus", str(folder / "calibration"), *depths, "--out", str(tmp_path / "x")]) == 2
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_reconstruction_between_depths_says_how_its_psf_was_made(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "reconstruct",
+        "--calibration",
+        str(folder / "calibration"),
+        "--image",
+        str(folder / "photo.tif"),
+    ]
+    words += ["--dark", "0", "--method", "wiener", "--tau", "0.01", "--force"]
+    peaks = {}
+    for z_mm in ("75", "60"):
+        out = tmp_path / f"{z_mm}.tif"
+        assert main([*words, "--z-mm", z_mm, "--out", str(out)]) == 0
+        image = tifffile.imread(out)
+        peaks[z_mm] = float(image.max() / np.abs(image).sum())
+        said = capsys.readouterr().out
+        assert ("refocused to 75 mm" in said) == (z_mm == "75")
+    assert peaks["75"] > 1.5 * peaks["60"]  # in focus
+    assert json.loads((tmp_path / "75.json").read_text())
+
+
+def test_comparing_tells_whether_a_calibration_is_due(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = str(folder / "calibration")
+    assert main(["compare", same, same]) == 0
+    assert "No recalibration is due" in capsys.readouterr().out
+    out = tmp_path / "bump.json"
+    assert main(["compare", same, str(folder / "other"), "--out", str(out)]) == 1
+    assert "RECALIBRATE" in capsys.readouterr().out
+    record = json.loads(out.read_text())
+    assert record["due"] is True
+    assert len(record["changes"]) == 2
+    assert main(["compare", same, same, "--out", str(out)]) == 2
+    assert main(["compare", same, str(tmp_path / "nothing")]) == 2

@@ -1,0 +1,108 @@
+"""Comparing calibrations: what was done to the simulated camera is what is found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from drivers.simulated.options import WorldOptions
+from drivers.simulated.world import SimulatedWorld
+from recon.analysis.compare import compare, compare_psfs
+from recon.errors import InputError
+from recon.types import Calibration
+
+GREEN = (0.0, 1.0, 0.0)
+DEPTHS_UM = (60e3, 120e3)
+
+
+def world(**options: float) -> SimulatedWorld:
+    return SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0, **options))  # type: ignore[arg-type]
+
+
+PSF = world().psf((0.0, 0.0, 100e3), GREEN)
+
+
+def noisy(psf: np.ndarray, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    counts = np.maximum(psf, 0) * (3000 / psf.max())
+    return np.maximum(rng.poisson(counts) + rng.normal(0, 2, psf.shape), 0).astype(np.float32)
+
+
+def calibration(
+    camera: SimulatedWorld, *, x_um: float = 0.0, seed: int = 0, exposure: float = 1.0
+) -> Calibration:
+    psfs = np.stack([noisy(camera.psf((x_um, 0.0, z), GREEN), seed) for z in DEPTHS_UM])[:, None]
+    return Calibration(
+        psfs * np.float32(exposure),
+        np.array([(0.0, 0.0, z) for z in DEPTHS_UM]),
+        geometry=camera.geometry,
+        provenance={"reference_exposure_ms": exposure},
+    )
+
+
+@pytest.mark.parametrize("angle_deg", [0.4, -0.8])
+def test_shift_scale_and_rotation_are_found(angle_deg: float) -> None:
+    """The pattern is turned, enlarged and moved by interpolation; the comparison fits blocks."""
+    scale, shift, angle = 1.004, np.array([2.3, -4.6]), np.deg2rad(angle_deg)
+    # From the right (columns) towards the bottom (rows).
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    inverse = np.linalg.inv(scale * turn)
+    centre = (np.array(PSF.shape) - 1) / 2
+    moved = ndimage.affine_transform(PSF, inverse, centre - inverse @ (centre + shift), order=3)
+    change = compare_psfs(noisy(moved), noisy(PSF, 1))
+    assert (change.rows, change.columns) == pytest.approx(tuple(shift), abs=0.1)
+    assert change.scale == pytest.approx(scale, abs=3e-4)
+    assert change.rotation_deg == pytest.approx(angle_deg, abs=0.02)
+    assert change.aligned > change.as_is
+    assert change.aligned > 0.98
+
+
+def test_nothing_happened() -> None:
+    found = compare(calibration(world()), calibration(world(), seed=5))
+    assert not found.due
+    assert "still serves" in found.reasons[0]
+    assert all(c.spot < 1.05 and c.brightness == pytest.approx(1, abs=0.02) for c in found.changes)
+
+
+def test_a_diffuser_that_moved_away_is_named_with_its_distance() -> None:
+    """0.15 mm farther from the sensor: the pattern grows by d'/z over d/z, which refocusing cannot undo."""
+    found = compare(calibration(world()), calibration(world(diffuser_distance_mm=9.05), seed=1))
+    changes = found.changes[0]
+    assert changes.scale == pytest.approx((1 + 9.05 / 60) / (1 + 8.9 / 60), abs=8e-4)
+    shifted_only = compare(calibration(world()), calibration(world(), x_um=500.0, seed=2))
+    assert shifted_only.due  # the shift differs between depths: the source's line moved
+    assert "differs" in " ".join(shifted_only.reasons)
+
+
+def test_another_diffuser_is_another_calibration() -> None:
+    found = compare(calibration(world()), calibration(world(diffuser_seed=9)))
+    assert found.due
+    assert min(c.aligned for c in found.changes) < 0.9
+
+
+def test_brightness_is_compared_at_equal_exposure() -> None:
+    same = compare(calibration(world()), calibration(world(), exposure=2.0))
+    assert same.changes[0].brightness == pytest.approx(1.0, rel=0.02)
+    dim = calibration(world())
+    dimmed = Calibration(
+        dim.psfs * np.float32(0.5), dim.source_positions_um, geometry=dim.geometry, provenance=dim.provenance
+    )
+    found = compare(calibration(world()), dimmed)
+    assert not found.due
+    assert any("0.50 times" in reason for reason in found.reasons)
+
+
+def test_depths_that_the_old_one_lacks_are_refocused() -> None:
+    old = calibration(world())
+    psfs = noisy(world().psf((0.0, 0.0, 80e3), GREEN))[None, None]
+    new = Calibration(psfs, np.array([(0.0, 0.0, 80e3)]), geometry=old.geometry)
+    found = compare(old, new)
+    assert found.changes[0].aligned > 0.95
+
+
+def test_sizes_must_agree() -> None:
+    old = calibration(world())
+    small = Calibration(old.psfs[..., :100, :100].copy(), old.source_positions_um, geometry=old.geometry)
+    with pytest.raises(InputError, match="region of interest"):
+        compare(old, small)
