@@ -10,8 +10,9 @@ import typer
 from rich.console import Console
 
 from calibration_routines import AxialSweep, GridSweep, PointSweep, axial_planes, grid_sweep
+from calibration_routines.angular_response import load_response
 from instrument.bench import Bench
-from instrument.cli import calibrate_slm
+from instrument.cli import calibrate_angular, calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.sweeping import take_sweep
 from instrument.errors import BenchError
@@ -76,6 +77,10 @@ FallOffDeg = Annotated[
     float | None,
     typer.Option("--fall-off-deg", metavar="DEG", help="Standard deviation of a Gaussian angular response."),
 ]
+ResponseFile = Annotated[
+    Path | None,
+    typer.Option("--response", metavar="FILE", help="Angular response, from calibrate angular."),
+]
 
 
 @app.callback()
@@ -84,6 +89,7 @@ def calibrate() -> None:
 
 
 app.command(epilog=calibrate_slm.EPILOG)(calibrate_slm.slm)
+app.command(epilog=calibrate_angular.EPILOG)(calibrate_angular.angular)
 
 
 @app.command(
@@ -157,6 +163,7 @@ def lateral(
     half_field_x: HalfField = None,
     half_field_y: HalfField = None,
     spacing: Spacing = None,
+    response: ResponseFile = None,
     fall_off_deg: FallOffDeg = None,
     average: Average = 4,
     dark_frames: DarkFrames = 4,
@@ -178,11 +185,12 @@ def lateral(
     """
     blank = _point_sweep("lateral", average, dark_frames, target, dct, binning, reference_every)
     half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
+    fall_off = _fall_off(response, fall_off_deg)
     with open_and_say(bench) as opened:
         grid = grid_sweep(
             opened,
             (1e3 * z,),
-            response=_fall_off(fall_off_deg),
+            response=fall_off,
             half_field_um=half_field,
             spacing_um=spacing_um,
             x_um=1e3 * x,
@@ -206,6 +214,7 @@ def volume(
     half_field_x: HalfField = None,
     half_field_y: HalfField = None,
     spacing: Spacing = None,
+    response: ResponseFile = None,
     fall_off_deg: FallOffDeg = None,
     lenslet: Lenslet = None,
     wavelength: Wavelength = None,
@@ -227,6 +236,7 @@ def volume(
     """
     blank = _point_sweep("volume", average, dark_frames, target, dct, binning, reference_every)
     half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
+    fall_off = _fall_off(response, fall_off_deg)
     with open_and_say(bench) as opened:
         reasons: tuple[str, ...] = ()
         if planes is None:
@@ -240,7 +250,7 @@ def volume(
         grid = grid_sweep(
             opened,
             depths,
-            response=_fall_off(fall_off_deg),
+            response=fall_off,
             half_field_um=half_field,
             spacing_um=spacing_um,
             x_um=1e3 * x,
@@ -286,7 +296,11 @@ def _said(grid: GridSweep) -> tuple[str, ...]:
     return (*grid.reasons, f"Grid: {' to '.join(sizes)} points (y x x) at each depth")
 
 
-def _fall_off(sigma_deg: float | None) -> FallOff | None:
+def _fall_off(file: Path | None, sigma_deg: float | None) -> FallOff | None:
+    if file is not None and sigma_deg is not None:
+        raise BenchError("Give --response or --fall-off-deg, not both.")
+    if file is not None:
+        return load_response(file).fall_off()
     if sigma_deg is None:
         return None
     if not 0 < sigma_deg < 90:

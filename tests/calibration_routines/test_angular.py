@@ -1,0 +1,99 @@
+"""The sensor's angular response on the simulated bench, against the response that it was given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
+from calibration_routines.angular_response import AngularResponse, Curve, load_response
+from calibration_routines.errors import CalibrationError
+from drivers.simulated.world import SimulatedWorld
+from instrument.bench import Bench, open_bench
+from instrument.config_file import parse_config
+from instrument.errors import BenchError
+from recon.optics.fall_off import gaussian_fall_off
+
+TINY = """
+[camera]
+driver = "simulated"
+binning = 2
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+fall_off = "gaussian"
+fall_off_sigma_deg = 6
+"""
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with open_bench(parse_config(TINY, None)) as opened:
+        assert opened.stage is not None
+        opened.stage.home()
+        yield opened
+
+
+def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: Path) -> None:
+    response, file = measure_angular_response(bench, AngularSweep(150e3, 14.0, 2.0, average=2), tmp_path)
+    world = bench.shared["simulated"]
+    assert isinstance(world, SimulatedWorld)
+    assert response.findings == ()
+    assert response.simulated
+    for curve, axis in ((response.along_x, 1), (response.along_y, 0)):
+        tangents = np.tan(np.deg2rad(curve.angles_deg))
+        zero = np.zeros_like(tangents)
+        truth = world.fall_off(zero, tangents) if axis else world.fall_off(tangents, zero)
+        assert np.abs(np.array(curve.response) - truth).max() < 0.02
+        assert curve.cut_off_deg == pytest.approx(6 * np.sqrt(2 * np.log(5)), abs=0.2)
+        assert min(curve.seen) < 0.5  # the sensor's edge cut patterns, and it made no difference
+    loaded = load_response(file)
+    assert loaded == response
+    tan_y, tan_x = (np.tan(np.deg2rad(v)) for v in np.meshgrid([-6.0, 0, 4], [-5.0, 0, 7], indexing="ij"))
+    np.testing.assert_allclose(loaded.fall_off()(tan_y, tan_x), world.fall_off(tan_y, tan_x), atol=0.03)
+
+
+def test_an_angle_out_of_reach_is_refused_before_anything_moves(bench: Bench) -> None:
+    assert farthest_um(bench, 45.0) == pytest.approx(0.98 * 60e3)
+    assert farthest_um(bench, 5.0) == pytest.approx(300e3)
+    with pytest.raises(BenchError, match="out of its reach"):
+        farthest_um(bench, 83.0)
+    with pytest.raises(BenchError, match="step <= largest"):
+        AngularSweep(1e5, 10.0, 20.0)
+
+
+def test_curves_between_the_axes_follow_a_gaussian_of_two_widths() -> None:
+    angles = tuple(range(-40, 41, 4))
+    truth = gaussian_fall_off(10.0, 20.0)
+
+    def curve(sigma: float) -> Curve:
+        values = tuple(float(np.exp(-0.5 * (a / sigma) ** 2)) for a in angles)
+        return Curve(tuple(map(float, angles)), values, (1.0,) * len(angles))
+
+    fitted = AngularResponse(curve(20.0), curve(10.0)).fall_off()
+    y, x = np.meshgrid(*2 * [np.tan(np.deg2rad(np.arange(-20, 21, 5.0)))], indexing="ij")
+    np.testing.assert_allclose(fitted(y, x), truth(y, x), atol=0.02)
+
+
+def test_a_cut_off_that_was_not_reached_is_none() -> None:
+    curve = Curve((-10.0, -5.0, 0.0, 5.0, 10.0), (0.1, 0.5, 1.0, 0.6, 0.4), (1.0,) * 5)
+    assert curve.cut_offs_deg() == (pytest.approx(8.75), None)
+    assert curve.cut_off_deg == pytest.approx(8.75)
+
+
+def test_a_file_that_is_no_response_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"format": "else"}')
+    for name in ("a.json", "missing.json"):
+        with pytest.raises(CalibrationError, match=name):
+            load_response(tmp_path / name)
