@@ -124,19 +124,16 @@ def unpack(data: Bytes, packing: Packing, out: Pixels, line_bytes: int | None = 
         return False
     if len(data) < n_lines * pitch:  # padding of the last line that was not sent
         data = np.concatenate([data, np.zeros(n_lines * pitch - len(data), np.uint8)])
-    rows = data[: n_lines * pitch].reshape(n_lines, pitch)[:, :used]
+    rows = data[: n_lines * pitch].reshape(n_lines, pitch)
     if packing == "bytes":
-        lines[...] = rows
-    elif packing == "words":
-        lines[...] = rows.view("<u2") if rows.flags.c_contiguous else np.ascontiguousarray(rows).view("<u2")
-    elif packing == "big words":
-        lines[...] = np.ascontiguousarray(rows).view(">u2")
-    elif width % group_pixels == 0:
-        _unpack_groups(rows.reshape(n_lines, n_groups, group_bytes), packing, lines)
+        lines[...] = rows[:, :used]
+    elif packing in ("words", "big words"):
+        lines[...] = np.ascontiguousarray(rows[:, :used]).view("<u2" if packing == "words" else ">u2")
     else:
-        whole = np.empty((n_lines, n_groups * group_pixels), np.uint16)
-        _unpack_groups(rows.reshape(n_lines, n_groups, group_bytes), packing, whole)
-        lines[...] = whole[:, :width]
+        from drivers.unpacking import KERNELS  # numba takes a while to import: only where it is needed
+
+        rows.flags.writeable = False  # always: else numba would compile once more for those that are not
+        KERNELS[packing](rows, lines)  # type: ignore[arg-type]  # packed formats are all of 16 bits
     return True
 
 
@@ -151,40 +148,7 @@ def _needed(packing: Packing, width: int) -> int:
     return whole + (group_bytes if bits is None else -(-rest * bits // 8))
 
 
-def _unpack_groups(groups: Bytes, packing: Packing, out: Pixels) -> None:
-    """Unpack ``(lines, groups, bytes)`` into ``(lines, pixels)``, whole groups."""
-    byte = [groups[..., i] for i in range(groups.shape[-1])]
-    match packing:
-        case "lsb 10":  # the bits of four pixels one after another, lowest first
-            for i in range(4):
-                low = byte[i] >> np.uint8(2 * i)
-                out[:, i::4] = _word(low, byte[i + 1] & np.uint8(_mask(2 * i + 2)), 8 - 2 * i)
-        case "lsb 12":
-            out[:, 0::2] = _word(byte[0], byte[1] & np.uint8(0x0F), 8)
-            out[:, 1::2] = _word(byte[1] >> np.uint8(4), byte[2], 4)
-        case "gige 10":  # high bytes first and last, the low two bits of both in the nibbles between
-            out[:, 0::2] = _word(byte[1] & np.uint8(0x03), byte[0], 2)
-            out[:, 1::2] = _word((byte[1] >> np.uint8(4)) & np.uint8(0x03), byte[2], 2)
-        case "gige 12":
-            out[:, 0::2] = _word(byte[1] & np.uint8(0x0F), byte[0], 4)
-            out[:, 1::2] = _word(byte[1] >> np.uint8(4), byte[2], 4)
-        case "mipi 10":  # four high bytes, then the low two bits of each
-            for i in range(4):
-                out[:, i::4] = _word((byte[4] >> np.uint8(2 * i)) & np.uint8(0x03), byte[i], 2)
-        case "mipi 12":
-            out[:, 0::2] = _word(byte[2] & np.uint8(0x0F), byte[0], 4)
-            out[:, 1::2] = _word(byte[2] >> np.uint8(4), byte[1], 4)
-        case _:
-            raise ValueError(f"{packing!r} is not packed")
-
-
-def _word(low: Bytes, high: Bytes, shift: int) -> npt.NDArray[np.uint16]:
-    """Return ``low + (high << shift)`` as 16-bit words."""
-    word = high.astype(np.uint16)
-    word <<= np.uint16(shift)
-    word |= low
-    return word
-
-
-def _mask(bits: int) -> int:
-    return (1 << bits) - 1
+def prepare(packing: Packing) -> None:
+    """Have what unpacks a packing ready, so that the first frame need not wait for its compilation."""
+    if packing not in ("bytes", "words", "big words"):
+        unpack(np.zeros(8, np.uint8), packing, np.empty((1, 4), np.uint16))

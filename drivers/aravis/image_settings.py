@@ -9,7 +9,7 @@ from drivers.aravis.settings import AravisSettings
 from drivers.camera import Roi, TriggerMode
 from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
-from drivers.pixels import PixelFormat, genicam_format
+from drivers.pixels import PixelFormat, genicam_format, prepare
 
 
 class AravisImageSettings(AravisSettings):
@@ -119,6 +119,7 @@ class AravisImageSettings(AravisSettings):
 
     def _apply_format(self, pixel_format: str) -> None:
         self._format_name = self._features.choose("PixelFormat", pixel_format)
+        prepare(self._formats[pixel_format].packing)
 
     # Region and binning ----------------------------------------------------------------------------
     @property

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from drivers.camera import Roi, TriggerMode
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
+from drivers.pixels import prepare
 from drivers.v4l2.formats import V4l2Format
 from drivers.v4l2.geometry import (
     crop,
@@ -130,6 +131,7 @@ class V4l2ImageSettings(V4l2Settings):
                 *self.options.size,
             )
         self._format, self._made = wanted, made
+        prepare(wanted.pixels.packing)
         self._can_crop = region is not None and (region.height, region.width) == (made.height, made.width)
         self._origin = (region.top, region.left) if self._can_crop and region is not None else (0, 0)
         self._roi = self._whole = Roi(0, 0, made.height, made.width)

@@ -16,7 +16,7 @@ from drivers.aravis.camera import AravisCamera
 from drivers.camera import Roi
 from drivers.claim import DeviceBusyError
 from drivers.errors import DeviceError, DeviceLostError, LimitError
-from tests.drivers.contract_camera import CameraContract
+from drivers.testing.camera import CameraContract
 from tests.mocks.gige_cameras import (
     ADDRESS,
     ArvFakeCamera,
