@@ -174,7 +174,7 @@ class CompositeStage(Stage):
             driver=_NAME,
             vendor=" + ".join(dict.fromkeys(identity.vendor for identity in found)),
             model=" + ".join(identity.model for identity in found),
-            serial_number=" + ".join(identity.serial_number for identity in found),
+            serial_number=" + ".join(identity.serial_number or "none" for identity in found),
             firmware=" + ".join(identity.firmware for identity in found),
             simulated=any(identity.simulated for identity in found),
         )

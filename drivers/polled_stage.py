@@ -114,7 +114,7 @@ class PolledStage(Stage):
     # Device ----------------------------------------------------------------------------------------
     def open(self) -> None:
         """Connect and stop whatever moves; see the interface."""
-        if self.is_open:
+        if self._identity is not None and self._is_connected:
             return
         self._disconnect()  # what a lost connection left behind
         try:
@@ -134,12 +134,14 @@ class PolledStage(Stage):
             raise
 
     def close(self) -> None:
-        """Stop whatever moves and disconnect. Of a stage that was lost only the connection is closed."""
+        """Stop whatever moves and disconnect; of a stage that was lost, what can still be reached."""
         if self._identity is None:
             return
         try:
             if self._is_connected:
                 self.stop()
+            else:
+                self._halt_what_is_left()
         finally:
             self._identity = None
             self._disconnect()
@@ -276,7 +278,8 @@ class PolledStage(Stage):
         seen_moving, rested_s = False, None
         while not motion.ended:
             if motion.interrupted.is_set():
-                motion.decided.wait()  # stop() always decides
+                if not motion.decided.wait(2 * self.stop_s):  # stop() itself was interrupted
+                    motion.ended = motion.stopped = True
                 break
             try:
                 state = self._ask()
@@ -370,6 +373,12 @@ class PolledStage(Stage):
                     "Switch off its power.",
                 )
             time.sleep(self.poll_s)
+
+    def _halt_what_is_left(self) -> None:
+        try:
+            self._halt()
+        except DeviceError as error:  # said when the connection was lost
+            _log.info("%s: closed without a stop: %s", self.name, error)
 
     def _halt_after(self, error: DeviceError) -> None:
         """Stop every axis because one failed; that this fails too becomes a note."""

@@ -224,6 +224,11 @@ class InertiaUnit:
             else:
                 self._waiting[channel] = target
 
+    def forget(self) -> None:
+        """Let no move that waited when the connection was lost begin after it came back."""
+        self._waiting = {}
+        self._current = None
+
     def stop(self, channel: int) -> None:
         """Stop whatever moves; from any thread, and whatever reply is awaited."""
         self._stops += 1  # whoever is about to begin a move sees it
@@ -257,6 +262,7 @@ class InertiaChannel:
 
     def prepare(self) -> None:
         """Forget the zero unless the steps say that the unit was under power all the time."""
+        self._unit.forget()
         self._link.send(short(HW_STOP_UPDATEMSGS, self._address))
         last = self._last
         self._zeroed = self._zeroed and last != 0 and self.state().counts == last

@@ -23,7 +23,7 @@ from drivers.serial_transport import SerialTransport
 
 _log = logging.getLogger(__name__)
 _BAUD_RATE = 115_200
-_ATTEMPTS = 3
+_ATTEMPTS = 2  # and the transport's probes in between
 _REPLY_S = 0.5
 _INFO = struct.Struct("<l8sH4B60sHHH")
 _COMPLAINT = struct.Struct("<HH64s")
@@ -81,7 +81,7 @@ class Link:
         self._transport.close()
 
     def ask(self, request: bytes, number: int, source: int | None, channel: int | None = None) -> Message:
-        """Send a request, up to three times, and return its reply.
+        """Send a request, again if need be, and return its reply.
 
         Parameters
         ----------

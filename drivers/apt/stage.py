@@ -88,6 +88,11 @@ class AptStage(PolledStage):
         ports = dict.fromkeys(axis.port for axis in self.options.axes.values())
         return f"stage (apt, {', '.join(ports)})"
 
+    @property
+    def is_open(self) -> bool:
+        """Whether any controller is connected, so that its axes are stopped when another was lost."""
+        return self._identity is not None and any(link.is_open for link in self._links.values())
+
     # The protocol ----------------------------------------------------------------------------------
     @property
     def _is_connected(self) -> bool:

@@ -20,6 +20,8 @@ from drivers.zaber.chain import Chain
 from drivers.zaber.protocol import FAULTS, NO_REFERENCE, SPEED_FACTOR, flag_words
 
 _log = logging.getLogger(__name__)
+_SETTLING_UM = 1.0
+_SETTLING_MRAD = 0.02
 
 
 class ZaberAxis(AxisOptions):
@@ -213,6 +215,10 @@ class ZaberStage(PolledStage):
             self._chain.ask("warnings clear", axis.device, axis.axis)
             self._chain.ask("home", axis.device, axis.axis)
         self._lost_reference.clear()
+
+    def _tolerance(self, axis: StageAxis) -> float:
+        """Return how far from its target an axis may rest: steppers are exact, direct drives settle."""
+        return max(1.01 * axis.resolution, _SETTLING_UM if axis.unit == "um" else _SETTLING_MRAD)
 
     def _halt(self) -> None:
         self._chain.stop()

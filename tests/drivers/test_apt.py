@@ -196,6 +196,9 @@ def test_axes_of_several_controllers_move_together(
     stage.stop()
     assert not servo.axes[0].motion.moving
     assert not rack.axes[0].motion.moving
+    at_once = bytes.fromhex("65 04 01 01")
+    assert at_once + b"\x50\x01" in servo.port.received
+    assert at_once + b"\x21\x01" in rack.port.received
 
 
 def test_status_is_had_for_as_long_as_one_likes(stage: AptStage) -> None:
@@ -278,9 +281,10 @@ def test_unplugged_and_plugged_in_again(stage: AptStage, servo: AptController) -
     servo.port.unplug()
     with pytest.raises(DeviceError, match="apt"):
         stage.wait(10.0)
-    assert not stage.is_open
+    assert stage.is_open  # what is left can be stopped
     with pytest.raises(DeviceError, match="no port"):
         stage.open()
+    assert not stage.is_open
     servo.axes[0].enabled = False  # it lost its power
     servo.axes[0].motion.homed = False
     servo.port.plug_in()
@@ -313,6 +317,37 @@ def test_channels_of_an_inertia_drive_take_turns(inertia: AptController) -> None
         with pytest.raises(StoppedError):
             stage.wait(10.0)
         assert inertia.axes[1].motion.place == -1000
+
+
+def test_a_move_that_waited_does_not_begin_after_reconnecting(inertia: AptController) -> None:
+    stage = stage_of(x_um=inertia_axis(inertia, 1), y_um=inertia_axis(inertia, 2))
+    stage.open()
+    stage.home()
+    stage.move_to({"x_um": 60.0, "y_um": 60.0}, wait=False)
+    inertia.port.unplug()
+    while stage.is_open:
+        time.sleep(0.01)
+    for axis in inertia.axes:
+        axis.motion.halt()
+    time.sleep(0.35)  # after that a move counts as ended
+    sent = len(inertia.port.received)
+    inertia.port.plug_in()
+    with stage:
+        assert not stage.is_moving
+    assert not any(message.startswith(b"\xd4\x08") for message in inertia.port.received[sent:])
+
+
+def test_closing_stops_the_controllers_that_are_left(
+    stage: AptStage, servo: AptController, rack: AptController
+) -> None:
+    stage.move_to({"x_um": 6000.0, "z_um": -8000.0}, wait=False)
+    servo.port.unplug()
+    while stage._is_connected:
+        time.sleep(0.005)
+    stage.close()
+    wait_for(lambda: not rack.axes[0].motion.moving)
+    assert rack.axes[0].motion.place < 6_553_600
+    servo.port.plug_in()
 
 
 def test_the_zero_of_an_inertia_drive_is_kept_as_long_as_its_power(inertia: AptController) -> None:

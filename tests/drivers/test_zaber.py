@@ -201,6 +201,17 @@ def test_damaged_replies_are_asked_for_again(
     assert stage.move_to({"x_um": 700.0})["x_um"] == 700.0
 
 
+def test_a_late_reply_is_not_taken_for_the_answer_to_the_next_question(
+    stage: ZaberStage, chain: ZaberChain
+) -> None:
+    def answer_late_and_move(reply: bytes) -> list[Answer]:
+        chain.devices[1].axes[0].set_place(998)
+        return [0.8, reply]
+
+    chain.spoil.append(answer_late_and_move)
+    assert stage.position()["x_um"] == 499.0
+
+
 def test_silence_names_the_device_that_is_silent(stage: ZaberStage, chain: ZaberChain) -> None:
     del chain.devices[2]
     with pytest.raises(DeviceTimeoutError, match=r"device 2 did not answer 'get pos'"):
