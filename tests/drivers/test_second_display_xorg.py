@@ -1,7 +1,8 @@
 """The SLM as second display on a real X server with two outputs: exact by screenshot, unplugged while open.
 
-Needs Xorg with its dummy driver (Debian: xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils
-libxcb-cursor0 libxcb-icccm4 libxcb-keysyms1); skipped where that is not installed.
+A Wayland desktop (weston) with two outputs runs as a client of the same server. Needs Xorg with its dummy
+driver (Debian: xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils libxcb-cursor0 libxcb-icccm4
+libxcb-keysyms1, weston); skipped where that is not installed.
 """
 
 from __future__ import annotations
@@ -79,8 +80,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     reading, writing = os.pipe()
     log = (folder / "output").open("wb")
     files = ("-config", str(folder / "xorg.conf"), "-logfile", str(folder / "log"))
+    alone = ("-nolisten", "tcp", "-noreset", "-novtswitch", "-sharevts")
     process = subprocess.Popen(
-        [XORG, "-displayfd", str(writing), *files, "-nolisten", "tcp", "-noreset"],
+        [XORG, "-displayfd", str(writing), *files, *alone],
         pass_fds=(writing,),
         stdout=log,
         stderr=log,
@@ -258,6 +260,49 @@ def test_the_x_server_keeps_its_screen_saver_off(server: str) -> None:
         assert until(lambda: screen_saver_is_on(server))
     finally:
         subprocess.run(["xset", "s", "off"], check=True)
+
+
+@pytest.fixture
+def wayland(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
+    """A Wayland desktop whose two outputs are windows of the X server, the second on top; its shape."""
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    two = ("--output-count=2", "--width=640", "--height=480")
+    process = subprocess.Popen(
+        ["weston", "--backend=x11-backend.so", *two, "--use-pixman", "--no-config", "--socket=wayland-slm"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        assert until((tmp_path / "wayland-slm").exists)
+        monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-slm")
+        monkeypatch.setenv("QT_QPA_PLATFORM", "wayland")
+        yield 480, 640
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@pytest.mark.usefixtures("outputs")
+@pytest.mark.skipif(shutil.which("weston") is None, reason="weston is not installed: no test on Wayland")
+def test_a_wayland_desktop_shows_the_levels_on_the_output_asked_for(
+    wayland: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    height, width = wayland
+    found = [device for device in SecondDisplaySlm.discover() if device.driver == "second_display"]
+    assert len(found) == 1
+    with SecondDisplaySlm(options(output=found[0].address, shape=wayland)) as slm:
+        slm.display(ramp(slm.shape))
+
+        def shown() -> bool:
+            with monkeypatch.context() as on_x11:
+                on_x11.setenv("QT_QPA_PLATFORM", "xcb")
+                return bool((shot(0, 0, width, height) == ramp(slm.shape)[..., None]).all())
+
+        assert until(shown)
+    checked = SecondDisplaySlm(options(output=found[0].address, check_by_screenshot=True))
+    with checked, pytest.raises(DeviceError, match="allows no screenshot"):
+        checked.blank()
 
 
 def until(condition: Callable[[], bool], timeout_s: float = 20.0) -> bool:
