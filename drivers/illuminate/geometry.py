@@ -17,6 +17,7 @@ from drivers.illuminate.protocol import parse_properties, parse_table
 _log = logging.getLogger(__name__)
 _SLOW_S = 10.0  # a thousand lines at 115,200 baud
 _NA_DIGITS = 2e-3  # pledposna prints three decimals
+_LONGEST_NM = 1e5
 _MICROMETRES_END = 10.0  # wavelengths below are in micrometres, above in nanometres
 
 
@@ -79,7 +80,8 @@ def read_geometry(link: Link, distance_mm: float | None) -> Geometry:
             )
     assert positions is not None
     assert told_na is not None
-    channels = _whole(properties, "color_channel_count", len(properties.get("color_channels") or "rgb"))
+    names = properties.get("color_channels")
+    channels = _whole(properties, "color_channel_count", len(names) if isinstance(names, list) else 3)
     if channels not in (1, 3):
         raise DeviceError(link.device, f"has LEDs of {channels} colours; 1 or 3 can be driven.")
     if distance_mm is not None:
@@ -133,7 +135,7 @@ def _wavelengths(properties: Mapping[str, Any], channels: int) -> tuple[float, f
     told = properties.get("color_channel_center_wavelengths")
     if not isinstance(told, dict) or len(told) != channels:
         return None
-    values = [value for value in told.values() if isinstance(value, int | float) and value > 0]
+    values = [v for v in told.values() if isinstance(v, int | float) and 0 < v < _LONGEST_NM]
     nm = sorted((1e3 * v if v < _MICROMETRES_END else float(v) for v in values), reverse=True)
     if len(nm) == 1:
         return nm[0], nm[0], nm[0]

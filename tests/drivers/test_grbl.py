@@ -160,6 +160,16 @@ def test_a_limit_switch_ends_the_move_and_the_reference(
     assert "alarm 1" in caplog.text
 
 
+def test_a_reset_in_motion_loses_the_reference(board: GrblController, stage: GrblStage) -> None:
+    thread, outcome = in_background(lambda: stage.move_to({"x_um": -19_000.0}))
+    wait_until(lambda: board.state == "Jog")
+    board._realtime(0x18)
+    thread.join(20)
+    assert "reset while it moved: steps may be lost (alarm 3)" in str(outcome[0])
+    assert board.place != board.reported
+    assert not stage.is_homed
+
+
 @pytest.mark.parametrize(("alarm", "words"), [(8, "pull-off"), (9, "found no limit switch")])
 def test_homing_that_fails_says_why(board: GrblController, stage: GrblStage, alarm: int, words: str) -> None:
     board.homing_alarm = alarm

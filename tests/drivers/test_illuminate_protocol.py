@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.errors import DeviceError
 from drivers.framing import LineFramer, Verdict
 from drivers.illuminate.dialect import Firmware1, Firmware2, dialect_of
+from drivers.illuminate.geometry import read_geometry
+from drivers.illuminate.link import Link
 from drivers.illuminate.protocol import (
     Version,
     parse_properties,
@@ -120,6 +125,49 @@ def test_led_lists_fit_the_firmware_and_lose_none(leds: list[int], dialect: Firm
         assert 1 <= len(numbers) <= dialect.most_arguments
         found += map(int, numbers)
     assert found == leds
+
+
+class ToldLink(Link):
+    """Answers as a test says, without a port."""
+
+    def __init__(self, properties: object) -> None:
+        super().__init__("none", "led_array (test)")
+        self._dialect = Firmware2()
+        self._told = json.dumps(properties).encode()
+
+    def command(self, words: bytes, timeout_s: float | None = None) -> list[bytes]:
+        table = {
+            b"pledpos": b'"0" : [0, 0, 50], "1" : [4, 0, 50]',
+            b"pledposna": b'"0" : [0, 0], "1" : [0.08, 0]',
+        }
+        return [table.get(words, self._told), b"-==-"]
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["r", "green", ""]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from("rgb"), inner),
+    max_leaves=6,
+)
+KEYS = (
+    "led_count",
+    "color_channels",
+    "color_channel_count",
+    "color_channel_center_wavelengths",
+    "device_name",
+)
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow])
+@given(st.dictionaries(st.sampled_from([*KEYS, "trigger_output_count", "serial_number"]), JSON))
+def test_whatever_the_properties_say_the_geometry_is_whole_or_refused(properties: dict[str, object]) -> None:
+    try:
+        found = read_geometry(ToldLink(properties), None)
+    except DeviceError:
+        return
+    assert found.positions_mm.shape == (2, 3)
+    assert found.channels in (1, 3)
+    assert found.outputs >= 0
+    assert found.wavelengths_nm is None or all(0 < nm < 1e5 for nm in found.wavelengths_nm)
 
 
 def test_the_two_layouts_of_a_sequence() -> None:
