@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceError
@@ -157,7 +157,6 @@ KEYS = (
 )
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(st.sampled_from([*KEYS, "trigger_output_count", "serial_number"]), JSON))
 def test_whatever_the_properties_say_the_geometry_is_whole_or_refused(properties: dict[str, object]) -> None:
     try:

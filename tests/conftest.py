@@ -1,0 +1,8 @@
+"""For all tests: property tests are not judged by the clock of a machine that does other things, too."""
+
+from __future__ import annotations
+
+from hypothesis import HealthCheck, settings
+
+settings.register_profile("diffuserbench", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("diffuserbench")
