@@ -17,6 +17,7 @@ from instrument.errors import FileError
 from instrument.images import write_image
 from instrument.plain_json import plain
 from instrument.reconstruction_job import Job
+from instrument.volume_zarr import is_zarr_name
 from recon.result import Reconstruction
 
 WHITE_PERCENTILE = 99.9
@@ -25,7 +26,10 @@ WHITE_PERCENTILE = 99.9
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure."""
+    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure.
+
+    A volume may be an OME-Zarr folder instead of a TIFF.
+    """
 
     image: Path
     preview: Path
@@ -33,17 +37,25 @@ class Outputs:
     figure: Path | None = None
 
     @classmethod
-    def named(cls, out: Path, figure: Path | None = None) -> Outputs:
-        """Return the files that go with ``out``, whose suffix must be ``.tif``.
+    def named(cls, out: Path, figure: Path | None = None, *, volume: bool = False) -> Outputs:
+        """Return the files that go with ``out``, whose suffix must be ``.tif`` (volumes: or ``.ome.zarr``).
 
         Raises
         ------
         FileError
         """
+        if volume and is_zarr_name(out):
+            stem = out.name.lower().removesuffix(".zarr").removesuffix(".ome")
+            stem = out.name[: len(stem)]
+            if not stem:
+                raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
+            return cls(out, out.with_name(f"{stem}.png"), out.with_name(f"{stem}.json"))
         if out.suffix.lower() not in (".tif", ".tiff"):
             raise FileError(
                 out,
-                "a reconstruction is written as float32 TIFF: the name must end in .tif.",
+                "a volume is written as OME-TIFF or OME-Zarr: the name must end in .tif or .ome.zarr."
+                if volume
+                else "a reconstruction is written as float32 TIFF: the name must end in .tif.",
                 "A preview .png and a .json with the settings are written beside it.",
             )
         if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
@@ -65,7 +77,15 @@ class Outputs:
         FileError
         """
         for path in self.files():
-            check_writable(path, 8 * n_pixels + 1_000_000)
+            folder = is_zarr_name(path)
+            # The place of a folder is as good as that of a file in it that is not there yet.
+            check_writable(
+                path.with_name(f".{path.name}.draft") if folder else path, 8 * n_pixels + 1_000_000
+            )
+            if folder and path.exists() and not (path / "zarr.json").is_file():
+                raise FileError(
+                    path, "is there and is no Zarr folder; it was left as it is.", "Name another."
+                )
             if path.exists() and not overwrite:
                 raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
 

@@ -1,4 +1,4 @@
-"""Writing a reconstructed volume: OME-TIFF with voxel sizes, a page of views, and how it came about."""
+"""Writing a reconstructed volume: OME-TIFF or OME-Zarr with voxel sizes, a page of views, its record."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,31 +16,40 @@ from instrument.figures import save_figure
 from instrument.plain_json import plain
 from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_job import Job
+from instrument.volume_zarr import is_zarr_name, write_volume_zarr
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 
 def write_volume(outputs: Outputs, result: VolumeReconstruction, job: Job) -> None:
     """Write volume, page of views and record, each whole or not at all.
 
-    The TIFF holds ``ZYX`` or ``ZCYX`` float32. OME knows one voxel size for all: that of the middle plane is
-    written there; every plane's own is in the record.
+    A TIFF holds ``ZYX`` or ``ZCYX`` float32, an OME-Zarr ``zyx`` or ``czyx``; the name says which. OME knows
+    one voxel size for all: that of the middle plane is written there; every plane's own is in the record.
 
     Raises
     ------
     FileError, OSError
         When a file cannot be written, naming it.
     """
-    import tifffile
-
     from instrument.volume_figure import volume_figure
 
-    volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
-    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **_voxel_size(result.grid)}
-    with whole_file(outputs.image) as temporary:
-        tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
+    if is_zarr_name(outputs.image):
+        about = {"simulated": job.simulated, "record": outputs.record.name}
+        write_volume_zarr(outputs.image, result.volume, result.grid, about)
+    else:
+        _write_tiff(outputs.image, result)
     with whole_file(outputs.preview) as temporary:
         save_figure(volume_figure(result, simulated=job.simulated), temporary)
     write_text(outputs.record, json.dumps(volume_record(result, job), indent=1, allow_nan=False) + "\n")
+
+
+def _write_tiff(path: Path, result: VolumeReconstruction) -> None:
+    import tifffile
+
+    volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
+    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **_voxel_size(result.grid)}
+    with whole_file(path) as temporary:
+        tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
 
 
 def volume_record(result: VolumeReconstruction, job: Job) -> dict[str, Any]:

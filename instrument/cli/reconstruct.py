@@ -190,7 +190,13 @@ def reconstruct(
         ),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", help="float32 TIFF; .png and .json go beside it.")
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="float32 TIFF (volumes: or .ome.zarr); .png and .json go beside it.",
+        ),
     ] = Path("reconstruction.tif"),
     rotate: Annotated[
         Rotation,
@@ -216,7 +222,7 @@ def reconstruct(
     Both must come from the same camera with the same region of interest and binning, 8 to 16 bit or float,
     grey or colour. Ctrl-C ends the work and keeps the picture so far; a second Ctrl-C gives it up.
     """
-    outputs = Outputs.named(out, figure)
+    outputs = Outputs.named(out, figure, volume=volume is not None)
     if volume is not None:
         pictures_only = {
             "--psf": psf is not None,

@@ -117,3 +117,20 @@ def test_simulated_volumes_are_called_so(files, run, tmp_path):
     code, output = run("--volume", tmp_path / "calibration", "--image", image, "--out", out, "-n", 2)
     assert code == 0, output
     assert "SIMULATED" in output
+
+
+def test_a_name_that_ends_in_ome_zarr_writes_that(files, run):
+    import zarr
+
+    folder, image, out = files
+    out = out.with_name("volume.ome.zarr")
+    arguments = ("--volume", folder, "--image", image, "--dark", OFFSET, "--prior", "l1", "--out", out)
+    code, output = run(*arguments)
+    assert code == 0, output
+    volume = zarr.open_group(out, mode="r")["0"][...]
+    assert np.unravel_index(volume.argmax(), volume.shape) == (2, SIZE // 2 + 4, SIZE // 2 - 3)
+    assert out.with_name("volume.json").exists()
+    code, output = run(*arguments)
+    assert code == 2
+    assert "exists already" in output
+    assert run(*arguments, "--force")[0] == 0
