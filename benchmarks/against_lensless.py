@@ -78,13 +78,13 @@ class Problem:
         self.prior = TotalVariation(tau) + NonNegativity()
         self.scale = float(self.data.max())
         self.tau = tau
-        self.judge = PadCropConvolution(self.psfs, (height, width))
-        theirs = fast_grid(height, width)
-        if self.judge.grid_shape != theirs:
-            raise SystemExit(
-                f"At {height} x {width} the FFT grids differ, {self.judge.grid_shape} here and {theirs} in "
-                "lensless, and so do the objectives at the borders. Choose a size at which they agree."
-            )
+        # Our own grid may be a little smaller; on the same one both have the same object, pixel for pixel.
+        self.judge = self.camera()
+
+    def camera(self) -> PadCropConvolution:
+        """Return our operator on the grid of lensless."""
+        height, width = self.data.shape[1:]
+        return PadCropConvolution(self.psfs, (height, width), grid_shape=fast_grid(height, width))
 
     def objective(self, x: np.ndarray) -> float:
         """Return the objective of an object on our grid."""
@@ -172,7 +172,7 @@ class Ours(Contender):
 
     def _make(self) -> Solver:
         p = self.problem
-        made: Solver = self._type(PadCropConvolution(p.psfs, p.data.shape[1:]), p.data, p.prior)
+        made: Solver = self._type(p.camera(), p.data, p.prior)
         return made
 
 
@@ -270,11 +270,11 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def fast_grid(height: int, width: int) -> tuple[int, ...]:
+def fast_grid(height: int, width: int) -> tuple[int, int]:
     """Return the grid that lensless pads a sensor to."""
     from scipy.fftpack import next_fast_len
 
-    return tuple(int(next_fast_len(2 * n - 1)) for n in (height, width))
+    return int(next_fast_len(2 * height - 1)), int(next_fast_len(2 * width - 1))
 
 
 def interpreter(environment: Path) -> str:
@@ -305,7 +305,7 @@ def ready(environment: Path | None) -> Path:
 
 def settled_penalties(problem: Problem) -> tuple[float, ...]:
     """Return our ``Admm``'s penalties once settled, mean over channels, as ``mu1, mu2, mu3``."""
-    solver = Admm(PadCropConvolution(problem.psfs, problem.data.shape[1:]), problem.data, problem.prior)
+    solver = Admm(problem.camera(), problem.data, problem.prior)
     for _ in range(SETTLED_AFTER):
         solver.step()
         solver.iteration += 1

@@ -29,6 +29,8 @@ class PadCropConvolution(LinearOperator):
         ``(height, width)`` of the data.
     n_channels : int, optional
         Number of channels of object and data when one PSF serves all; default as many as there are PSFs.
+    grid_shape : (int, int), optional
+        FFT grid, at least ``sensor + psf - 1``; default the next fast one.
     dtype : dtype
         float32 or float64.
 
@@ -52,6 +54,7 @@ class PadCropConvolution(LinearOperator):
         sensor_shape: tuple[int, int],
         *,
         n_channels: int | None = None,
+        grid_shape: tuple[int, int] | None = None,
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
         if psfs.ndim != 3:
@@ -62,7 +65,9 @@ class PadCropConvolution(LinearOperator):
         psf_shape = psfs.shape[1:]
         self.sensor_shape = (int(sensor_shape[0]), int(sensor_shape[1]))
         self.field_shape = tuple(s + p - 1 for s, p in zip(self.sensor_shape, psf_shape, strict=True))
-        self.grid_shape = fft.fast_shape(self.field_shape)
+        self.grid_shape = fft.fast_shape(self.field_shape) if grid_shape is None else tuple(grid_shape)
+        if any(g < f for g, f in zip(self.grid_shape, self.field_shape, strict=True)):
+            raise ValueError(f"A grid of {self.grid_shape} does not hold the field {self.field_shape}.")
         # With the PSF in the grid's first corner, sensor pixel i is grid pixel i + psf - 1 ("valid" part).
         self.corner = (psf_shape[0] - 1, psf_shape[1] - 1)
         self.centre = (

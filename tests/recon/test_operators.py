@@ -108,3 +108,17 @@ def test_composition_refuses_what_does_not_fit():
         Erasures(np.ones((6, 5), bool), (1, 6, 5)) @ camera
     with pytest.raises(ValueError, match="2 PSFs do not serve 3 channels"):
         PadCropConvolution(np.ones((2, 4, 5)), (5, 6), n_channels=3)
+
+
+def test_a_larger_grid_changes_no_measurement():
+    rng = np.random.default_rng(3)
+    psf = rng.random((1, 9, 11)).astype(np.float32)
+    plain, wide = (PadCropConvolution(psf, (12, 10), grid_shape=grid) for grid in (None, (25, 24)))
+    x = np.zeros(plain.domain_shape, np.float32)
+    height, width = plain.field_shape
+    x[:, :height, :width] = rng.random((height, width))
+    larger = np.zeros(wide.domain_shape, np.float32)
+    larger[:, :height, :width] = x[:, :height, :width]
+    np.testing.assert_allclose(plain.forward(x), wide.forward(larger), rtol=1e-5)
+    with pytest.raises(ValueError, match="does not hold"):
+        PadCropConvolution(psf, (12, 10), grid_shape=(19, 24))
