@@ -79,6 +79,14 @@ def _sensor_admm(p: Problem) -> Outcome:
     return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
 
 
+def _gpu(p: Problem) -> Outcome:
+    from recon.gpu import array_namespace
+    from recon.gpu.picture import picture_solver
+
+    solver = picture_solver(array_namespace("gpu"), p.operator, p.data, p.prior, p.initial)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+
+
 def _fista(p: Problem) -> Outcome:
     solver = Fista(p.operator, p.data, p.prior, initial=p.initial)
     return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
@@ -95,5 +103,6 @@ def _wiener(p: Problem) -> Outcome:
 
 register("admm", _admm)
 register("admm-sensor", _sensor_admm)
+register("admm-gpu", _gpu)
 register("fista", _fista, tolerance=5e-4)
 register("wiener", _wiener)

@@ -56,6 +56,10 @@ class BackgroundRemoval(LinearOperator):
         gram = (yy @ mask.astype(np.float64) @ xx.T).reshape(ny, ny, nx, nx)
         return np.asarray(gram.transpose(0, 2, 1, 3).reshape(ny * nx, ny * nx))
 
+    def basis(self, channel: int) -> tuple[Array, Array, Array]:
+        """Return what :meth:`background` computes with: cosines along y and x, inverse Gram matrix."""
+        return self._rows, self._columns, self._inverse[channel]
+
     def background(self, y: Array) -> Array:
         """Return the smooth part of ``y`` on all pixels: the least-squares fit to the valid ones."""
         fitted = np.empty(self.range_shape, self.dtype)

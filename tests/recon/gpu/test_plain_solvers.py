@@ -1,0 +1,181 @@
+"""The solvers by array namespace, run on NumPy: against the compiled ones, iteration by iteration."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError, StructureError
+from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation, array_namespace
+from recon.gpu.namespace import require_memory
+from recon.gpu.picture import picture_solver
+from recon.metrics import psnr
+from recon.operators import BackgroundRemoval, Convolution3D, Erasures, PadCropConvolution
+from recon.priors import L1, Box, NonNegativity, TotalVariation
+from recon.solvers import SensorAdmm, StoppingRules
+from recon.volume import DouglasRachford, LeanTotalVariation
+
+SENSOR = (12, 11)
+
+
+def problem(dtype=np.float64, n_z=5):
+    rng = np.random.default_rng(0)
+    psfs = (rng.standard_normal((n_z, 1, 10, 9)) + 0.2).astype(dtype)
+    operator = Convolution3D(psfs, SENSOR, dtype=dtype)
+    x = np.zeros(operator.domain_shape, dtype)
+    x[0, n_z // 2, 3:7, 4:7] = 1
+    x[0, min(1, n_z - 1), 5:8, 2:6] += 2
+    data = operator.forward(x)
+    data += 0.01 * data.std() * rng.standard_normal(data.shape).astype(dtype)
+    return operator, data
+
+
+def camera_of(operator, valid=None, background=None, xp=np):
+    window = operator.sensor_window
+    return DepthCamera(xp, operator.channel_spectrum(0), operator.grid_shape, window, valid, background)
+
+
+@pytest.fixture(params=[False, True], ids=["all pixels", "erased and background"])
+def masks(request):
+    if not request.param:
+        return None, None
+    valid = np.random.default_rng(1).random(SENSOR) > 0.2
+    return valid, BackgroundRemoval((1, *SENSOR), (3, 3), valid, dtype=np.float64)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_camera_is_its_adjoints_adjoint_and_the_compiled_one(dtype, masks):
+    valid, background = masks
+    operator, _ = problem(dtype)
+    camera = camera_of(operator, valid, background)
+    rng = np.random.default_rng(2)
+    x, y = rng.random(camera.domain_shape).astype(dtype), rng.random(camera.range_shape).astype(dtype)
+    tolerance = 1e-4 if dtype is np.float32 else 1e-11
+    assert camera.forward(x).dtype == dtype
+    assert np.vdot(camera.forward(x), y) == pytest.approx(np.vdot(x, camera.adjoint(y)), rel=tolerance)
+    if valid is None:
+        np.testing.assert_allclose(camera.forward(x), operator.forward(x[None])[0], rtol=10 * tolerance)
+
+
+@pytest.mark.parametrize("n_z", [1, 5])
+def test_l1_does_what_the_compiled_solver_does(n_z, masks):
+    operator, data = problem(n_z=n_z)
+    valid, background = masks
+    weight = 0.02 * float(np.abs(operator.adjoint(data)).max())
+    plain = PlainDouglasRachford(camera_of(operator, valid, background), data[0], weight)
+    compiled = DouglasRachford(operator, data, weight, valid=valid, background=background)
+    rules = StoppingRules(iterations=60, tolerance=0)
+    one, other = plain.run(rules), compiled.run(rules)
+    assert one.solution.max() > 0
+    np.testing.assert_allclose(one.solution, other.solution, atol=1e-4 * other.solution.max())
+    for mine, theirs in zip(one.history[::10], other.history[::10], strict=True):
+        assert mine.objective == pytest.approx(theirs.objective, rel=1e-4)
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("n_z", [1, 5])
+def test_total_variation_does_what_the_compiled_solver_does(n_z, isotropic, masks):
+    operator, data = problem(n_z=n_z)
+    valid, background = masks
+    weights = np.random.default_rng(3).uniform(0.5, 2, (n_z, 3))
+    weight = 0.002 * float(np.abs(operator.adjoint(data)).max())
+    options = {"axis_weights": weights, "isotropic": isotropic}
+    plain = PlainTotalVariation(camera_of(operator, valid, background), data[0], weight, **options)
+    compiled = LeanTotalVariation(operator, data, weight, valid=valid, background=background, **options)
+    rules = StoppingRules(iterations=60, tolerance=0)
+    one, other = plain.run(rules), compiled.run(rules)
+    np.testing.assert_allclose(one.solution, other.solution, atol=1e-3 * other.solution.max())
+    for mine, theirs in zip(one.history[::10], other.history[::10], strict=True):
+        assert mine.objective == pytest.approx(theirs.objective, rel=1e-3)
+
+
+@pytest.mark.parametrize("solver", [PlainDouglasRachford, PlainTotalVariation])
+def test_goes_on_from_a_checkpoint_to_the_last_bit(solver):
+    operator, data = problem(np.float32)
+    whole, first, second = (solver(camera_of(operator), data[0], 1.0) for _ in range(3))
+    whole.run(StoppingRules(iterations=14, tolerance=0))
+    first.run(StoppingRules(iterations=7, tolerance=0))
+    second.restore(first.checkpoint())
+    second.run(StoppingRules(iterations=14, tolerance=0))
+    np.testing.assert_array_equal(second.solution, whole.solution)
+
+
+def test_a_start_is_where_it_begins():
+    operator, data = problem()
+    rules = StoppingRules(iterations=300, tolerance=0)
+    converged = PlainTotalVariation(camera_of(operator), data[0], 1.0).run(rules).solution[0]
+    cold, warm = (
+        PlainTotalVariation(camera_of(operator), data[0], 1.0, initial=start) for start in (None, converged)
+    )
+    for solver in (cold, warm):
+        solver.run(StoppingRules(iterations=3, tolerance=0))
+    errors = [np.linalg.norm(s.solution[0] - converged) for s in (cold, warm)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("prior", [TotalVariation(1.0) + NonNegativity(), L1(3.0) + NonNegativity()])
+def test_a_picture_in_colour_reaches_the_minimum(prior):
+    rng = np.random.default_rng(4)
+    psf = rng.random((1, 9, 8)) ** 6
+    convolution = PadCropConvolution(psf, SENSOR, n_channels=2, dtype=np.float64)
+    valid = rng.random((2, *SENSOR)) > 0.1
+    operator = Erasures(valid, (2, *SENSOR), np.float64) @ convolution
+    x = np.zeros(convolution.domain_shape)
+    x[0, 6:10, 7:12], x[1, 9:13, 5:9] = 3, 2
+    data = operator.forward(x) + 0.05 * rng.standard_normal((2, *SENSOR)) * valid
+
+    def objective(x):
+        return 0.5 * np.sum((operator.forward(x) - data) ** 2) + prior.value(x)
+
+    plain = picture_solver(np, operator, data, prior).run(StoppingRules(iterations=1500, tolerance=0))
+    exact = SensorAdmm(operator, data, prior).run(StoppingRules(iterations=1500, tolerance=0))
+    assert objective(plain.solution) == pytest.approx(objective(exact.solution), rel=1e-3)
+    with pytest.raises(StructureError, match="bounds 0 to 5"):
+        picture_solver(np, operator, data, TotalVariation(1.0) + Box(0, 5))
+
+
+def test_what_is_missing_is_said(monkeypatch):
+    assert array_namespace("cpu") is np
+    with pytest.raises(InputError, match="device 'tpu' is not known"):
+        array_namespace("tpu")
+    monkeypatch.setitem(sys.modules, "cupy", None)
+    with pytest.raises(InputError, match=r'pip install "diffuserbench\[gpu\]"'):
+        array_namespace("gpu")
+    runtime = types.SimpleNamespace(getDeviceCount=lambda: 0, memGetInfo=lambda: (2**30, 2**31))
+    fake = types.SimpleNamespace(cuda=types.SimpleNamespace(runtime=runtime))
+    monkeypatch.setitem(sys.modules, "cupy", fake)
+    with pytest.raises(InputError, match="finds no GPU"):
+        array_namespace("gpu")
+    require_memory(fake, 2**30)
+    with pytest.raises(InputError, match=r"needs 2\.0 GiB, and 1\.0 GiB are free"):
+        require_memory(fake, 2**31)
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_as_on_the_host():
+    cupy = pytest.importorskip("cupy", reason="needs a GPU and the [gpu] extra")
+    if cupy.cuda.runtime.getDeviceCount() == 0:
+        pytest.skip("no GPU")
+    operator, data = problem(np.float32)
+    for solver in (PlainDouglasRachford, PlainTotalVariation):
+        results = [
+            solver(camera_of(operator, xp=xp), data[0], 1.0).run(StoppingRules(iterations=40, tolerance=0))
+            for xp in (np, cupy)
+        ]
+        largest = results[0].solution.max()
+        np.testing.assert_allclose(results[1].solution, results[0].solution, atol=1e-3 * largest)
+
+
+def test_the_gpus_method_makes_the_picture_or_says_what_to_install(monkeypatch, shoot):
+    import recon.gpu
+
+    shot = shoot()
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "cupy", None)
+        with pytest.raises(InputError, match="needs CuPy"):
+            recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
+    monkeypatch.setattr(recon.gpu, "array_namespace", lambda _device: np)
+    plain = recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
+    assert plain.image.dtype == np.float32
+    assert psnr(plain.image, shot.truth) > 26
