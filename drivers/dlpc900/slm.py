@@ -77,6 +77,8 @@ class Dlpc900Slm(Slm):
         self._link = HidLink(self.name, options.serial_number)
         self._lock = threading.RLock()
         self._closing = threading.Event()
+        self._blanked = 0
+        """How often ``blank`` was called; uploads begun before it end."""
         self._board: Board | None = None
         self._firmware = ""
         self._tag = ""
@@ -242,7 +244,7 @@ class Dlpc900Slm(Slm):
         LimitError
             When shape or dtype do not fit, or with ``bit_depth = 1`` a level is neither 0 nor 255.
         StoppedError
-            When ``close`` was called meanwhile.
+            When ``close`` or ``blank`` was called meanwhile.
         DeviceError
             When the controller refuses or was unplugged; what is shown is then unknown.
         """
@@ -258,6 +260,13 @@ class Dlpc900Slm(Slm):
                 "Give uint8 levels 0 and 255 only, or set bit_depth = 8.",
             )
         self._show(levels.copy())
+        self._closing.wait(self.settle_ms * 1e-3)
+
+    def blank(self) -> None:
+        """Show all zeros, ahead of an upload that is under way: that ends with a StoppedError."""
+        board = self._require()
+        self._blanked += 1
+        self._show(np.zeros(board.shape, np.uint8), gives_way=False)
         self._closing.wait(self.settle_ms * 1e-3)
 
     @property
@@ -295,9 +304,13 @@ class Dlpc900Slm(Slm):
             self._wait_until_running()
             self._displayed, self._uploaded = self._uploaded, None
 
-    def _show(self, levels: npt.NDArray[np.uint8]) -> None:
-        """Section 5.3 of the guide: stop, define, configure, load, start."""
+    def _show(self, levels: npt.NDArray[np.uint8], *, gives_way: bool = True) -> None:
+        """Section 5.3 of the guide: stop, define, configure, load, start.
+
+        ``gives_way``: end with a StoppedError when ``blank`` is called meanwhile.
+        """
         board = self._require()
+        began = self._blanked if gives_way else None
         images = [encode(half, self.options.compression) for half in np.hsplit(levels, board.controllers)]
         with self._lock:
             self._require()
@@ -307,7 +320,7 @@ class Dlpc900Slm(Slm):
             self._link.write(Command.PATTERN_CONFIGURATION, _configuration(patterns=1, repeats=0))
             # The other half first: the primary controller then has its image last, and starts.
             for half in reversed(range(board.controllers)):
-                self._upload(images[half], *_LOAD[half])
+                self._upload(images[half], *_LOAD[half], began)
             self._link.write(Command.START_STOP, bytes([commands.START]))
             self._wait_until_running()
             self._displayed = levels
@@ -325,11 +338,11 @@ class Dlpc900Slm(Slm):
             + (0).to_bytes(2, "little")
         )
 
-    def _upload(self, image: bytes, initialise: Command, load: Command) -> None:
+    def _upload(self, image: bytes, initialise: Command, load: Command, began: int | None) -> None:
         self._link.write(initialise, (0).to_bytes(2, "little") + len(image).to_bytes(4, "little"))
         for start in range(0, len(image), commands.LOAD_BYTES):
-            if self._closing.is_set():
-                raise StoppedError(self.name, "was closed during an upload.")
+            if self._closing.is_set() or began not in (None, self._blanked):
+                raise StoppedError(self.name, "was closed or blanked during an upload.")
             part = image[start : start + commands.LOAD_BYTES]
             self._link.write(load, len(part).to_bytes(2, "little") + part)
 

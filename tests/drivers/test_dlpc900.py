@@ -6,6 +6,8 @@ import contextlib
 import re
 import sys
 import threading
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -368,19 +370,25 @@ def test_unplugged_is_an_error_and_opening_again_shows_a_blank_pattern(board: Dl
     device.close()
 
 
-def test_closing_ends_an_upload(board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("end", ["close", "blank"])
+def test_closing_and_blanking_end_an_upload(
+    board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch, end: str
+) -> None:
+    """STOP blanks the SLM: that does not wait for minutes of upload."""
     device = slm(compression="none")
     device.open()
     begun, errors = threading.Event(), []
     load = board._load
 
     def slow(half: int, data: bytes) -> None:
-        begun.set()
-        closing.wait(10)
+        if len(board.commands) < 40:  # of many
+            begun.set()
+            ending.wait(10)
         load(half, data)
 
     monkeypatch.setattr(board, "_load", slow)
-    closing = threading.Event()
+    ending = threading.Event()
+    board.commands.clear()
 
     def show() -> None:
         try:
@@ -391,12 +399,45 @@ def test_closing_ends_an_upload(board: Dlpc900Emulator, monkeypatch: pytest.Monk
     showing = threading.Thread(target=show)
     showing.start()
     assert begun.wait(10)
-    device._closing.set()
-    closing.set()
-    device.close()
+    stopping = threading.Thread(target=getattr(device, end))
+    stopping.start()
+    assert until(lambda: device._closing.is_set() or device._blanked > 0)
+    ending.set()
     showing.join(10)
+    stopping.join(10)
     assert isinstance(errors[0], StoppedError)
-    assert board.shown is None
+    assert board.shown is None if end == "close" else not board.shown.any()
+    device.close()
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def test_two_threads_may_blank_at_once(board: Dlpc900Emulator) -> None:
+    with slm() as device:
+        device.display(pattern())
+        errors: list[BaseException] = []
+
+        def blank() -> None:
+            try:
+                device.blank()
+            except DeviceError as error:
+                errors.append(error)
+
+        threads = [threading.Thread(target=blank) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(10)
+        assert errors == []
+        assert board.shown is not None
+        assert not board.shown.any()
 
 
 def test_the_controller_is_discovered_with_its_lines() -> None:
