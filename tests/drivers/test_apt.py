@@ -244,6 +244,12 @@ def test_a_complaint_of_the_controller_is_an_error(stage: AptStage, servo: AptCo
     assert stage.position()["x_um"] == 0.0
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait half as long for replies as one would for real devices."""
+    monkeypatch.setattr("drivers.apt.link._REPLY_S", 0.25)
+
+
 def late(seconds: float) -> Callable[[bytes], list[Answer]]:
     return lambda reply: [seconds, reply]
 
@@ -256,10 +262,11 @@ def late(seconds: float) -> Callable[[bytes], list[Answer]]:
         lambda reply: [reply[:13]],
         lambda reply: [reply[7:]],
         lambda reply: [b"\x91\x04" + reply],
-        late(0.8),
+        late(0.4),
     ],
     ids=["silence", "garbage", "torn", "headless", "noise before", "late"],
 )
+@pytest.mark.usefixtures("impatient")
 def test_damaged_replies_are_asked_for_again(
     stage: AptStage, servo: AptController, spoil: Callable[[bytes], list[Answer]]
 ) -> None:
@@ -269,6 +276,7 @@ def test_damaged_replies_are_asked_for_again(
     assert stage.move_to({"x_um": 700.0})["x_um"] == pytest.approx(700.0, abs=SERVO_UM)
 
 
+@pytest.mark.usefixtures("impatient")
 def test_silence_names_controller_and_port(stage: AptStage, servo: AptController) -> None:
     servo.spoil += [lambda reply: []] * 40
     with pytest.raises(DeviceTimeoutError):

@@ -11,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from drivers.composite_stage import CompositeOptions, CompositeStage
+from drivers.device import SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.zaber.stage import ZaberOptions, ZaberStage
 from tests.drivers.contract_stage import StageContract
@@ -200,7 +201,6 @@ ZABER = {"driver": "zaber", "port": "/dev/ttyUSB0", "axes": {"x_um": {"microstep
         ({"a": ZABER | {"prot": 1}}, ("parts", "a", "prot"), "Extra inputs"),
         ({"a": {"driver": "zabr"}}, ("parts", "a", "driver"), "must be one of apt, "),
         ({"a": {"driver": "composite"}}, ("parts", "a", "driver"), "must be one of apt, "),
-        ({"a": {"driver": "simulated"}}, ("parts", "a", "driver"), r"does not share \[simulated\]"),
         ({"a": {"port": "x"}}, ("parts", "a", "driver"), "Field required"),
         ({"a": 3}, ("parts", "a"), "should be a valid dictionary"),
     ],
@@ -209,6 +209,18 @@ def test_options_that_make_no_sense(parts: object, place: tuple[str, ...], words
     with pytest.raises(ValidationError, match=words) as caught:
         CompositeOptions.model_validate({"parts": parts})
     assert [detail["loc"] for detail in caught.value.errors()] == [place]
+
+
+def test_a_driver_that_shares_a_table_with_the_bench_is_no_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    class World(SharedPart):
+        table = "world"
+
+    class Sharing(ZaberStage):
+        Shared = World
+
+    monkeypatch.setattr("drivers.composite_stage.load_driver", lambda kind, name: Sharing)
+    with pytest.raises(ValidationError, match=r"does not share \[world\] with the bench"):
+        CompositeOptions.model_validate({"parts": {"a": ZABER}})
 
 
 def test_options_come_back_from_what_they_are_kept_as() -> None:

@@ -176,6 +176,12 @@ def test_a_fault_that_lasts_refuses_moves(stage: ZaberStage, chain: ZaberChain) 
         stage.move_to({"x_um": 10.0})
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait half as long for replies as one would for real devices."""
+    monkeypatch.setattr("drivers.zaber.chain._REPLY_S", 0.25)
+
+
 def late(seconds: float) -> Callable[[bytes], list[Answer]]:
     return lambda reply: [seconds, reply]
 
@@ -188,10 +194,11 @@ def late(seconds: float) -> Callable[[bytes], list[Answer]]:
         lambda reply: [reply[:-7] + b"\r\n"],  # the last digits and the checksum are lost
         lambda reply: [reply[:9] + b"X" + reply[10:]],
         lambda reply: [reply.split(b":")[0][:-1] + b"\r\n"],
-        late(0.8),
+        late(0.4),
     ],
     ids=["silence", "garbage", "torn", "garbled", "without checksum", "late"],
 )
+@pytest.mark.usefixtures("impatient")
 def test_damaged_replies_are_asked_for_again(
     stage: ZaberStage, chain: ZaberChain, spoil: Callable[[bytes], list[Answer]]
 ) -> None:
@@ -201,17 +208,19 @@ def test_damaged_replies_are_asked_for_again(
     assert stage.move_to({"x_um": 700.0})["x_um"] == 700.0
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_late_reply_is_not_taken_for_the_answer_to_the_next_question(
     stage: ZaberStage, chain: ZaberChain
 ) -> None:
     def answer_late_and_move(reply: bytes) -> list[Answer]:
         chain.devices[1].axes[0].set_place(998)
-        return [0.8, reply]
+        return [0.4, reply]
 
     chain.spoil.append(answer_late_and_move)
     assert stage.position()["x_um"] == 499.0
 
 
+@pytest.mark.usefixtures("impatient")
 def test_silence_names_the_device_that_is_silent(stage: ZaberStage, chain: ZaberChain) -> None:
     del chain.devices[2]
     with pytest.raises(DeviceTimeoutError, match=r"device 2 did not answer 'get pos'"):
@@ -288,6 +297,7 @@ def test_options_that_make_no_sense(axes: object, words: str) -> None:
         ZaberOptions.model_validate({"port": "/dev/ttyUSB0", "axes": axes})
 
 
+@pytest.mark.usefixtures("impatient")
 def test_probe_recognises_a_chain(chain: ZaberChain) -> None:
     found = ZaberStage.probe(str(chain.port.link))
     assert found is not None
