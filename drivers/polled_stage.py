@@ -63,6 +63,8 @@ class PolledStage(Stage):
     """An axis that claims to move and stays where it is for this long is blocked."""
     grace_s = 0.3
     """A controller may need this long until it says that it moves, or that it has settled."""
+    stop_again_s = 1.0
+    """Axes that still move this long after STOP are told once more: it may have been lost on the line."""
     stop_s = 5.0
     """Axes that still move this long after STOP are an error."""
 
@@ -357,7 +359,8 @@ class PolledStage(Stage):
                     motion.decided.set()
 
     def _wait_for_rest(self) -> StageState:
-        deadline_s = time.monotonic() + self.stop_s
+        told_s = time.monotonic()
+        deadline_s = told_s + self.stop_s
         while True:
             try:
                 state = self._state()
@@ -372,6 +375,9 @@ class PolledStage(Stage):
                     f"still moves {self.stop_s:g} s after it was told to stop.",
                     "Switch off its power.",
                 )
+            if time.monotonic() - told_s > self.stop_again_s:
+                told_s = time.monotonic()
+                self._halt()
             time.sleep(self.poll_s)
 
     def _halt_what_is_left(self) -> None:

@@ -24,6 +24,7 @@ class ScriptedStage(PolledStage):
     poll_s = 0.002
     stuck_s = 0.1
     grace_s = 0.03
+    stop_again_s = 0.05
     stop_s = 0.2
 
     def __init__(self) -> None:
@@ -37,6 +38,7 @@ class ScriptedStage(PolledStage):
         self.blocked = False
         self.forgets_home = False
         self.ignores_stop = False
+        self.stops_lost = 0
         self.as_sent: Callable[[], None] = lambda: None
         self._read_s = time.monotonic()
 
@@ -83,7 +85,8 @@ class ScriptedStage(PolledStage):
         self.halts += 1
         if not self.connected:
             raise DeviceError(self.name, "was lost.")
-        if not self.ignores_stop:
+        self.stops_lost -= 1
+        if not self.ignores_stop and self.stops_lost < 0:
             self.targets = dict(self.places)
 
 
@@ -174,6 +177,15 @@ def test_an_axis_that_ignores_stop_is_an_error(stage: ScriptedStage) -> None:
         stage.stop()
     with pytest.raises(StoppedError):
         stage.wait(1.0)
+
+
+def test_a_stop_that_is_lost_on_the_line_is_sent_again(stage: ScriptedStage) -> None:
+    stage.stops_lost = 1
+    stage.move_to({"x_um": 50.0}, wait=False)
+    stage.blocked = True  # so that it does not arrive meanwhile
+    stage.stop()
+    assert not stage.is_moving
+    assert stage.halts == 2
 
 
 def test_moves_begun_during_a_move_join_it(stage: ScriptedStage) -> None:
