@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -99,11 +99,12 @@ class Convolution3D(LinearOperator):
                 self.transfer_plane(z, channel, spectrum[channel, z])
         return spectrum
 
-    def power(self, channel: int = 0) -> Array:
-        """``sum_z |H_z|^2`` of one channel: eigenvalues of ``A A^H`` before the crop."""
+    def power(self, channel: int = 0, planes: Iterable[int] | None = None) -> Array:
+        """``sum_z |H_z|^2`` of one channel (of some planes): eigenvalues of ``A A^H`` before the crop."""
         total = np.zeros(fft.spectrum_shape(self.grid_shape), self.dtype)
-        for z in range(self.domain_shape[1]):
-            H = self.transfer_plane(z, channel)
+        known = self.__dict__.get("spectrum")
+        for z in range(self.domain_shape[1]) if planes is None else planes:
+            H = self.transfer_plane(z, channel) if known is None else known[channel, z]
             total += H.real**2 + H.imag**2
         return total
 

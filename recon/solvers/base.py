@@ -83,6 +83,8 @@ class Solver(ABC):
             record = replace(known, iteration=self.iteration, seconds=seconds)
             history.append(record)
             reason = check(record)
+            if reason is StopReason.CONVERGED and not self.confirm():
+                reason = None
             if callback is not None:
                 callback(self, record)
             if reason is None and cancel is not None and cancel.is_set():
@@ -92,6 +94,13 @@ class Solver(ABC):
         if not np.isfinite(np.sum(solution, dtype=np.float64)):
             reason, solution = StopReason.NOT_FINITE, np.zeros_like(solution) if start is None else start
         return Outcome(solution, tuple(history), reason, seconds)
+
+    def confirm(self) -> bool:
+        """Tell whether the solver, too, takes itself to be converged, now that a rule says so.
+
+        A solver that leaves part of the problem out puts back here what turns out to be needed, and goes on.
+        """
+        return True
 
     def _start(self) -> Array | None:
         """Return what to fall back on if the iterate is lost; None (zeros) where memory is dear."""

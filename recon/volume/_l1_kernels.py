@@ -15,6 +15,8 @@ from recon.operators._plane_kernels import (
     to_spectrum,
 )
 
+__all__ = ["conjugate_product", "correlation_peaks", "from_spectrum", "l1_solution_plane", "l1_sweep"]
+
 STATISTICS = 4
 
 
@@ -52,11 +54,11 @@ def _update_plane(z: Any, d: Any, t: Any, relax: Any, step_scale: Any, positive:
 
 @njit(nogil=True, cache=True)
 def l1_sweep(
-    Z: Any, H: Any, E: Any, t: Any, relax: Any, step_scale: Any, positive: bool, total: Any, st: Any, z0: int,
-    z1: int, d: Any, scratch: Any,
+    Z: Any, H: Any, E: Any, t: Any, relax: Any, step_scale: Any, positive: bool, total: Any, st: Any,
+    planes: Any, d: Any, scratch: Any,
 ) -> None:  # fmt: skip
-    """One iteration on planes ``z0 <= z < z1``; ``total += H F z``. ``E`` carries the factor gamma."""
-    for z in range(z0, z1):
+    """One iteration on some planes; ``total += H F z``. ``E`` carries the factor gamma."""
+    for z in planes:
         conjugate_product(H[z], E, scratch)
         from_spectrum(scratch, d)
         st[z] = 0
@@ -75,6 +77,16 @@ def l1_solution_plane(z: Any, d: Any, t: Any, positive: bool) -> None:
         for i in range(a.shape[0]):
             v = a[i] + b[i] + b[i]
             a[i] = max(v - t, zero) if positive else v - max(min(v, t), -t)
+
+
+@njit(nogil=True, cache=True)
+def correlation_peaks(H: Any, E: Any, positive: bool, peaks: Any, planes: Any, d: Any, scratch: Any) -> None:
+    """Largest value, or magnitude where negative voxels count, of ``F^-1 conj(H) E`` on some planes."""
+    for z in planes:
+        conjugate_product(H[z], E, scratch)
+        from_spectrum(scratch, d)
+        peak = max(d.max(), -d.min())
+        peaks[z] = d.max() if positive else peak
 
 
 def plane_scratch(shape: tuple[int, int], dtype: Any) -> tuple[Any, Any]:

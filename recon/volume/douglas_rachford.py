@@ -10,11 +10,16 @@ sparsifying transform) by alternating the exact proximal maps of its two halves:
 ``e`` solves ``(I + gamma A A^H) e = b - A z`` on the sensor plane
 (:class:`~recon.volume.sensor_system.SensorSystem`). x and u are never stored: a plane is back-projected,
 updated, transformed and summed while it is in the core's cache. Over-relaxation alpha = 1.7.
+
+Planes in which u has been zero for a while are left out: the problem is solved on the others. Before the
+result is called converged (and now and then before), the optimality condition ``A_z^H e <= tau`` is looked
+at on the planes left out; those that miss it come back, with ``z = -gamma A_z^H e``, the value of z that an
+empty plane has at the minimiser.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,47 +28,46 @@ from recon import fft
 from recon.operators.background import BackgroundRemoval
 from recon.operators.base import Array
 from recon.operators.convolution3d import Convolution3D
-from recon.solvers.base import Solver
+from recon.operators.planes import PlaneGroups
 from recon.solvers.stopping import IterationRecord
+from recon.threads import in_blocks
 from recon.volume.balance import is_due
+from recon.volume.empty_planes import EXCESS, REVIEW, EmptyPlanes, PlaneWatch
 from recon.volume.memory import Storage
 from recon.volume.scale import expected_height
-from recon.volume.sensor_system import SensorSystem, residual_norm
+from recon.volume.sensor_system import residual_norm
+from recon.volume.splitting import VolumeSplitting
 
 
-class DouglasRachford(Solver):
+class DouglasRachford(VolumeSplitting):
     """l1 and non-negativity for one channel of a volume.
 
     Parameters
     ----------
-    operator : Convolution3D
-        One channel.
-    data : ndarray, (1, height, width)
-    weight : float
-        tau, absolute; 0 leaves non-negativity alone.
+    operator, data, weight, valid, background, relaxation, keep_state, storage
+        As :class:`~recon.volume.splitting.VolumeSplitting`.
     positive : bool
         Non-negativity as well.
-    valid : ndarray of bool, (height, width), optional
-        Pixels that were measured.
-    background : BackgroundRemoval, optional
-        A smooth background to be estimated as well, for the same valid pixels.
     initial : ndarray, (1, n_z, grid_height, grid_width), optional
         Starting point; default zeros.
     step : float, optional
         gamma. Default: such that the threshold ``gamma tau`` is ``_THRESHOLD`` of the height that a voxel may
         be expected to have.
-    relaxation : float
-        alpha, between 1 and 2.
     balance : bool
         Adapt gamma to ``||u|| / ||A^H e||``, the length of the way that x has to go over that of the
         multiplier.
-    keep_state : bool
-        False lets the result take the state's place when :meth:`run` ends.
-    storage : Storage, optional
-        Where the state lives; default memory. (The transfer functions are the operator's.)
+    drop_empty : bool
+        Leave out planes that stay empty.
+
+    Attributes
+    ----------
+    empty : EmptyPlanes
+        The planes left out at the end of a run, and whether they were rightly so.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma")
+    state_names: ClassVar[tuple[str, ...]] = (
+        "z", "e", "gamma", "_used_gamma", "_active", "_empty_for", "_patience",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -78,28 +82,31 @@ class DouglasRachford(Solver):
         step: float | None = None,
         relaxation: float = 1.7,
         balance: bool = True,
+        drop_empty: bool = True,
         keep_state: bool = True,
         storage: Storage | None = None,
     ) -> None:
-        super().__init__()
-        if operator.domain_shape[0] != 1:
-            raise ValueError(f"One channel at a time, not {operator.domain_shape[0]}.")
+        super().__init__(
+            operator,
+            data,
+            weight,
+            valid=valid,
+            background=background,
+            relaxation=relaxation,
+            balance=balance,
+            keep_state=keep_state,
+            storage=storage,
+        )
         from recon.volume import _l1_kernels
 
         self._kernels = _l1_kernels
-        self.operator = operator
-        self.weight = float(weight)
         self.positive = positive
-        self.relaxation = relaxation
-        self.balance = balance
-        self.keep_state = keep_state
+        # Without a threshold no plane is certain to be empty.
+        self.drop_empty = drop_empty and self.weight > 0
         dtype = operator.dtype
-        self.system = SensorSystem(
-            operator.grid_shape, operator.sensor_window, valid, background, dtype=dtype
-        )
-        self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
-        self._storage = storage or Storage()
         self.z = self._storage.zeros(operator.domain_shape[1:], dtype)
+        self.watch = PlaneWatch(len(self.z))
+        self.empty = EmptyPlanes()
         if initial is not None:
             self.z[...] = np.reshape(initial, self.z.shape)
         self._power = operator.power()
@@ -114,9 +121,84 @@ class DouglasRachford(Solver):
         self._statistics = np.zeros((len(self.z), _l1_kernels.STATISTICS))
         spectrum = fft.spectrum_shape(operator.grid_shape)
         self._totals = np.zeros((operator.groups.count, *spectrum), fft.complex_dtype(dtype))
+        self._regroup()
         self._solve_data_term(
             operator.forward(self.z)[0] if initial is not None else np.zeros_like(self.data)
         )
+
+    # The watch's arrays are part of the state.
+    @property
+    def _active(self) -> Array:
+        return self.watch.active
+
+    @property
+    def _empty_for(self) -> Array:
+        return self.watch.empty_for
+
+    @property
+    def _patience(self) -> Array:
+        return self.watch.patience
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        super().restore(state)
+        self._regroup()
+
+    def _regroup(self) -> None:
+        """Share the active planes among the workers."""
+        self._planes = np.flatnonzero(self.watch.active)
+        self._groups = PlaneGroups(len(self._planes))
+        whole = self.watch.active.all()
+        self._power = self.operator.power(planes=None if whole else (int(z) for z in self._planes))
+
+    def _leave_out(self) -> None:
+        """Leave out what has been empty for long."""
+        due = self.watch.due()
+        if due.any():
+            self.watch.active[due] = False
+            self._regroup()
+
+    def _bring_back(self) -> bool:
+        """Let planes that miss the optimality condition take part again; return whether there were any."""
+        peaks = self._peaks()
+        missing = np.flatnonzero(peaks > (1 + EXCESS) * self.weight)
+        if not missing.size:
+            return False
+        E = self._weighted_spectrum()
+        H = self.operator.channel_spectrum(0)
+        plane, spectrum = self._kernels.plane_scratch(self.operator.grid_shape, self.operator.dtype)
+        for z in missing:
+            self._kernels.conjugate_product(H[z], E, spectrum)
+            self._kernels.from_spectrum(spectrum, plane)
+            np.negative(plane, out=self.z[z])
+        self.watch.bring_back(missing)
+        self._regroup()
+        return True
+
+    def _peaks(self) -> Array:
+        """``max A_z^H e`` of the planes that are left out; 0 of the others."""
+        peaks = np.zeros(len(self.z))
+        rest = np.flatnonzero(~self.watch.active)
+        E = self.system.spectrum_of(self.e)
+        H = self.operator.channel_spectrum(0)
+
+        def job(start: int, stop: int) -> None:
+            scratch = self._kernels.plane_scratch(self.operator.grid_shape, self.operator.dtype)
+            self._kernels.correlation_peaks(H, E, self.positive, peaks, rest[start:stop], *scratch)
+
+        if rest.size:
+            in_blocks(job, len(rest))
+        return peaks
+
+    def confirm(self) -> bool:
+        """Look at the optimality condition on the planes left out; go on where one misses it."""
+        return not self._bring_back()
+
+    def _weighted_spectrum(self) -> Array:
+        """Spectrum of ``gamma e``."""
+        E = self.system.spectrum_of(self.e)
+        E *= E.real.dtype.type(self._used_gamma)
+        return E
 
     def _solve_data_term(self, forward_z: Array) -> None:
         self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
@@ -126,8 +208,12 @@ class DouglasRachford(Solver):
         """Do one iteration. ``objective`` and ``data_residual`` are those of x, and of u in the prior."""
         k = self._kernels
         dtype = self.operator.dtype
-        E = self.system.spectrum_of(self.e)
-        E *= dtype.type(self._used_gamma)
+        if self.drop_empty and self.iteration:
+            if self.iteration % REVIEW == 0:
+                self._leave_out()
+            if is_due(self.iteration):
+                self._bring_back()
+        E = self._weighted_spectrum()
         step_scale = dtype.type(self.gamma / self._used_gamma)
         H = self.operator.channel_spectrum(0)
         threshold, relaxation = dtype.type(self.gamma * self.weight), dtype.type(self.relaxation)
@@ -137,10 +223,12 @@ class DouglasRachford(Solver):
             plane, spectrum = k.plane_scratch(self.operator.grid_shape, dtype)
             k.l1_sweep(
                 self.z, H, E, threshold, relaxation, step_scale, self.positive, self._totals[group],
-                self._statistics, z0, z1, plane, spectrum,
+                self._statistics, self._planes[z0:z1], plane, spectrum,
             )  # fmt: skip
 
-        self.operator.groups.run(job)
+        self._statistics[...] = 0
+        self._groups.run(job)
+        self.watch.note(self._statistics[:, 0])
         residual = residual_norm(self.e)
         l1, gap, size, dual = self._statistics.sum(axis=0)
         total = self._totals[0]
@@ -161,10 +249,11 @@ class DouglasRachford(Solver):
             change=self.relaxation * gap,
         )
 
-    def _start(self) -> Array | None:
-        return None
-
     def _end(self) -> Array:
+        self.empty = EmptyPlanes(
+            tuple(int(z) for z in np.flatnonzero(~self.watch.active)),
+            float(self._peaks().max()) / self.weight if self.weight > 0 else 0.0,
+        )
         return self.solution if self.keep_state else self._write_solution(self.z)
 
     @property
@@ -174,19 +263,19 @@ class DouglasRachford(Solver):
 
     def _write_solution(self, z: Array) -> Array:
         k = self._kernels
-        E = self.system.spectrum_of(self.e)
-        E *= z.dtype.type(self._used_gamma)
+        E = self._weighted_spectrum()
         H = self.operator.channel_spectrum(0)
         threshold = z.dtype.type(self._used_gamma * self.weight)
 
         def job(_: int, z0: int, z1: int) -> None:
             plane, spectrum = k.plane_scratch(self.operator.grid_shape, z.dtype)
-            for i in range(z0, z1):
+            for i in self._planes[z0:z1]:
                 k.conjugate_product(H[i], E, spectrum)
                 k.from_spectrum(spectrum, plane)
                 k.l1_solution_plane(z[i], plane, threshold, self.positive)
 
-        self.operator.groups.run(job)
+        self._groups.run(job)
+        z[~self.watch.active] = 0
         return z[None]
 
 

@@ -31,35 +31,28 @@ from recon import fft
 from recon.operators.background import BackgroundRemoval
 from recon.operators.base import Array
 from recon.operators.convolution3d import Convolution3D
-from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord
 from recon.threads import get_threads, in_blocks
 from recon.volume.balance import is_due
 from recon.volume.memory import Storage
-from recon.volume.sensor_system import SensorSystem, residual_norm
+from recon.volume.sensor_system import residual_norm
+from recon.volume.splitting import VolumeSplitting
 
 _TILE = 256
 """Spectral columns solved together: all planes of a tile fit a core's second-level cache."""
 
 
-class LeanTotalVariation(Solver):
+class LeanTotalVariation(VolumeSplitting):
     """ADMM for one channel of a volume with total variation and non-negativity.
 
     Parameters
     ----------
-    operator : Convolution3D
-        One channel.
-    data : ndarray, (1, height, width)
-    weight : float
-        tau of Eq. 4.2, absolute.
+    operator, data, weight, valid, background, relaxation, keep_state, storage
+        As :class:`~recon.volume.splitting.VolumeSplitting`; ``weight`` is tau of Eq. 4.2.
     axis_weights : ndarray, (3,) or (n_z, 3)
         Weights of the z, y and x differences, at each plane where they differ; z is not x.
     isotropic : bool
         Length of the gradient instead of the sum of its components.
-    valid : ndarray of bool, (height, width), optional
-        Pixels that were measured.
-    background : BackgroundRemoval, optional
-        A smooth background to be estimated as well, for the same valid pixels.
     initial : ndarray, (1, n_z, grid_height, grid_width), optional
         Starting point; default zeros.
     penalty : float, optional
@@ -67,13 +60,8 @@ class LeanTotalVariation(Solver):
         curvature of the data term: independent of exposure, size and tau.
     kappa : float
         Penalty of non-negativity relative to that of TV.
-    relaxation : float
-        alpha, between 1 and 2.
     balance : bool
         Adapt mu to the residuals.
-    keep_state : bool
-        False frees the states when :meth:`run` ends, before the result is written: one volume less at the
-        peak, and nothing to go on from.
     """
 
     state_names: ClassVar[tuple[str, ...]] = ("X", "S", "e", "penalty", "_used_penalty", "_misfit")
@@ -96,34 +84,33 @@ class LeanTotalVariation(Solver):
         keep_state: bool = True,
         storage: Storage | None = None,
     ) -> None:
-        super().__init__()
-        if operator.domain_shape[0] != 1:
-            raise ValueError(f"One channel at a time, not {operator.domain_shape[0]}.")
+        super().__init__(
+            operator,
+            data,
+            weight,
+            valid=valid,
+            background=background,
+            relaxation=relaxation,
+            balance=balance,
+            keep_state=keep_state,
+            storage=storage,
+        )
         from recon.volume import _tv_kernels
 
         self._kernels = _tv_kernels
-        self.operator = operator
-        self.weight = float(weight)
         self.isotropic = isotropic
-        self.relaxation = relaxation
-        self.balance = balance
-        self.keep_state = keep_state
         dtype = operator.dtype
         _, nz, ny, nx = operator.domain_shape
         self.axis_weights = np.ascontiguousarray(np.broadcast_to(np.asarray(axis_weights, dtype), (nz, 3)))
         self.kappa = dtype.type(kappa)
-        self.system = SensorSystem((ny, nx), operator.sensor_window, valid, background, dtype=dtype)
-        self.data = self.system.masked(np.array(data, dtype).reshape(operator.sensor_shape))
-
-        storage = storage or Storage()
-        self.g = storage.zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
+        zeros = self._storage.zeros
+        self.g = zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
         self._dy2 = (4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype)
         self._dx2 = (4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype)
         self._q = np.empty(self.g.shape[1:], dtype)
         self._prepare_transfer()
-        self.X = storage.zeros(self.g.shape, self.g.dtype)
-        self.S = storage.zeros((nz, ny, 4, nx), dtype)
-        self._storage = storage
+        self.X = zeros(self.g.shape, self.g.dtype)
+        self.S = zeros((nz, ny, 4, nx), dtype)
         self.e = self.data.copy()
         self._totals = np.empty((operator.groups.count, *self.g.shape[1:]), self.g.dtype)
         self._statistics = np.zeros((nz, _tv_kernels.STATISTICS))
@@ -163,9 +150,6 @@ class LeanTotalVariation(Solver):
             fft.irfft(scratch, nx, out=volume[0, z])
             np.maximum(volume[0, z], 0, out=volume[0, z])
         return volume
-
-    def _start(self) -> Array | None:
-        return None
 
     def _end(self) -> Array:
         if not self.keep_state:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.solvers.stopping import IterationRecord, StopReason
+from recon.volume.empty_planes import EmptyPlanes
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,9 @@ class VolumeReconstruction:
         One a channel.
     seconds : float
         Wall time of the solvers.
+    empty_planes : tuple of EmptyPlanes
+        One a channel: depth planes that were left out because they stayed empty, and whether the optimality
+        condition certifies it.
     """
 
     volume: npt.NDArray[np.float32]
@@ -93,5 +97,6 @@ class VolumeReconstruction:
     histories: tuple[tuple[IterationRecord, ...], ...]
     stop_reasons: tuple[StopReason, ...]
     seconds: float
+    empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)

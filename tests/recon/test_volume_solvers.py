@@ -218,3 +218,69 @@ def test_residual_is_that_of_the_solution():
     outcome = solver.run(LONG)
     residual = np.linalg.norm(operator.forward(outcome.solution) - data)
     assert outcome.history[-1].data_residual == pytest.approx(residual, rel=1e-4)
+
+
+def thin_scene(n_z=12):
+    """Light in two planes of a dozen only."""
+    rng = np.random.default_rng(3)
+    psfs = rng.standard_normal((n_z, 1, 12, 12)) + 0.2
+    operator = Convolution3D(psfs, (14, 14), dtype=np.float64)
+    x = np.zeros(operator.domain_shape)
+    x[0, 3, 10:13, 9], x[0, 8, 12, 12] = 1.0, 2.0
+    data = operator.forward(x)
+    data += 0.01 * data.std() * rng.standard_normal(data.shape)
+    return operator, data, tau(operator, data, 0.05)
+
+
+def test_empty_planes_are_left_out_with_a_certificate():
+    operator, data, weight = thin_scene()
+    rules = StoppingRules(iterations=3000, tolerance=1e-6)
+    solver = DouglasRachford(operator, data, weight)
+    whole = DouglasRachford(operator, data, weight, drop_empty=False)
+    found, expected = solver.run(rules), whole.run(rules)
+    assert found.stop_reason is StopReason.CONVERGED
+    assert len(solver.empty.planes) >= 8
+    assert solver.empty.certified
+    assert not whole.empty.planes
+    np.testing.assert_allclose(found.solution, expected.solution, atol=1e-3 * expected.solution.max())
+    # The certificate, worked out from the solution alone.
+    correlation = operator.adjoint(data - operator.forward(found.solution))[0]
+    left_out = list(solver.empty.planes)
+    assert correlation[left_out].max() == pytest.approx(solver.empty.worst * weight, rel=1e-3)
+    assert correlation[left_out].max() <= 1.01 * weight
+
+
+def test_a_plane_left_out_by_mistake_comes_back():
+    operator, data, weight = thin_scene()
+    solver = DouglasRachford(operator, data, weight)
+    solver.watch.active[[2, 3, 5]] = False
+    solver._regroup()
+    outcome = solver.run(StoppingRules(iterations=3000, tolerance=1e-6))
+    expected = DouglasRachford(operator, data, weight, drop_empty=False)
+    best = expected.run(StoppingRules(iterations=3000, tolerance=1e-6)).solution
+    assert 3 not in solver.empty.planes
+    np.testing.assert_allclose(outcome.solution, best, atol=1e-3 * best.max())
+
+
+def test_a_run_cut_short_says_that_nothing_is_certain():
+    operator, data, weight = thin_scene()
+    solver = DouglasRachford(operator, data, weight)
+    solver.watch.active[3] = False
+    solver._regroup()
+    solver.run(StoppingRules(iterations=1))
+    assert solver.empty.planes == (3,)
+    assert solver.empty.worst > 1.5
+    assert not solver.empty.certified
+
+
+def test_planes_left_out_are_part_of_the_checkpoint():
+    operator, data, weight = thin_scene()
+    whole, first, second = (DouglasRachford(operator, data, weight) for _ in range(3))
+    whole.run(StoppingRules(iterations=60, tolerance=0))
+    first.run(StoppingRules(iterations=45, tolerance=0))
+    assert not first.watch.active.all()
+    second.restore(first.checkpoint())
+    while second.iteration < 60:
+        second.step()
+        second.iteration += 1
+    np.testing.assert_array_equal(second.solution, whole.solution)
