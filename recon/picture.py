@@ -19,6 +19,9 @@ from recon.result import Reconstruction
 from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord, StoppingRules
 from recon.types import Calibration
+from recon.varying_picture import model_of, reconstruct_varying
+from recon.volume.channel import PRIORS as VOLUME_PRIORS
+from recon.volume.model import MODELS, ModelName
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -45,6 +48,7 @@ def reconstruct(
     calibration: Calibration | npt.ArrayLike,
     *,
     z_um: float | None = None,
+    model: ModelName = "auto",
     method: str = "admm",
     prior: str | Prior = "tv",
     tau: float | None = None,
@@ -70,6 +74,11 @@ def reconstruct(
         PSFs, or one PSF image (height, width[, n_channels]) without background. One channel serves all.
     z_um : float, optional
         Depth of the scene; chooses the nearest calibrated PSF. Needed when there are several.
+    model : str
+        ``"convolution"`` (one PSF for the whole field), ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5; for
+        PSFs from several places of the field), or ``"auto"``: by how much the PSFs of that depth differ. The
+        latter two have a solver of their own, take the priors of :func:`recon.reconstruct_volume` and start
+        from zero.
     method : str
         A name from :func:`recon.methods.method_names`: ``"admm"``, ``"admm-sensor"``
         (for dense scenes on many pixels), ``"fista"``, ``"wiener"``.
@@ -113,6 +122,27 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
+    varying = _varying_model(calibration, z_um, model, method, prior, initial)
+    if varying is not None and varying[0] != "convolution":
+        assert isinstance(calibration, Calibration)
+        return reconstruct_varying(
+            measurement,
+            calibration,
+            z_um=z_um,
+            model=varying[0],
+            reason=varying[1],
+            prior=str(prior),
+            tau=tau,
+            iterations=iterations,
+            time_s=time_s,
+            tolerance=tolerance,
+            noise=noise,
+            background=background,
+            erasures=erasures,
+            field=field,
+            callback=callback,
+            cancel=cancel,
+        )
     problem = prepare(
         measurement, calibration, z_um=z_um, noise=noise, background=background, erasures=erasures
     )
@@ -159,7 +189,7 @@ def reconstruct(
         history=outcome.history,
         stop_reason=outcome.stop_reason,
         seconds=outcome.seconds,
-        warnings=problem.warnings,
+        warnings=problem.warnings if varying is None else (*problem.warnings, *varying[2]),
         state=outcome.solution * problem.image_scale,
         provenance={
             "noise_deviation": [float(v) for v in problem.noise],
@@ -167,6 +197,34 @@ def reconstruct(
             "valid_share": float(problem.noise_norm**2 / problem.data.size),
         },
     )
+
+
+def _varying_model(
+    calibration: Calibration | npt.ArrayLike,
+    z_um: float | None,
+    model: ModelName,
+    method: str,
+    prior: str | Prior,
+    initial: Reconstruction | None,
+) -> tuple[ModelName, str, tuple[str, ...]] | None:
+    """Return the camera model and why, where there is a choice; None for one convolution."""
+    if model not in MODELS:
+        raise InputError(_unknown("model", model, MODELS))
+    able = method == "admm" and isinstance(prior, str) and prior in VOLUME_PRIORS and initial is None
+    if model == "convolution" or (model == "auto" and not able):
+        return None
+    if not isinstance(calibration, Calibration):
+        if model == "auto":
+            return None
+        raise InputError(f"The {model} model needs a calibration with PSFs from several places of the field.")
+    if not able:
+        raise InputError(
+            f"The {model} model has a solver of its own: leave method at 'admm', take one of the priors "
+            f"{', '.join(VOLUME_PRIORS)}, and start from zero."
+        )
+    if model == "auto" and len(calibration.psfs) == 1:
+        return None
+    return model_of(calibration, z_um, model)
 
 
 def _named(prior: str | Prior, weight: float) -> tuple[str, Prior]:

@@ -26,6 +26,7 @@ from instrument.reconstruction_job import (
 from recon import reconstruct as solve
 from recon.result import Reconstruction
 from recon.solvers.stopping import IterationRecord, StopReason
+from recon.volume.model import MODELS, ModelName
 
 app = command_app()
 
@@ -69,6 +70,7 @@ class Rotation(enum.StrEnum):
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --method wiener --tau 0.01",
         "diffuserbench reconstruct --volume psfs/ --image raw.tif --out volume.tif",
         "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
+        "diffuserbench reconstruct --calibration field/ --image photo.tif --model local",
     )
 )
 def reconstruct(
@@ -97,7 +99,11 @@ def reconstruct(
     ] = None,
     model: Annotated[
         str,
-        typer.Option("--model", metavar="auto|convolution|local|lowrank", help="Camera model of a volume."),
+        typer.Option(
+            "--model",
+            metavar="auto|convolution|local|lowrank",
+            help="Camera model; local, lowrank: PSFs from several places of the field. auto: by their PSFs.",
+        ),
     ] = "auto",
     background: Annotated[
         bool,
@@ -256,8 +262,11 @@ def reconstruct(
             force=force,
         )
         return
-    if model != "auto" or not background:
-        raise BenchError("--model and --no-background are for volumes: give --volume, or leave them out.")
+    if not background:
+        raise BenchError("--no-background is for volumes: give --volume, or leave it out.")
+    chosen_model = next((m for m in MODELS if m == model), None)
+    if chosen_model is None:
+        raise BenchError(f"--model {model!r} is not known; choose one of {', '.join(MODELS)}.")
     outputs.check(0, overwrite=force)
     with saying_what_is_left(*outputs.files()):
         job = _job(
@@ -280,7 +289,7 @@ def reconstruct(
             typer.echo("SIMULATED   PSF or image come from the simulated bench")
         for warning in job.warnings:
             typer.echo(f"Warning: {warning}", err=True)
-        result = _solve(job, method, prior, tau, iterations, time_s, tolerance, z_mm)
+        result = _solve(job, chosen_model, method, prior, tau, iterations, time_s, tolerance, z_mm)
         _tell(result)
         _write(outputs, result, job, int(rotate))
     if result.stop_reason is StopReason.CANCELLED:
@@ -353,6 +362,7 @@ def _binning(text: str) -> int | None:
 
 def _solve(
     job: Job,
+    model: ModelName,
     method: Method,
     prior: PriorName | None,
     tau: float | None,
@@ -381,6 +391,7 @@ def _solve(
             job.measurement,
             job.calibration,
             z_um=None if z_mm is None else 1e3 * z_mm,
+            model=model,
             method=method.value,
             prior=chosen.value,
             tau=tau,
@@ -404,6 +415,8 @@ def _write(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) 
 
 def _tell(result: Reconstruction) -> None:
     weight = "" if result.tau is None else f", tau {result.tau:.3g}"
+    if "model" in result.provenance:
+        typer.echo(f"{'Model':<12}{result.provenance['model']}: {result.provenance['model_reason']}")
     typer.echo(f"{'Method':<12}{result.method}, prior {result.prior}{weight}")
     count = len(result.history)
     if not count:

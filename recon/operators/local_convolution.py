@@ -42,6 +42,7 @@ def local_convolution(
     *,
     n_channels: int | None = None,
     support: npt.NDArray[np.bool_] | None = None,
+    grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
 ) -> SpatiallyVarying:
     """Build the local convolution model of one or many depths.
@@ -59,6 +60,8 @@ def local_convolution(
     support : ndarray of bool, (n_z, field height, field width), optional
         Where the object may be other than zero: cells, depths and PSFs that it does not touch are left out,
         and windows shrink to it.
+    grid_shape : (int, int), optional
+        Lateral shape of the object's array, at least the field's: rows and columns beyond it do nothing.
     dtype : dtype
 
     Returns
@@ -83,7 +86,12 @@ def local_convolution(
             offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
             strips += _strips(z, psfs, field.points, rows, columns, needed, offset)
     return SpatiallyVarying(
-        strips, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
+        strips,
+        field_shape if grid_shape is None else grid_shape,
+        sensor_shape,
+        n_z=len(fields),
+        n_channels=channels,
+        dtype=dtype,
     )
 
 

@@ -74,6 +74,7 @@ def low_rank(
     error: float | None = None,
     n_channels: int | None = None,
     support: npt.NDArray[np.bool_] | None = None,
+    grid_shape: tuple[int, int] | None = None,
     dtype: npt.DTypeLike = np.float32,
 ) -> SpatiallyVarying:
     """Build the low-rank model of one or many depths: ``rank`` convolutions of the whole frame a depth.
@@ -101,5 +102,10 @@ def low_rank(
         offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
         strips.append(Strip(z, window, weights, (whole(window, psfs),), offset))
     return SpatiallyVarying(
-        strips, field_shape, sensor_shape, n_z=len(fields), n_channels=channels, dtype=dtype
+        strips,
+        field_shape if grid_shape is None else grid_shape,
+        sensor_shape,
+        n_z=len(fields),
+        n_channels=channels,
+        dtype=dtype,
     )

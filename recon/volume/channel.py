@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon import fft
 from recon.errors import InputError
 from recon.operators import (
     BackgroundRemoval,
@@ -20,12 +21,13 @@ from recon.operators import (
     local_convolution,
     low_rank,
 )
-from recon.priors import L1, NonNegativity, TotalVariation
-from recon.solvers import Fista, Solver
+from recon.operators.local_convolution import field_of
+from recon.solvers import Solver
 from recon.volume import memory
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.lean_tv import LeanTotalVariation
 from recon.volume.model import LOW_RANK_ERROR, Depths, ModelName
+from recon.volume.operator_admm import OperatorAdmm
 
 Array = npt.NDArray[Any]
 VolumePrior = Literal["tv", "tv-isotropic", "l1", "nonnegative"]
@@ -70,6 +72,8 @@ class ChannelProblem:
     prior : str
     weights : ndarray
         Axis weights of TV.
+    drop_empty : bool
+        With l1: leave out planes that stay empty.
     memory_gib, scratch : optional
         As :func:`recon.reconstruct_volume`.
     """
@@ -83,6 +87,7 @@ class ChannelProblem:
         smooth: bool,
         prior: VolumePrior,
         weights: Array,
+        drop_empty: bool = True,
         memory_gib: float | None = None,
         scratch: Path | str | None = None,
     ) -> None:
@@ -90,6 +95,7 @@ class ChannelProblem:
         self.valid = scaled.valid[channel]
         self.prior = prior
         self.weights = weights
+        self.drop_empty = drop_empty
         self._unit = scaled.energy / float(scaled.noise[channel])
         self._removal = (
             BackgroundRemoval((1, *self.valid.shape), BACKGROUND_FREQUENCIES, self.valid) if smooth else None
@@ -98,6 +104,7 @@ class ChannelProblem:
         self._storage = memory.Storage()
         own = slice(channel, channel + 1) if scaled.depths.central.shape[1] > 1 else slice(0, 1)
         scale = np.float32(1 / scaled.energy)
+        height, width = self.valid.shape
         if model == "convolution":
             self.camera: Convolution3D | SpatiallyVarying = self._convolution(
                 scaled.depths.central[:, own] * scale, scratch
@@ -105,6 +112,7 @@ class ChannelProblem:
         else:
             fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in scaled.depths.fields]
             self.camera = self._varying(fields, model)
+            self._central = Convolution3D(scaled.depths.central[:, own] * scale, (height, width))
 
     def _convolution(self, psfs: Array, scratch: Path | str | None) -> Convolution3D:
         height, width = self.valid.shape
@@ -121,15 +129,17 @@ class ChannelProblem:
 
     def _varying(self, fields: list[FieldOfPsfs], model: ModelName) -> SpatiallyVarying:
         shape = (self.valid.shape[0], self.valid.shape[1])
+        field_shape, _ = field_of(shape, fields[0].psfs.shape[2:])
+        grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
         camera = (
-            local_convolution(fields, shape)
+            local_convolution(fields, shape, grid_shape=grid)
             if model == "local"
-            else low_rank(fields, shape, error=LOW_RANK_ERROR)
+            else low_rank(fields, shape, error=LOW_RANK_ERROR, grid_shape=grid)
         )
         volumes = 12 if self.prior.startswith("tv") else 6
         size = 4 * int(np.prod(camera.domain_shape))
         available = memory.available_bytes() if self._limit is None else self._limit
-        self.plan = memory.MemoryPlan(0, volumes * size + 8 * camera.fft_pixels, available)
+        self.plan = memory.MemoryPlan(0, volumes * size + camera.nbytes, available)
         if not self.plan.fits:
             raise InputError(f"The {model} model needs {self.plan}. Bin the images or take fewer depths.")
         return camera
@@ -176,7 +186,7 @@ class ChannelProblem:
             raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
         weight = 0.0 if self.prior == "nonnegative" else tau * peak
         if isinstance(self.camera, SpatiallyVarying):
-            return self._general(data, weight, start), tau
+            return self._general(self.camera, weight, start), tau
         if kind == "l1":
             return (
                 DouglasRachford(
@@ -186,6 +196,7 @@ class ChannelProblem:
                     valid=self.valid,
                     background=self._removal,
                     initial=start,
+                    drop_empty=self.drop_empty,
                     keep_state=False,
                     storage=self._storage,
                 ),
@@ -213,17 +224,16 @@ class ChannelProblem:
             return float(np.abs(self.camera.adjoint(data)).max())
         return max(float(np.abs(plane).max()) for plane in self.camera.adjoint_planes(data))
 
-    def _general(self, data: Array, weight: float, start: Array | None) -> Solver:
-        if self.prior.startswith("tv"):
-            z, y, x = (float(w) for w in np.broadcast_to(self.weights, (len(self.weights), 3)).mean(axis=0))
-            tv = TotalVariation(
-                weight,
-                isotropic=self.prior == "tv-isotropic",
-                axis_weights=(z, y, x),
-                wrap=(False, False, False),
-                separable=NonNegativity(),
-                tolerance=1e-4,
-                max_inner=20,
-            )
-            return Fista(self.operator, data, tv, initial=start)
-        return Fista(self.operator, data, L1(weight) + NonNegativity(), initial=start)
+    def _general(self, camera: SpatiallyVarying, weight: float, start: Array | None) -> Solver:
+        z, y, x = (float(w) for w in np.broadcast_to(self.weights, (len(self.weights), 3)).mean(axis=0))
+        return OperatorAdmm(
+            camera,
+            self._central,
+            self.data,
+            weight,
+            axis_weights=(z, y, x) if self.prior.startswith("tv") else None,
+            isotropic=self.prior == "tv-isotropic",
+            valid=self.valid,
+            background=self._removal,
+            initial=start,
+        )

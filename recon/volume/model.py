@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.checks import select_psf
 from recon.errors import InputError
 from recon.operators.local_convolution import FieldOfPsfs
 from recon.operators.low_rank import principal_psfs
@@ -20,6 +21,10 @@ MODELS: tuple[ModelName, ...] = ("auto", "convolution", "local", "lowrank")
 
 TOLERATED = 0.05
 """Relative PSF error over the field below which one PSF a depth will do."""
+SAME_DEPTH = 1e-3
+"""Sources whose z differ by no more, relatively, were calibrated at one depth."""
+SAME_PLACE_UM = 1.0
+"""Sources nearer to one another in x and y were calibrated at one place."""
 LOW_RANK_ERROR = 0.03
 """Relative PSF error that the low-rank model is built to."""
 _SEARCH_PX, _SEARCH_PART = 16.0, 0.1
@@ -66,19 +71,14 @@ class Depths:
 def sort_by_depth(calibration: Calibration) -> Depths:
     """Group a calibration's PSFs by depth and register those of a depth to its central one.
 
-    PSFs whose depths are not known are taken for one depth each, in their order.
+    PSFs whose depths are not known are taken for one depth each, in their order; those of one depth may
+    differ by ``SAME_DEPTH`` (see :func:`members_of_depths`).
     """
     psfs, positions = calibration.psfs, calibration.source_positions_um
     if len(psfs) == 0:
         raise InputError("The calibration holds no PSF: a volume needs at least one depth.")
-    z = positions[:, 2]
-    if np.isfinite(z).all():
-        depths, first, label = np.unique(z, return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        members = [np.flatnonzero(label == k) for k in order]
-        z_um = depths[order]
-    else:
-        members, z_um = [np.array([k]) for k in range(len(psfs))], np.full(len(psfs), np.nan)
+    members = members_of_depths(positions)
+    z_um = np.array([float(np.mean(positions[group, 2])) for group in members])
     central, fields, warnings = [], [], []
     for group in members:
         off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
@@ -132,6 +132,50 @@ def _expected(calibration: Calibration, k: int, central: int) -> tuple[float, fl
         for x, y, z in positions.tolist()
     )
     return row - row_0, column - column_0
+
+
+def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray[np.intp]]:
+    """Group sources (n, 3) by depth: index arrays, in the order in which the depths first appear.
+
+    A stage does not come back to exactly the same z. Sources belong to one depth when they lie within
+    ``SAME_DEPTH`` of the group's least z, relative to it, each at another place of the field: two at the same
+    place were meant as two depths, however fine the steps.
+    """
+    z = positions_um[:, 2]
+    if not np.isfinite(z).all():
+        return [np.array([k]) for k in range(len(z))]
+    groups: list[list[int]] = []
+    for k in np.argsort(z, kind="stable"):
+        group = groups[-1] if groups else []
+        if group and z[k] - z[group[0]] <= SAME_DEPTH * abs(z[group[0]]):
+            apart = np.abs(positions_um[group, :2] - positions_um[k, :2]).max(axis=1)
+            # NaN stands for a place that is not known: not certainly another one.
+            if (apart > SAME_PLACE_UM).all():
+                group.append(int(k))
+                continue
+        groups.append([int(k)])
+    return [np.sort(np.array(g)) for g in sorted(groups, key=min)]
+
+
+def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
+    """Return the part of a calibration at the depth nearest to ``z_um`` (in 1/z, as PSFs change).
+
+    Raises
+    ------
+    InputError
+        When there are several depths and none is asked for, or they are not known.
+    """
+    groups = members_of_depths(calibration.source_positions_um)
+    if len(groups) > 1:
+        _, chosen = select_psf(calibration, z_um)
+        z = calibration.source_positions_um[:, 2]
+        groups = [g for g in groups if chosen in z[g]]
+    group = groups[0]
+    return replace(
+        calibration,
+        psfs=calibration.psfs[group],
+        source_positions_um=calibration.source_positions_um[group],
+    )
 
 
 def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:

@@ -19,6 +19,8 @@ from recon.solvers import Outcome, Solver, StoppingRules
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
+from recon.volume.douglas_rachford import DouglasRachford
+from recon.volume.empty_planes import EmptyPlanes
 from recon.volume.model import Depths, ModelName, choose_model, sort_by_depth
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
@@ -41,6 +43,7 @@ def reconstruct_volume(
     iterations: int | None = None,
     time_s: float | None = None,
     tolerance: float = 1e-3,
+    drop_empty: bool = True,
     field: Field = "sensor",
     initial: VolumeReconstruction | None = None,
     memory_gib: float | None = None,
@@ -74,6 +77,8 @@ def reconstruct_volume(
     iterations, time_s, tolerance : optional
         When to stop, whichever comes first. Without ``iterations`` and ``time_s``: 200 iterations. ``time_s``
         is shared evenly by the channels.
+    drop_empty : bool
+        With l1: leave out depth planes that stay empty, and certify it (see ``empty_planes`` of the result).
     field : "sensor" or "full"
         Return the part opposite to the sensor, or everything that can reach it.
     initial : VolumeReconstruction, optional
@@ -111,7 +116,7 @@ def reconstruct_volume(
     window, centre = _window(field, (height, width), (psf_shape[0], psf_shape[1]))
     grid = _grid(calibration, scaled.depths, window, centre)
     weights = grid.axis_weights() if axis_weights is None else np.asarray(axis_weights, float)
-    volumes, outcomes, backgrounds, taus = [], [], [], []
+    volumes, outcomes, backgrounds, taus, empty = [], [], [], [], []
     for channel in range(len(scaled.data)):
         run = ChannelProblem(
             scaled,
@@ -120,6 +125,7 @@ def reconstruct_volume(
             smooth=smooth,
             prior=prior,
             weights=weights,
+            drop_empty=drop_empty,
             memory_gib=memory_gib,
             scratch=scratch,
         )
@@ -136,6 +142,7 @@ def reconstruct_volume(
         backgrounds.append(run.background(outcome.solution) * scaled.noise[channel] if smooth else None)
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
+        empty.append(solver.empty if isinstance(solver, DouglasRachford) else EmptyPlanes())
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
@@ -151,9 +158,19 @@ def reconstruct_volume(
         histories=tuple(o.history for o in outcomes),
         stop_reasons=tuple(o.stop_reason for o in outcomes),
         seconds=sum(o.seconds for o in outcomes),
-        warnings=scaled.warnings,
+        empty_planes=tuple(empty),
+        warnings=(*scaled.warnings, *_uncertified(empty)),
         provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": str(run.plan)},
     )
+
+
+def _uncertified(empty: list[EmptyPlanes]) -> list[str]:
+    return [
+        f"Stopped before it was certain that {len(e.planes)} depth planes are empty: on one of them the "
+        f"residual's correlation is {e.worst:.2f} tau. Let it run longer, or give drop_empty=False."
+        for e in empty
+        if not e.certified
+    ]
 
 
 def _stacked(images: list[Array | None], flat: bool) -> npt.NDArray[np.float32] | None:

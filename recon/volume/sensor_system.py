@@ -99,13 +99,17 @@ class SensorSystem:
         X *= transfer
         return self.from_spectrum(X)
 
+    def _bend(self, e: Array) -> Array:
+        """``C q C^T e``."""
+        return self._filtered(e, self._q)
+
     def solve(self, right: Array, e: Array) -> None:
         """Improve ``e`` in place until the residual is down to the tolerance."""
         target = self.tolerance * float(np.linalg.norm(right))
         if not np.isfinite(target):
             e[...] = np.nan
             return
-        residual = right - e - self._filtered(e, self._q)
+        residual = right - e - self._bend(e)
         direction = np.zeros_like(e)
         rho = 1.0
         self.steps = 0
@@ -114,7 +118,7 @@ class SensorSystem:
             rho, rho_before = float(np.vdot(residual, z)), rho
             direction *= rho / rho_before if self.steps else 0.0
             direction += z
-            image = direction + self._filtered(direction, self._q)
+            image = direction + self._bend(direction)
             length = e.dtype.type(rho / float(np.vdot(direction, image)))
             e += length * direction
             residual -= length * image

@@ -5,11 +5,11 @@ import threading
 import numpy as np
 import pytest
 
-from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct_volume
+from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct, reconstruct_volume
 from recon.solvers import StopReason
 from recon.volume import memory
 from recon.volume.channel import ChannelProblem
-from recon.volume.model import choose_model, sort_by_depth
+from recon.volume.model import choose_model, members_of_depths, sort_by_depth
 
 SIZE, DEPTHS, SPAN = 40, 8, 0.4
 PITCH_UM, DISTANCE_MM = 10.0, 5.0
@@ -285,3 +285,69 @@ def test_being_called_back_costs_no_volume_more_at_the_end(monkeypatch, prior):
     monkeypatch.setattr(ChannelProblem, "solver", noted)
     reconstruct_volume(measurement(), calibration(), prior=prior, iterations=1, callback=lambda *_: None)
     assert not solvers[0][0].keep_state
+
+
+def test_depths_of_a_stage_that_repeats_imperfectly_are_one():
+    def positions(*rows):
+        return members_of_depths(np.array(rows, float))
+
+    same = positions((0, 0, 10_000), (500, 0, 10_004), (0, 500, 9_998), (0, 0, 12_000))
+    assert [list(g) for g in same] == [[0, 1, 2], [3]]
+    fine = positions((0, 0, 10_000), (0, 0, 10_004), (0, 0, 10_008))
+    assert [list(g) for g in fine] == [[0], [1], [2]], "one place, three depths"
+    unknown = positions((0, 0, np.nan), (500, 0, np.nan))
+    assert [list(g) for g in unknown] == [[0], [1]]
+
+
+def test_empty_planes_are_told():
+    result = reconstruct_volume(measurement(), calibration(), prior="l1", tau=0.1, tolerance=1e-4)
+    (empty,) = result.empty_planes
+    assert empty.certified
+    assert empty.planes
+    assert not result.volume[list(empty.planes)].any()
+    whole = reconstruct_volume(
+        measurement(), calibration(), prior="l1", tau=0.1, tolerance=1e-4, drop_empty=False
+    )
+    assert not whole.empty_planes[0].planes
+    np.testing.assert_allclose(result.volume, whole.volume, atol=0.02 * whole.volume.max())
+
+
+def field_scene(fall_off):
+    beads = [(r + 0.3, c - 0.4, 3, 900.0) for r in (-9, 0, 9) for c in (-9, 0, 9)]
+    clean = sum(render([b], fall_off_px=fall_off) for b in beads) * 50
+    rng = np.random.default_rng(5)
+    return rng.poisson(clean) + rng.normal(0, 2, clean.shape)
+
+
+@pytest.mark.parametrize("model", ["auto", "local", "lowrank"])
+def test_a_picture_takes_the_model_of_its_field(model):
+    b, c = field_scene(20.0), field_calibration(20.0)
+    one = reconstruct(b, c, model="convolution", z_um=Z_UM[3], prior="l1", tau=1e-3)
+    result = reconstruct(b, c, model=model, prior="l1", tau=1e-3)
+    assert result.image.shape == (SIZE, SIZE)
+    assert result.provenance["model"] in ("local", "lowrank")
+    assert result.history[-1].data_residual < 0.6 * one.history[-1].data_residual
+    assert result.grid.object_pitch_um is None  # this calibration tells no geometry
+    assert result.grid.z_um == pytest.approx(Z_UM[3])
+
+
+def test_a_picture_of_colour_and_its_refusals():
+    b, c = field_scene(20.0), field_calibration(20.0)
+    colour = np.stack([b, 0.5 * b, b], axis=-1)
+    seen = []
+    result = reconstruct(
+        colour,
+        c,
+        model="local",
+        prior="tv",
+        iterations=2,
+        callback=lambda r, image: seen.append(image().shape),
+    )
+    assert result.image.shape == (SIZE, SIZE, 3)
+    assert seen == [(SIZE, SIZE)] * 6
+    with pytest.raises(InputError, match="solver of its own"):
+        reconstruct(b, c, model="local", method="fista")
+    with pytest.raises(InputError, match="several places of the field"):
+        reconstruct(b, c.psfs[0, 0], model="lowrank")
+    with pytest.raises(InputError, match="Did you mean 'local'"):
+        reconstruct(b, c, model="locl")

@@ -1,0 +1,105 @@
+"""The solver of the local and low-rank models against FISTA, on small problems."""
+
+import numpy as np
+import pytest
+
+from recon import fft, threads
+from recon.operators import BackgroundRemoval, Convolution3D, Erasures, FieldOfPsfs, local_convolution
+from recon.priors import L1, NonNegativity, TotalVariation
+from recon.solvers import Fista, StoppingRules
+from recon.volume.operator_admm import OperatorAdmm
+
+POINTS = np.array([(y, x) for y in (-6, 0, 6) for x in (-6, 0, 6)], float)
+SENSOR = (14, 13)
+
+
+def problem(n_z=2, seed=0):
+    """PSFs of both signs that change over the field; light in a few voxels."""
+    rng = np.random.default_rng(seed)
+    fields = []
+    for _ in range(n_z):
+        base = rng.standard_normal((1, 7, 8)) + 0.2
+        changes = 0.3 * rng.standard_normal((9, 1, 7, 8))
+        changes[4] = 0
+        fields.append(FieldOfPsfs(base + changes, POINTS))
+    field = (SENSOR[0] + 6, SENSOR[1] + 7)
+    grid = (fft.fast_length(field[0]), fft.fast_length(field[1]))
+    camera = local_convolution(fields, SENSOR, grid_shape=grid, dtype=np.float64)
+    central = Convolution3D(np.stack([f.psfs[4] for f in fields]), SENSOR, dtype=np.float64)
+    x = np.zeros(camera.domain_shape)
+    x[0, 0, 8:12, 9:12], x[0, -1, 6:9, 12] = 1.0, 2.0
+    data = camera.forward(x)
+    data += 0.01 * data.std() * rng.standard_normal(data.shape)
+    return camera, central, data
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = threads.get_threads()
+    threads.set_threads(1)
+    yield
+    threads.set_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "harder"), [("l1", False), ("tv", False), ("l1", True), ("tv-isotropic", True)]
+)
+def test_reaches_the_minimiser_that_fista_reaches(kind, harder):
+    camera, central, data = problem()
+    rng = np.random.default_rng(4)
+    valid = rng.random(SENSOR) > 0.2 if harder else np.ones(SENSOR, bool)
+    removal = BackgroundRemoval((1, *SENSOR), (3, 2), valid, np.float64) if harder else None
+    if harder:
+        data = np.where(valid, data + 5 + 2 * np.cos(np.pi * (np.arange(SENSOR[1]) + 0.5) / SENSOR[1]), 0)
+    operator = Erasures(valid, data.shape, np.float64) @ camera
+    reduced = data
+    if removal is not None:
+        operator, reduced = removal @ operator, removal.forward(data)
+    weight = 0.02 * float(np.abs(operator.adjoint(reduced)).max())
+    weights = None if kind == "l1" else (0.5, 1.0, 1.0)
+    prior = L1(weight) + NonNegativity()
+    if weights is not None:
+        prior = (
+            TotalVariation(
+                weight,
+                isotropic=kind == "tv-isotropic",
+                axis_weights=weights,
+                wrap=(False,) * 3,
+                tolerance=1e-6,
+            )
+            + NonNegativity()
+        )
+    solver = OperatorAdmm(
+        camera, central, data, weight, axis_weights=weights, isotropic=kind == "tv-isotropic", valid=valid,
+        background=removal,
+    )  # fmt: skip
+    outcome = solver.run(StoppingRules(iterations=250, tolerance=1e-6))
+    best = Fista(operator, reduced, prior).run(StoppingRules(iterations=700, tolerance=1e-7)).solution
+
+    def value(x):
+        return 0.5 * float(np.sum((operator.forward(x) - reduced) ** 2)) + prior.value(x)
+
+    assert value(outcome.solution) == pytest.approx(value(best), rel=1e-4 if kind == "l1" else 6e-4)
+    residual = float(np.linalg.norm(operator.forward(outcome.solution) - reduced))
+    assert outcome.history[-1].data_residual == pytest.approx(residual, rel=1e-3)
+
+
+def test_needs_a_tenth_of_the_iterations_of_fista():
+    """On a dense scene under smooth PSFs, where the mean carries the norm."""
+    camera, central, _ = problem(1)
+    rng = np.random.default_rng(6)
+    fields = [FieldOfPsfs(rng.random((1, 1, 7, 8)) * (1 + 0.2 * rng.random((9, 1, 1, 1))), POINTS)]
+    camera = local_convolution(fields, SENSOR, dtype=np.float64)
+    central = Convolution3D(fields[0].psfs[4:5], SENSOR, dtype=np.float64)
+    x = np.zeros(camera.domain_shape)
+    x[0, 0, 4:14, 4:12] = rng.random((10, 8))
+    data = camera.forward(x) + 0.01 * rng.standard_normal(camera.range_shape)
+    weight = 1e-3 * float(np.abs(camera.adjoint(data)).max())
+    prior = L1(weight) + NonNegativity()
+
+    def value(x):
+        return 0.5 * float(np.sum((camera.forward(x) - data) ** 2)) + prior.value(x)
+
+    few = OperatorAdmm(camera, central, data, weight).run(StoppingRules(iterations=60, tolerance=0))
+    many = Fista(camera, data, prior).run(StoppingRules(iterations=600, tolerance=0))
+    assert value(few.solution) <= value(many.solution) * 1.001
