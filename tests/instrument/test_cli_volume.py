@@ -104,7 +104,7 @@ def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     assert f"With --volume these do not apply: {options[0]}." in output
     code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, "--no-background")
     assert code == 2
-    assert "are for volumes" in output
+    assert "is for volumes" in output
     assert not out.exists()
 
 
