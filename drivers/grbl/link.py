@@ -166,7 +166,7 @@ class GrblLink:
         with self._heard:
             if alarm is not None:
                 self._alarm = alarm
-                _log.warning("%s: %s", self.device, self.alarm_words(alarm))
+                _log.info("%s: %s", self.device, self.alarm_words(alarm))
             elif is_banner(line):
                 self._banners += 1
                 self._offset = None

@@ -245,11 +245,12 @@ class GrblStage(PolledStage):
                 self._fault = self._link.refused(b"$H", code).problem
         try:
             report = self._link.report()
-        except (DeviceTimeoutError, StoppedError):
+        except (DeviceTimeoutError, StoppedError) as error:
             self._note_what_happened()
-            if not self._fault:
+            if isinstance(error, DeviceTimeoutError) and not self._fault:
                 raise
-            report = self._link.report()  # a critical alarm: it is heard again since it was reset
+            # After a critical alarm it is heard again since it was reset; STOP overtook the question.
+            report = self._link.report()
         self._note_what_happened()  # whatever was said before this report
         if len(report.places) != len(self._zero):
             raise DeviceError(

@@ -234,8 +234,8 @@ class IlluminateLedArray(LedArray):
                     self.link.command(words)
                 if self._darkenings != began:
                     raise StoppedError(self.name, "the light was turned off meanwhile.")
-            except BaseException:
-                self._color = self._auto_clear = None  # who knows which commands arrived
+            except BaseException as error:
+                self.darken_after(error)
                 raise
             self._pattern = pattern
         return pattern
@@ -253,16 +253,25 @@ class IlluminateLedArray(LedArray):
         self._darkenings += 1
         self.link.darken_at_once()
         with self.commanding:
+            self._confirm_darkness()
+            self._pattern = OFF
+            self._color = self._auto_clear = None
+
+    def _confirm_darkness(self) -> None:
+        while True:
             try:
                 self.link.command(b"x")
+            except StoppedError:
+                if not self.link.is_open:
+                    raise
+                continue  # another thread turned it off meanwhile, and overtook this question
             except DeviceTimeoutError as error:
                 raise DeviceError(
                     self.name,
                     f"does not confirm that it is off ({error.problem})",
                     "The light may be on: check it, and its cable.",
                 ) from error
-            self._pattern = OFF
-            self._color = self._auto_clear = None
+            return
 
     # More than the interface ------------------------------------------------------------------------
     def set_brightness(self, brightness: int) -> int:
@@ -330,6 +339,14 @@ class IlluminateLedArray(LedArray):
                 "Another program may be using it; open it again.",
             )
         self._color = rgb
+
+    def darken_after(self, error: BaseException) -> None:
+        """Turn off what may shine since a command failed; that this fails too becomes a note."""
+        self._color = self._auto_clear = None  # who knows which commands arrived
+        try:
+            self.off()
+        except DeviceError as another:
+            error.add_note(f"The light may be on: {another}")
 
     def remember(self, setting: str, restore: Callable[[], object]) -> None:
         """Keep how to bring a setting back when a lost array is opened again."""

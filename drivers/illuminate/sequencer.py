@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from drivers.errors import DeviceError, DeviceNotOpenError, LimitError, StoppedError
+from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
 from drivers.illuminate.protocol import parse_trigger_outputs
 from drivers.led_array import OFF, LedPattern, Rgb
 
@@ -145,11 +145,8 @@ class Sequencer:
             try:
                 array.link.command(words, limit_s)
                 array.link.command(b"x")
-            except StoppedError:
-                raise
-            except DeviceError:
-                if array.link.is_open:
-                    array.off()
+            except BaseException as error:
+                array.darken_after(error)
                 raise
             array.showing(OFF)
         return shown

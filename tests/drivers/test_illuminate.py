@@ -226,6 +226,15 @@ def test_off_during_a_pattern_leaves_it_dark(array: IlluminateEmulator, leds: Il
     assert leds.pattern == OFF
 
 
+def test_off_from_many_threads_at_once(array: IlluminateEmulator, leds: IlluminateLedArray) -> None:
+    leds.set_pattern(leds.bright_field(0.2))
+    runs = [in_background(leds.off) for _ in range(4)]
+    for thread, _ in runs:
+        thread.join(30)
+    assert [outcome for _, outcome in runs] == [[None]] * 4
+    assert not array.lit.any()
+
+
 def test_off_says_when_the_light_may_be_on(
     array: IlluminateEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,6 +320,39 @@ def test_no_power_says_what_to_check(new_array: IlluminateEmulator, new_leds: Il
     with pytest.raises(DeviceError, match="power supply"):
         new_leds.set_pattern(new_leds.single(0))
     assert new_leds.pattern.is_dark
+
+
+def test_a_pattern_that_fails_halfway_leaves_nothing_lit(
+    array: IlluminateEmulator, leds: IlluminateLedArray
+) -> None:
+    array.fault = spoil(b"l.7", b"ERROR[3]: Source Disconnected\n-==-\n")
+    with pytest.raises(DeviceError, match="Disconnected"):
+        leds.set_pattern(LedPattern("two", ((0, (9, 0, 0)), (7, (0, 9, 0)))))
+    assert b"l.7" in array.received
+    assert not array.lit.any()
+    assert leds.pattern.is_dark
+    leds.set_pattern(leds.single(7, (0, 9, 0)))
+    assert array.lit[7].tolist() == [0, 9, 0]
+
+
+def test_ctrl_c_in_a_sequence_leaves_nothing_lit(
+    array: IlluminateEmulator, leds: IlluminateLedArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leds.sequencer.load([leds.single(k) for k in range(3)])
+    command = leds.link.command
+
+    def interrupted(words: bytes, timeout_s: float | None = None) -> list[bytes]:
+        if words.startswith(b"rseq"):
+            leds.link._transport.send_now(words + b"\n")
+            wait_until(lambda: array.lit.any())
+            raise KeyboardInterrupt
+        return command(words, timeout_s)
+
+    monkeypatch.setattr(leds.link, "command", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        leds.sequencer.run(50, 1000)
+    assert not array.lit.any()
+    assert leds.pattern.is_dark
 
 
 def test_late_replies_and_garbage(array: IlluminateEmulator, monkeypatch: pytest.MonkeyPatch) -> None:
