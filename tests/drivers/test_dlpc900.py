@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from drivers.device import Device
 from drivers.dlpc900 import commands, link
-from drivers.dlpc900.commands import Board
+from drivers.dlpc900.commands import Board, Command
 from drivers.dlpc900.images import encode
 from drivers.dlpc900.packets import parse_reply, reports
 from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
@@ -318,9 +318,9 @@ def test_silence_is_an_error_and_later_commands_get_their_own_replies(board: Dlp
         board.faults.silent = False
         board.faults.late = True
         with pytest.raises(DeviceTimeoutError):
-            device.settings()
+            device._link.read(Command.ERROR_CODE, 1)  # 0
         board.faults.late = False
-        assert device.settings()["mode"] == "pattern on the fly"
+        assert device._link.read(Command.DISPLAY_MODE, 1) == b"\x03"
         device.display(pattern())
         np.testing.assert_array_equal(board.shown, pattern())
 

@@ -96,7 +96,7 @@ class Faults:
 
     silent: bool = False
     late: bool = False
-    """Each reply comes with the one after it."""
+    """Replies are held back, and come before the first that is not late."""
     garbage: bytes | None = None
     """Sent before each reply."""
     truncated: bool = False
@@ -180,7 +180,9 @@ class Dlpc900Emulator:
         if self.faults.truncated:
             replies = [reply[:3]]
         if self.faults.late:
-            replies, self._held = self._held, replies
+            self._held += replies
+            return []
+        replies, self._held = self._held + replies, []
         return replies
 
     def _read(self, command: int) -> bytes:
