@@ -153,6 +153,15 @@ def test_without_qt_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPat
         SecondDisplaySlm(options()).open()
 
 
+def test_the_driver_can_be_configured_without_qt() -> None:
+    code = (
+        "import sys; from drivers.registry import load_driver; load_driver('slm', 'second_display'); "
+        "print([name for name in sys.modules if name.startswith('PySide6')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout == "[]\n"
+
+
 def test_without_qts_libraries_the_error_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
