@@ -187,6 +187,7 @@ class BufferedCamera(Camera):
         with self._fetching:
             if self._connected:
                 self._disconnect()
+            self._lost = None
 
     def _require(self) -> None:
         if self._lost is not None:
@@ -239,7 +240,7 @@ class BufferedCamera(Camera):
             image = np.empty(run.shape, run.dtype)
             first_id = self._next_id
             for _ in range(skip + 1):
-                metadata = self._next_into(image, deadline_s - time.monotonic())
+                metadata = self._next_into(run, image, deadline_s - time.monotonic())
             # Frames let go, or lost before the one that was asked for, were not asked for: they do not count.
             self._next_id = first_id + 1
             return Frame(image, replace(metadata, frame_id=first_id, dropped_before=0))
@@ -257,7 +258,7 @@ class BufferedCamera(Camera):
         """Return the oldest frame of the running sequence not yet fetched."""
         run = self._running()
         image = np.empty(run.shape, run.dtype)
-        return Frame(image, self._next_into(image, timeout_s))
+        return Frame(image, self._next_into(run, image, timeout_s))
 
     def next_frame_into(self, buffer: Pixels, timeout_s: float) -> FrameMetadata:
         """Unpack the oldest frame not yet fetched into a buffer that fits it."""
@@ -267,7 +268,7 @@ class BufferedCamera(Camera):
                 self.name,
                 f"sends frames {run.dtype} {run.shape}; {buffer.dtype} {buffer.shape} was expected.",
             )
-        return self._next_into(buffer, timeout_s)
+        return self._next_into(run, buffer, timeout_s)
 
     def trigger(self) -> None:
         """Send one software trigger."""
@@ -324,11 +325,10 @@ class BufferedCamera(Camera):
                 self._run = None
                 self._end()
 
-    def _next_into(self, image: Pixels, timeout_s: float) -> FrameMetadata:
+    def _next_into(self, run: _Run, image: Pixels, timeout_s: float) -> FrameMetadata:
         deadline_s = time.monotonic() + timeout_s
         with self._fetching:
-            run = self._run
-            while run is not None and not run.stopping:
+            while self._run is run and not run.stopping:
                 try:
                     raw = self._take(max(0.0, deadline_s - time.monotonic()))
                     metadata = None if raw is None else self._accept(raw, run, image)

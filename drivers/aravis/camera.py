@@ -54,6 +54,7 @@ class AravisCamera(AravisImageSettings):
                     driver="aravis",
                     kind="camera",
                     options={"device_id": aravis.get_device_id(i)},
+                    note="pixel_pitch_um = (micrometres, if the camera does not say it: its data sheet does)",
                 )
             )
         return tuple(found)
@@ -68,6 +69,7 @@ class AravisCamera(AravisImageSettings):
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
         features, aravis, camera = self._features, self._aravis, self._camera
         self._woken.clear()
+        self._apply_rate()
         with features.words("start streaming"):
             self._stream = camera.create_stream(None, None)
             if self._stream is None:
@@ -97,6 +99,12 @@ class AravisCamera(AravisImageSettings):
 
     def _raw(self, buffer: Any) -> RawFrame:
         complete = buffer.get_status() == self._aravis.BufferStatus.SUCCESS
+        if complete:
+            width, height = buffer.get_image_width(), buffer.get_image_height()
+            padding, _ = buffer.get_image_padding()
+            pixels = self._formats[self._format_name]
+            self._line_bytes = pixels.line_bytes(width) + padding if padding else None
+            complete = (height, width) == self.image_shape
         data = np.frombuffer(buffer.get_data() if complete else b"", np.uint8)
         return RawFrame(
             data=data,
@@ -121,7 +129,7 @@ class AravisCamera(AravisImageSettings):
         self._statistics = _statistics(stream)
 
     def _decode(self, data: Bytes, out: Pixels) -> bool:
-        return unpack(data, self._formats[self._format_name].packing, out)
+        return unpack(data, self._formats[self._format_name].packing, out, self._line_bytes)
 
     def _fire(self) -> None:
         self._features.execute("TriggerSoftware")
@@ -133,12 +141,12 @@ class _Underruns(FrameNumberCounter):
     def __init__(self, stream: Any) -> None:
         super().__init__(_BLOCK_IDS, 1)
         self._stream = stream
-        self._counted = 0
+        self._counted: int | None = None
 
     def lost(self, number: int) -> int:
         underruns = int(self._stream.get_info_uint64_by_name("n_underruns"))
-        new, self._counted = underruns - self._counted, underruns
-        return super().lost(number) + new
+        before, self._counted = self._counted, underruns
+        return super().lost(number) + (0 if before is None else underruns - before)
 
 
 def _statistics(stream: Any) -> dict[str, int]:

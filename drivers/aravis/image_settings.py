@@ -244,7 +244,8 @@ class AravisImageSettings(AravisSettings):
         for selector in selectors or (None,):
             if selector is not None:
                 features.choose("TriggerSelector", selector)
-            features.choose("TriggerMode", "Off")
+            if features.find("TriggerMode"):  # not every selector has it
+                features.choose("TriggerMode", "Off")
         if mode != "free_run":
             frame = next((name for name in FRAME_TRIGGERS if name in selectors), None)
             if frame is not None:

@@ -160,7 +160,7 @@ class AravisSettings(BufferedCamera):
         self._open_images()
         for name, value in self.options.features.items():
             features.set_any(name, value)
-        self._apply_rate()
+        self._rate = features.number(self._rate_name) if self._rate_name else 0.0
         self._exposure_ms = features.number(self._exposure_name) / 1e3
         self._gain = self._read_gain()
         if self._camera.is_gv_device():
@@ -232,7 +232,7 @@ class AravisSettings(BufferedCamera):
         return 1 / self._rate if self._rate else 0.0
 
     def _apply_rate(self) -> None:
-        """Set the configured frame rate, and note the present one."""
+        """Set the configured frame rate, whose limits depend on region and exposure; note the present one."""
         features, wanted = self._features, self.options.frames_per_s
         if wanted is not None:
             if self._rate_name is None:

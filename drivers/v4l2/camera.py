@@ -47,7 +47,7 @@ class V4l2Camera(V4l2ImageSettings):
                 FoundDevice(
                     bus=device.bus,
                     address=device.address,
-                    description=f"{device.description} (pixel_pitch_um: see its data sheet)",
+                    description=device.description,
                     vendor=device.vendor,
                     product=device.product,
                     serial_number=device.serial_number,
@@ -55,6 +55,7 @@ class V4l2Camera(V4l2ImageSettings):
                     driver="v4l2",
                     kind="camera",
                     options={"device": lasting_path(device.address)},
+                    note="pixel_pitch_um = (micrometres, from the data sheet of its sensor)",
                 )
             )
         return tuple(found)

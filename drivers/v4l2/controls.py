@@ -22,6 +22,7 @@ _SETTABLE = (
     api.CTRL_TYPE_BUTTON,
 )
 _MOST = 2000
+_ALL_BITS = 0xFFFFFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,14 @@ class Control:
         """Whether it has a value to read."""
         return self.type != api.CTRL_TYPE_BUTTON and not self.flags & api.CTRL_FLAG_WRITE_ONLY
 
+    def takes(self, value: int) -> bool:
+        """Whether a value is on its menu, among its bits, or in its range."""
+        if self.type == api.CTRL_TYPE_BUTTON:
+            return True
+        if self.type == api.CTRL_TYPE_BITMASK:
+            return value >= 0 and value & ~self.maximum == 0
+        return value in self.menu if self.menu else self.minimum <= value <= self.maximum
+
     @property
     def range_text(self) -> str:
         """What it takes, in words."""
@@ -64,6 +73,8 @@ class Control:
             return ", ".join(f"{value} ({text})" for value, text in self.menu.items())
         if self.type == api.CTRL_TYPE_BUTTON:
             return "any value"
+        if self.type == api.CTRL_TYPE_BITMASK:
+            return f"bits of {self.maximum:#x}"
         steps = f" in steps of {self.step}" if self.step > 1 else ""
         return f"{self.minimum} to {self.maximum}{steps}"
 
@@ -90,7 +101,7 @@ class Controls:
         """Read a control."""
         value = api.ControlValue(id=control.id)
         self._device.call(api.G_CTRL, value, f"read its control {control.name}")
-        return value.value
+        return value.value & _ALL_BITS if control.type == api.CTRL_TYPE_BITMASK else value.value
 
     def set(self, control: Control, value: int) -> int:
         """Set a control; returns what it reads afterwards (a button: ``value``).
@@ -102,8 +113,7 @@ class Controls:
         DeviceError
             When the driver refuses (read only, or inactive while an automatic is on).
         """
-        inside = value in control.menu if control.menu else control.minimum <= value <= control.maximum
-        if not inside and control.type != api.CTRL_TYPE_BUTTON:
+        if not control.takes(value):
             raise LimitError(
                 self._device.name,
                 f"control {control.name} does not take {value}.",
@@ -150,7 +160,7 @@ class Controls:
             name=re.sub(r"[^a-z0-9]+", "_", found.name.decode(errors="replace").lower()).strip("_"),
             type=found.type,
             minimum=found.minimum,
-            maximum=found.maximum,
+            maximum=found.maximum & _ALL_BITS if found.type == api.CTRL_TYPE_BITMASK else found.maximum,
             step=found.step,
             default=found.default_value,
             menu=menu,

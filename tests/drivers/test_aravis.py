@@ -127,8 +127,10 @@ def test_features_of_the_configuration_are_set_and_listed() -> None:
         camera_of("Fake_1", features={"Colour": 1}).open()
     with pytest.raises(LimitError, match=r"PixelFormat 'Mono99'\. It offers .*Mono8"):
         camera_of("Fake_1", features={"PixelFormat": "Mono99"}).open()
-    with pytest.raises(LimitError, match="cannot send 5000 frames/s"):
-        camera_of("Fake_1", frames_per_s=5000.0).open()
+    with camera_of("Fake_1", frames_per_s=5000.0) as camera:
+        with pytest.raises(LimitError, match="cannot send 5000 frames/s"):
+            camera.start_sequence()
+        assert not camera.is_streaming
 
 
 def test_a_hardware_trigger_sets_line_and_edge(fake: AravisCamera) -> None:
@@ -223,6 +225,22 @@ def test_known_lost_packets_lose_exactly_their_frames() -> None:
 
 
 @pytest.mark.usefixtures("port")
+def test_without_resends_what_the_camera_could_send_again_stays_lost() -> None:
+    fakes = viva_or_skip()
+    with (
+        fakes(width=256, height=256, fps=30, drop_packets=[(3, 4)], packet_resend=True),
+        camera_of(ADDRESS, frames_per_s=None, packet_resend=False, packet_size=1400) as camera,
+    ):
+        assert camera.settings()["packet_size_bytes"] == 1400
+        camera.set_pixel_format("Mono8")
+        camera.set_roi(Roi(0, 0, 256, 256))
+        camera.start_sequence(32)
+        frames = [camera.next_frame(10).metadata for _ in range(5)]
+        camera.stop_sequence()
+    assert sum(metadata.dropped_before for metadata in frames) == 1
+
+
+@pytest.mark.usefixtures("port")
 def test_lost_packets_are_sent_again_where_the_camera_can() -> None:
     fakes = viva_or_skip()
     with (
@@ -282,6 +300,8 @@ def test_sfnc_names_serve_too() -> None:
         assert camera.set_exposure_ms(3.0) == pytest.approx(3.0)
         assert camera.set_black_level(5) == 5
         assert camera.gain_limits[0] == 1.0
+        camera.set_roi(Roi(0, 0, 256, 256))
+        camera.snap()
         assert camera.settings()["frames_per_s"] == pytest.approx(20.0)
         assert camera.settings()["packet_size_bytes"]
 

@@ -86,6 +86,10 @@ def test_controls_have_ranges_menus_and_are_read_back(camera: V4l2Camera) -> Non
         camera.set_control("menu", 2)
     with pytest.raises(DeviceError, match="read only"):
         camera.set_control("read_only_integer_32_bits", 1)
+    assert controls["bitmask"].maximum == 0x80402010
+    assert camera.set_control("bitmask", 0x80000000) == 0x80000000
+    with pytest.raises(LimitError, match="bits of 0x80402010"):
+        camera.set_control("bitmask", 1)
     low, high = camera.gain_limits
     assert camera.set_gain(high) == camera.gain == high
     with pytest.raises(LimitError):
