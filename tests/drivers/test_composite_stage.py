@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from drivers.composite_stage import CompositeOptions, CompositeStage
 from drivers.device import SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
+from drivers.testing.stage import StageContract
 from drivers.zaber.stage import ZaberOptions, ZaberStage
-from tests.drivers.contract_stage import StageContract
 from tests.mocks.grbl_controller import GrblController
 from tests.mocks.moving_axis import MovingAxis
 from tests.mocks.zaber_chain import ZaberChain, ZaberDevice

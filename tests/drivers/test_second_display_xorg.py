@@ -223,6 +223,37 @@ def test_another_mode_or_place_is_an_error_by_name(
         slm.display(ramp(slm.shape))
 
 
+@pytest.mark.usefixtures("outputs")
+@pytest.mark.skipif(ctypes.util.find_library("Xtst") is None, reason="libXtst is not installed")
+def test_real_clicks_and_keys_change_nothing(server: str) -> None:
+    xlib, extension = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXtst.so.6")
+    xlib.XOpenDisplay.restype = ctypes.c_void_p
+    xlib.XKeysymToKeycode.restype = ctypes.c_ubyte
+    display = ctypes.c_void_p(xlib.XOpenDisplay(server.encode()))
+    with SecondDisplaySlm(options()) as slm:
+        slm.display(ramp(slm.shape))
+        for x in (1300, 1700, 2079):
+            extension.XTestFakeMotionEvent(display, 0, x, x - 1290, 0)
+            for button in (1, 2, 3):
+                extension.XTestFakeButtonEvent(display, button, 1, 0)
+                extension.XTestFakeButtonEvent(display, button, 0, 0)
+        alt, *keys = (
+            xlib.XKeysymToKeycode(display, ctypes.c_ulong(xlib.XStringToKeysym(name)))
+            for name in (b"Alt_L", b"F4", b"Escape", b"q")
+        )
+        extension.XTestFakeKeyEvent(display, alt, 1, 0)
+        for key in keys:
+            extension.XTestFakeKeyEvent(display, key, 1, 0)
+            extension.XTestFakeKeyEvent(display, key, 0, 0)
+        extension.XTestFakeKeyEvent(display, alt, 0, 0)
+        xlib.XSync(display, 0)
+        time.sleep(0.3)
+        np.testing.assert_array_equal(shot(1280, 0, 800, 600), np.repeat(ramp(slm.shape)[..., None], 3, 2))
+        assert slm.is_open
+        slm.blank()
+    xlib.XCloseDisplay(display)
+
+
 class ScreenSaverInfo(ctypes.Structure):
     _fields_ = (
         ("window", ctypes.c_ulong),
