@@ -44,7 +44,7 @@ class Curve:
     def cut_offs_deg(self, level: float = CUT_OFF) -> tuple[float | None, float | None]:
         """Return where the response falls to ``level`` on the negative and the positive side; None: nowhere.
 
-        Interpolated linearly between the measured angles.
+        Between the measured angles the logarithm goes with the square of the angle.
         """
         angles, values = np.array(self.angles_deg), np.array(self.response)
         sides: list[float | None] = []
@@ -57,7 +57,9 @@ class Curve:
                 sides.append(None)
                 continue
             k = int(below[0])
-            sides.append(float(a[k - 1] + (v[k - 1] - level) / (v[k - 1] - v[k]) * (a[k] - a[k - 1])))
+            logs = np.log(np.maximum(v[k - 1 : k + 1], _LEAST))
+            part = (logs[0] - np.log(level)) / (logs[0] - logs[1])
+            sides.append(float(np.sqrt(a[k - 1] ** 2 + part * (a[k] ** 2 - a[k - 1] ** 2))))
         return sides[0], sides[1]
 
     @property

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration_routines.angular_response import CUT_OFF, AngularResponse
+from calibration_routines.dpc import DiffuserSurface
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +34,46 @@ def response_figure(response: AngularResponse) -> Figure:
     axes.set(xlabel="angle of incidence, degrees", ylabel="response relative to the axis", ylim=(0, None))
     axes.set_xlim(*(1.05 * np.array([-1, 1]) * max(map(abs, response.along_x.angles_deg))))
     axes.legend(frameon=False)
-    mark = " (SIMULATED)" if response.simulated else ""
-    axes.set_title(f"Angular response of the sensor, {response.bench}{mark}", fontsize=10)
+    axes.set_title(f"Angular response of the sensor, {response.bench}", fontsize=10)
+    return figure
+
+
+def surface_figure(surface: DiffuserSurface) -> Figure:
+    """Draw a diffuser's height, a cut, and histograms of slope and deflection (Kuo 2020, Fig. A.1)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), height_ratios=(1.6, 1))
+    height, width = (n * surface.pitch_um for n in surface.height_um.shape)
+    axes = figure.add_subplot(grid[0, 0])
+    shown = axes.imshow(surface.height_um, extent=(0, width, height, 0), cmap="viridis")
+    axes.axhline(height / 2, color="white", ls="--", lw=0.8)
+    axes.set(xlabel="um", ylabel="um", title="height above the best plane, um")
+    figure.colorbar(shown, ax=axes)
+    axes = figure.add_subplot(grid[1, 0])
+    row = surface.height_um[surface.height_um.shape[0] // 2]
+    axes.plot((np.arange(len(row)) + 0.5) * surface.pitch_um, row, color=_COLOURS[0])
+    axes.set(xlabel="um", ylabel="height, um", title="along the dashed line")
+    figures = surface.figures
+    for place, values, colour, title in (
+        (
+            grid[0, 1],
+            surface.slope_deg,
+            _COLOURS[0],
+            f"slope: mean {figures['slope_mean_deg']:.2f}",
+        ),
+        (
+            grid[1, 1],
+            surface.deflection_deg,
+            _COLOURS[1],
+            f"deflection: half width {figures['deflection_hwhm_deg']:.2f}, largest "
+            f"{figures['deflection_largest_deg']:.2f}",
+        ),
+    ):
+        axes = figure.add_subplot(place)
+        axes.hist(values.ravel(), bins=80, color=colour, density=True)
+        axes.set(xlabel="degrees", ylabel="density", title=title)
+    figure.suptitle(f"Diffuser by differential phase contrast, {surface.bench}", fontsize=10)
     return figure

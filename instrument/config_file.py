@@ -44,6 +44,11 @@ def display_text() -> str:
     return resources.files("instrument").joinpath("display_bench.toml").read_text("utf-8")
 
 
+def led_microscope_text() -> str:
+    """Return the configuration of a simulated LED array microscope."""
+    return resources.files("instrument").joinpath("led_microscope_bench.toml").read_text("utf-8")
+
+
 def load_config(path: Path | str | None = None) -> BenchConfig:
     """Read and check a bench configuration without touching any device.
 

@@ -9,8 +9,8 @@ import typer
 
 from instrument.atomic import write_text
 from instrument.cli.app import command_app, examples
-from instrument.config_file import DEFAULT_NAME, default_text, display_text
-from instrument.errors import FileError
+from instrument.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
+from instrument.errors import BenchError, FileError
 
 app = command_app()
 
@@ -21,19 +21,29 @@ app = command_app()
         "diffuserbench new benches/microscope.toml",
         "diffuserbench new --force          overwrite an existing bench.toml",
         "diffuserbench new display.toml --display",
+        "diffuserbench new microscope.toml --led-microscope",
     )
 )
 def new(
     file: Annotated[Path, typer.Argument(help="The file to write.")] = Path(DEFAULT_NAME),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
+    led_microscope: Annotated[
+        bool, typer.Option("--led-microscope", help="An LED array microscope instead, for calibrate dpc.")
+    ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
     if file.exists() and not force:
         raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
-    write_text(file, display_text() if display else default_text())
-    what = "holographic display" if display else "bench, with every key explained"
+    if display and led_microscope:
+        raise BenchError("Give --display or --led-microscope, not both.")
+    text, what = default_text(), "bench, with every key explained"
+    if display:
+        text, what = display_text(), "holographic display"
+    if led_microscope:
+        text, what = led_microscope_text(), "LED array microscope"
+    write_text(file, text)
     typer.echo(f"Wrote {file}: a SIMULATED {what}.")
     typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")

@@ -56,7 +56,7 @@ def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: P
         zero = np.zeros_like(tangents)
         truth = world.fall_off(zero, tangents) if axis else world.fall_off(tangents, zero)
         assert np.abs(np.array(curve.response) - truth).max() < 0.02
-        assert curve.cut_off_deg == pytest.approx(6 * np.sqrt(2 * np.log(5)), abs=0.2)
+        assert curve.cut_off_deg == pytest.approx(6 * np.sqrt(2 * np.log(5)), abs=0.1)
         assert min(curve.seen) < 0.5  # the sensor's edge cut patterns, and it made no difference
     loaded = load_response(file)
     assert loaded == response
@@ -88,8 +88,8 @@ def test_curves_between_the_axes_follow_a_gaussian_of_two_widths() -> None:
 
 def test_a_cut_off_that_was_not_reached_is_none() -> None:
     curve = Curve((-10.0, -5.0, 0.0, 5.0, 10.0), (0.1, 0.5, 1.0, 0.6, 0.4), (1.0,) * 5)
-    assert curve.cut_offs_deg() == (pytest.approx(8.75), None)
-    assert curve.cut_off_deg == pytest.approx(8.75)
+    assert curve.cut_offs_deg() == (pytest.approx(np.sqrt(25 + 75 * np.log(2.5) / np.log(5))), None)
+    assert curve.cut_off_deg == curve.cut_offs_deg()[0]
 
 
 def test_a_file_that_is_no_response_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,144 @@
+"""A diffuser's surface by differential phase contrast, against the surface that the light really passed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from calibration_routines.dpc import DpcSetup, dpc_optics, measure_diffuser
+from drivers.simulated.led_microscope import LedMicroscopeWorld
+from instrument.bench import Bench, open_bench
+from instrument.cli import main
+from instrument.config_file import led_microscope_text, parse_config
+from instrument.errors import BenchError
+from recon.dpc import SIDES, DpcOptics, deflections_deg, level, phase_from_halves, slopes_deg, transfer
+from recon.errors import InputError
+from recon.optics.led_microscope import led_image
+
+SETUP = DpcSetup(objective_na=0.1, magnification=4.0)
+SMALL = led_microscope_text().replace("pixels = 384", "pixels = 160")
+
+
+def small_bench(text: str = SMALL) -> Bench:
+    return open_bench(parse_config(text, None))
+
+
+def test_height_and_slopes_are_the_diffusers(tmp_path: Path) -> None:
+    with small_bench() as bench:
+        surface, file = measure_diffuser(bench, SETUP, tmp_path)
+        world = bench.shared["simulated_led_microscope"]
+        assert isinstance(world, LedMicroscopeWorld)
+        assert bench.led_array is not None
+        assert bench.led_array.pattern.is_dark
+    truth = level(world.true_height_um())
+    assert truth.std() > 0.3  # several radians: far from a weak phase
+    error = surface.height_um - truth
+    assert error.std() < 0.1 * truth.std()
+    true_slope = slopes_deg(truth.astype(np.float32), surface.pitch_um)
+    assert surface.figures["slope_mean_deg"] == pytest.approx(true_slope.mean(), rel=0.03)
+    assert surface.figures["deflection_largest_deg"] == pytest.approx(
+        np.quantile(deflections_deg(true_slope, 1.58), 0.999), rel=0.1
+    )
+    kept = json.loads(file.read_text())
+    assert kept["simulated"] is True
+    assert np.array_equal(np.load(file.with_name(kept["height_file"])), surface.height_um)
+
+
+def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float64]:
+    rng = np.random.default_rng(4)
+    ky, kx = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])
+    noise = np.fft.fft2(rng.normal(size=shape)) * np.exp(-0.5 * (np.hypot(ky, kx) / 0.03) ** 2)
+    phase = np.fft.ifft2(noise).real
+    return np.asarray(phase * amplitude / phase.std())
+
+
+def halves_of(phase: npt.NDArray[np.float64], optics: DpcOptics) -> dict[str, npt.NDArray[np.float32]]:
+    axis = np.arange(-14.5, 15) * 0.009
+    x, y = (side.ravel() for side in np.meshgrid(axis, axis))
+    lit = np.hypot(x, y) <= optics.illumination_na
+    chosen = {"left": x < 0, "right": x > 0, "bottom": y < 0, "top": y > 0}
+    return {
+        side: led_image(
+            phase,
+            optics.pitch_um,
+            np.stack([x, y], axis=1)[lit & chosen[side]],
+            np.ones(int((lit & chosen[side]).sum())),
+            wavelength_nm=optics.wavelength_nm,
+            na=optics.objective_na,
+        )
+        for side in SIDES
+    }
+
+
+OPTICS = DpcOptics(1.6, 515.0, 0.1, 0.13)
+
+
+def test_a_weak_phase_comes_back() -> None:
+    truth = weak_phase((96, 128), 0.05)
+    found = phase_from_halves(halves_of(truth, OPTICS), OPTICS)
+    inside = (slice(16, -16), slice(16, -16))  # this sample is periodic, the method assumes a mirror
+    error = level(found[inside]) - level(truth[inside])
+    assert error.std() < 0.12 * level(truth[inside]).std()
+
+
+def test_half_circles_that_just_fill_the_pupil_lose_slope() -> None:
+    """Why the array is lit beyond the objective's aperture (docs/decisions/0016-dpc.md)."""
+    truth = weak_phase((96, 128), 5.0)
+    inside = (slice(16, -16), slice(16, -16))
+    slopes = []
+    for rim in (0.1, 0.13):
+        optics = DpcOptics(1.6, 515.0, 0.1, rim)
+        slopes.append(slopes_deg(phase_from_halves(halves_of(truth, optics), optics)[inside], 1.6).mean())
+    true = slopes_deg(truth[inside].astype(np.float32), 1.6).mean()
+    assert slopes[1] == pytest.approx(true, rel=0.1)
+    assert slopes[0] < 0.85 * true
+
+
+def test_the_transfer_function_is_odd_along_its_axis_and_straight_for_slow_phases() -> None:
+    H = transfer((64, 256), DpcOptics(1.0, 515.0, 0.1, 0.13), axis=1)
+    assert np.abs(H.real).max() == 0
+    assert H.imag[0, 1] == pytest.approx(-H.imag[0, -1])
+    q = np.fft.fftfreq(256, 1.0)
+    radius = 0.1 / 0.515
+    assert H.imag[0, 1] == pytest.approx(4 * q[1] / (np.pi * radius), rel=0.02)
+    assert H.imag[0, 2] / H.imag[0, 1] == pytest.approx(2, rel=0.02)
+    assert np.abs(H[3:6, 0]).max() < 1e-12
+    assert np.abs(H.imag[0, q > 2.05 * radius]).max() < 1e-12
+
+
+def test_what_cannot_give_a_phase_is_refused() -> None:
+    ones = dict.fromkeys(SIDES, np.ones((8, 8)))
+    with pytest.raises(InputError, match="'top' is missing"):
+        phase_from_halves({side: ones[side] for side in SIDES if side != "top"}, OPTICS)
+    with pytest.raises(InputError, match="one shape"):
+        phase_from_halves(ones | {"left": np.ones((8, 9))}, OPTICS)
+    with pytest.raises(InputError, match="no light"):
+        phase_from_halves(dict.fromkeys(SIDES, np.zeros((8, 8))), OPTICS)
+    with pytest.raises(InputError, match="do not fill"):
+        DpcOptics(1.6, 515.0, 0.1, 0.08)
+    with pytest.raises(BenchError, match="red, green or blue"):
+        DpcSetup(0.1, 4.0, band="white")
+
+
+def test_an_array_too_small_for_the_objective_is_refused() -> None:
+    with small_bench() as bench, pytest.raises(BenchError, match="a tenth beyond"):
+        dpc_optics(bench, DpcSetup(0.4, 4.0))
+
+
+def test_the_command_says_what_it_does_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("m.toml").write_text(SMALL.replace("pixels = 160", "pixels = 64"))
+    command = ["calibrate", "dpc", "--bench", "m.toml", "--na", "0.1", "--magnification", "4"]
+    assert main([*command, "--dry-run"]) == 0
+    assert not Path("runs").exists()
+    assert main([*command, "--average", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "deflection half width" in out
+    assert len(list(tmp_path.glob("runs/*/dpc.png"))) == 1
+    assert main(["calibrate", "dpc", "--bench", "m.toml", "--na", "1.4", "--magnification", "4"]) == 2
