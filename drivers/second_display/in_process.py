@@ -94,17 +94,18 @@ class WindowHere:
         self._there(lambda: self._screen.show(data))
 
     def close(self) -> None:
-        """Uncover the output. Closing twice does nothing."""
+        """Uncover the output; a GUI thread that is busy does so later. Closing twice does nothing."""
         if QGuiApplication.instance() is not None:  # else the windows went with the program
-            self._there(self._screen.close)
+            self._there(self._screen.close, gives_up=False)
 
-    def _there(self, call: Callable[[], _T]) -> _T:
+    def _there(self, call: Callable[[], _T], *, gives_up: bool = True) -> _T:
         if QThread.currentThread() is self._thread:
             return call()
         errand = _Errand(call)
         self._messenger.sent.emit(errand)
         if not errand.done.wait(_ANSWER_S):
-            errand.give_up()
+            if gives_up:
+                errand.give_up()
             if not errand.done.is_set():
                 raise DeviceTimeoutError(
                     self._device,

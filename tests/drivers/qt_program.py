@@ -177,6 +177,26 @@ def blocked() -> dict[str, object]:
     return {"said": said, "old": old}
 
 
+def closed_while_blocked() -> dict[str, object]:
+    """The SLM is closed while the GUI thread computes: its window goes as soon as that thread has time."""
+    from drivers.second_display import in_process
+
+    in_process._ANSWER_S = 0.2
+    release = threading.Event()
+    slm = SecondDisplaySlm(OPTIONS)
+    slm.open()
+    QTimer.singleShot(0, QCoreApplication.instance(), lambda: release.wait(20))
+    try:
+        slm.close()
+        said = ""
+    except DeviceError as error:
+        said = str(error)
+    release.set()
+    in_process._ANSWER_S = 10.0
+    left = on_gui(lambda: sum(window.isVisible() for window in QGuiApplication.topLevelWindows()))
+    return {"said": said, "left": left}
+
+
 def main() -> int:
     app = QGuiApplication(sys.argv[:1])
     app.setQuitOnLastWindowClosed(False)

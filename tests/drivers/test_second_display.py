@@ -359,7 +359,8 @@ def in_qt_program(*tests: str, **environment: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What a Qt program found; one for all tests, for the sake of time."""
-    tests = ("exact", "clicks_and_keys", "drawn_wrongly", "from_the_gui_thread", "unplugged", "blocked")
+    tests = ("exact", "clicks_and_keys", "drawn_wrongly", "from_the_gui_thread", "unplugged")
+    tests += ("blocked", "closed_while_blocked")
     return in_qt_program(*tests, QT_QPA_PLATFORM=screens(tmp_path_factory.mktemp("qt")))
 
 
@@ -405,3 +406,9 @@ def test_a_blocked_gui_thread_is_an_error_and_draws_nothing_later(program: dict[
     found = program["blocked"]
     assert "GUI thread did not draw within 0.2 s" in found["said"]
     assert found["old"]
+
+
+def test_closing_while_the_gui_thread_is_blocked_leaves_no_window(program: dict[str, Any]) -> None:
+    found = program["closed_while_blocked"]
+    assert "GUI thread did not draw within 0.2 s" in found["said"]
+    assert found["left"] == 0
