@@ -135,7 +135,7 @@ class Dlpc900Slm(Slm):
                 self._check_hardware(self._board)
                 self._link.write(Command.START_STOP, bytes([commands.STOP]))
                 self._link.write(Command.DISPLAY_MODE, bytes([commands.PATTERN_ON_THE_FLY]))
-                self._check_mode()
+                self._wait_for_mode()
                 self._show(np.zeros(self._board.shape, np.uint8))
             except BaseException:
                 self._link.close()
@@ -179,14 +179,20 @@ class Dlpc900Slm(Slm):
                 "Switch it off and on again.",
             )
 
-    def _check_mode(self) -> None:
-        mode = self._link.read(Command.DISPLAY_MODE, 1)[0] & 0x03
-        if mode != commands.PATTERN_ON_THE_FLY:
-            raise DeviceError(
-                self.name,
-                f"stayed in {commands.MODES[mode]} mode instead of pattern on the fly.",
-                "Switch it off and on again.",
-            )
+    def _wait_for_mode(self) -> None:
+        """Wait until the controller says that it changed its mode (section 2.4.1)."""
+        deadline_s = time.monotonic() + _START_S
+        while (mode := self._mode()) != commands.PATTERN_ON_THE_FLY:
+            if time.monotonic() > deadline_s:
+                raise DeviceError(
+                    self.name,
+                    f"stays in {commands.MODES[mode]} mode instead of pattern on the fly.",
+                    "Switch it off and on again.",
+                )
+            time.sleep(_POLL_S)
+
+    def _mode(self) -> int:
+        return self._link.read(Command.DISPLAY_MODE, 1)[0] & 0x03
 
     # Identity and settings -------------------------------------------------------------------------
     @property
@@ -207,12 +213,11 @@ class Dlpc900Slm(Slm):
     def settings(self) -> Mapping[str, Setting]:
         """Read mode and status from the controller, with the configured times."""
         self._require()
-        mode = self._link.read(Command.DISPLAY_MODE, 1)[0] & 0x03
         return {
             "shape": self.shape,
             "pixel_pitch_um": self.pixel_pitch_um,
             "settle_ms": self.settle_ms,
-            "mode": commands.MODES[mode],
+            "mode": commands.MODES[self._mode()],
             "status": commands.main_status_words(self._link.read(Command.MAIN_STATUS, 1)[0]),
             "bit_depth": self.options.bit_depth,
             "exposure_us": self.options.exposure_us,

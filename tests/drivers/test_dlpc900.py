@@ -310,6 +310,17 @@ def test_a_sequence_that_does_not_start_is_an_error(
             device.blank()
 
 
+def test_a_controller_that_stays_in_its_mode_is_an_error(
+    board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.dlpc900.slm._START_S", 0.1)
+    board.faults.stays_in_mode = True
+    device = slm()
+    with pytest.raises(DeviceError, match="stays in pre-stored pattern mode"):
+        device.open()
+    assert not device.is_open
+
+
 def test_silence_is_an_error_and_later_commands_get_their_own_replies(board: Dlpc900Emulator) -> None:
     with slm() as device:
         board.faults.silent = True

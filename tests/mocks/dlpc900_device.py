@@ -103,6 +103,7 @@ class Faults:
     refuse: dict[int, int] = field(default_factory=dict)
     """Error code by command."""
     never_starts: bool = False
+    stays_in_mode: bool = False
     hardware_status: int | None = None
     unplugged: bool = False
 
@@ -121,7 +122,7 @@ class Dlpc900Emulator:
     def power_cycle(self) -> None:
         self.mode = 1
         self.running = False
-        self._polls = 0
+        self._polls = self._changing = 0
         self._error = 0
         self._partial = b""
         self._wanted = 0
@@ -200,6 +201,9 @@ class Dlpc900Emulator:
             started = self.running and self._polls > 2 and not self.faults.never_starts
             return bytes([0x02 if started else 0])
         if command == 0x1A1B:
+            if self._changing > 0 or self.faults.stays_in_mode:
+                self._changing -= 1
+                return bytes([1])
             return bytes([self.mode])
         if command == 0x1A31:
             return self._lut
@@ -225,6 +229,7 @@ class Dlpc900Emulator:
         if self.running:
             raise Refusal(5)
         self.mode = data[0] & 0x03
+        self._changing = 3  # it takes a while
 
     def _start_stop(self, data: bytes) -> None:
         if data[0] == 2:
