@@ -31,6 +31,7 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
+from recon.noise import NoiseModel
 from recon.refocus import at_depth
 from recon.types import Calibration
 
@@ -66,6 +67,13 @@ class Job:
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     simulated: bool = False
+
+    def binned_noise(self, noise: NoiseModel | float | None) -> NoiseModel | float | None:
+        """Return what is left of a single pixel's noise after the averaging that made the measurement."""
+        factor = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
+        if isinstance(noise, NoiseModel):
+            return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
+        return None if noise is None else noise / factor
 
 
 def job_from_files(

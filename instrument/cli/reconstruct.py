@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.noise_option import parse_noise
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.erasures import Choice
 from instrument.errors import BenchError
@@ -23,6 +24,7 @@ from instrument.reconstruction_job import (
     job_from_files,
     refocused,
 )
+from recon import NoiseModel
 from recon import reconstruct as solve
 from recon.result import Reconstruction
 from recon.solvers.stopping import IterationRecord, StopReason
@@ -147,6 +149,34 @@ def reconstruct(
             help="Pixels to leave out: saturated ones, a mask's zeros, or a random share.",
         ),
     ] = "saturated",
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            "--noise",
+            metavar="COUNTS|READ,GAIN",
+            help="Camera noise: one deviation, or read noise in counts and counts per electron. "
+            "Default: estimated.",
+            show_default=False,
+        ),
+    ] = None,
+    scratch: Annotated[
+        Path | None,
+        typer.Option(
+            "--scratch",
+            metavar="FOLDER",
+            help="Of a volume: where to keep what does not fit into memory, on a fast disk.",
+            show_default=False,
+        ),
+    ] = None,
+    memory_gib: Annotated[
+        float | None,
+        typer.Option(
+            "--memory",
+            metavar="GIB",
+            help="Of a volume: memory that may be taken. Default: what is free.",
+            show_default=False,
+        ),
+    ] = None,
     method: Annotated[
         Method,
         typer.Option(
@@ -255,6 +285,9 @@ def reconstruct(
             crop=None if crop is None else Crop.parse(crop),
             binning=_binning(binning),
             erasures=_erasures(erasures),
+            noise=parse_noise(noise),
+            scratch=scratch,
+            memory_gib=memory_gib,
             tau=tau,
             iterations=iterations,
             time_s=time_s,
@@ -262,8 +295,14 @@ def reconstruct(
             force=force,
         )
         return
-    if not background:
-        raise BenchError("--no-background is for volumes: give --volume, or leave it out.")
+    for_volumes = {
+        "--no-background": not background,
+        "--scratch": scratch is not None,
+        "--memory": memory_gib is not None,
+    }
+    for option, is_given in for_volumes.items():
+        if is_given:
+            raise BenchError(f"{option} is for volumes: give --volume, or leave it out.")
     chosen_model = next((m for m in MODELS if m == model), None)
     if chosen_model is None:
         raise BenchError(f"--model {model!r} is not known; choose one of {', '.join(MODELS)}.")
@@ -289,7 +328,9 @@ def reconstruct(
             typer.echo("SIMULATED   PSF or image come from the simulated bench")
         for warning in job.warnings:
             typer.echo(f"Warning: {warning}", err=True)
-        result = _solve(job, chosen_model, method, prior, tau, iterations, time_s, tolerance, z_mm)
+        result = _solve(
+            job, chosen_model, method, prior, parse_noise(noise), tau, iterations, time_s, tolerance, z_mm
+        )
         _tell(result)
         _write(outputs, result, job, int(rotate))
     if result.stop_reason is StopReason.CANCELLED:
@@ -365,6 +406,7 @@ def _solve(
     model: ModelName,
     method: Method,
     prior: PriorName | None,
+    noise: NoiseModel | float | None,
     tau: float | None,
     iterations: int | None,
     time_s: float | None,
@@ -394,6 +436,7 @@ def _solve(
             model=model,
             method=method.value,
             prior=chosen.value,
+            noise=job.binned_noise(noise),
             tau=tau,
             iterations=limit,
             time_s=time_s,

@@ -15,6 +15,7 @@ from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_job import DarkChoice
 from instrument.volume_file import write_volume
 from instrument.volume_job import volume_job
+from recon.noise import NoiseModel
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.volume.channel import PRIORS
 from recon.volume.model import MODELS
@@ -35,6 +36,9 @@ def reconstruct_to_volume(
     crop: Crop | None,
     binning: int | None,
     erasures: Choice,
+    noise: NoiseModel | float | None,
+    scratch: Path | None,
+    memory_gib: float | None,
     tau: float | None,
     iterations: int | None,
     time_s: float | None,
@@ -71,6 +75,9 @@ def reconstruct_to_volume(
                 model=chosen_model,
                 estimate_background=background,
                 erasures=None if job.valid is None else ~job.valid,
+                noise=job.binned_noise(noise),
+                scratch=scratch,
+                memory_gib=memory_gib,
                 iterations=limit,
                 time_s=time_s,
                 tolerance=1e-3 if tolerance is None else tolerance,

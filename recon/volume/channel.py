@@ -124,7 +124,7 @@ class ChannelProblem:
             kind, camera.domain_shape, psfs.size, len(psfs) * height * width, available=self._limit
         )
         if not self.plan.fits:
-            self._storage = memory.Storage(memory.scratch_for(self.plan, scratch))
+            self._storage = memory.Storage(memory.scratch_for(self.plan, scratch), self.plan.room)
         return camera
 
     def _varying(self, fields: list[FieldOfPsfs], model: ModelName) -> SpatiallyVarying:
@@ -143,6 +143,17 @@ class ChannelProblem:
         if not self.plan.fits:
             raise InputError(f"The {model} model needs {self.plan}. Bin the images or take fewer depths.")
         return camera
+
+    def memory_used(self) -> str:
+        """Say what was planned, and what had to go to disk."""
+        on_disk = self._storage.on_disk
+        if not on_disk:
+            return str(self.plan)
+        share = on_disk / max(self.plan.state, 1)
+        return (
+            f"{self.plan}; {on_disk / memory.GIB:.2f} GiB of the state in files, of which an iteration reads "
+            f"and writes about {share * self.plan.traffic / memory.GIB:.2f} GiB"
+        )
 
     def close(self) -> None:
         """Remove what the solver kept on disk."""

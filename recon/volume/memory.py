@@ -32,6 +32,8 @@ class MemoryPlan:
     ----------
     state : int
         The solver's volumes: what may go to disk.
+    traffic : int
+        How much of the state an iteration reads and writes: the price of having it on disk.
     work : int
         Planes, PSFs and the result: what must be in memory.
     available : int
@@ -41,6 +43,12 @@ class MemoryPlan:
     state: int
     work: int
     available: int
+    traffic: int = 0
+
+    @property
+    def room(self) -> int:
+        """What is left for the state in memory."""
+        return max(int((1 - KEPT_FREE) * self.available) - self.work, 0)
 
     @property
     def total(self) -> int:
@@ -90,7 +98,10 @@ def plan(
     volumes = 2 * spectrum + 4 * real if kind == "tv" else spectrum + real
     plane = height * (width // 2 + 1) * 2 * itemsize
     work = (psf_values + result_values) * itemsize + plane * (GROUPS + 6 * get_threads() + 8)
-    return MemoryPlan(volumes, work, available_bytes() if available is None else available)
+    # TV: the spectra X (twice read and written) and g (twice read), four states read and written. l1: z read
+    # and written, the transfer functions read.
+    traffic = 6 * spectrum + 8 * real if kind == "tv" else spectrum + 2 * real
+    return MemoryPlan(volumes, work, available_bytes() if available is None else available, traffic)
 
 
 def available_bytes() -> int:
@@ -111,13 +122,20 @@ def available_bytes() -> int:
 class Storage:
     """Where a solver's volumes live: in memory, or as files in a scratch folder that the system pages.
 
+    Solvers pass over their volumes plane by plane, so that files are read and written in runs of whole depth
+    planes, and at any time only the planes in work need memory.
+
     Parameters
     ----------
     scratch : path, optional
         Folder for the files (a fast disk); :meth:`close` removes them. Default: memory.
+    room : int
+        Bytes that may lie in memory all the same: the first volumes that fit.
     """
 
-    def __init__(self, scratch: Path | str | None = None) -> None:
+    def __init__(self, scratch: Path | str | None = None, room: int = 0) -> None:
+        self._room = room
+        self.on_disk = 0
         self._folder: Path | None = None
         if scratch is not None:
             self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
@@ -137,9 +155,10 @@ class Storage:
         InputError
             When the scratch folder's disk has no room for it.
         """
-        if self._folder is None:
-            return np.zeros(shape, dtype)
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if self._folder is None or size <= self._room:
+            self._room -= size
+            return np.zeros(shape, dtype)
         free = shutil.disk_usage(self._folder).free
         if size > free:
             raise InputError(
@@ -147,6 +166,7 @@ class Storage:
                 f"{size / GIB:.2f} GiB more are needed. Name a folder on another disk."
             )
         self._count += 1
+        self.on_disk += size
         path = self._folder / f"{self._count}.dat"
         array = np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
         if hasattr(
@@ -170,6 +190,23 @@ def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
     if scratch is None:
         raise InputError(
             f"This volume needs {plan}. Bin the images, take fewer depths, use the l1 prior (two volumes "
-            "instead of six), or name a scratch folder on a fast disk for the solver's state."
+            "instead of six), or name a scratch folder (--scratch) on a fast disk for the solver's state; "
+            f"an iteration then reads and writes {plan.traffic / GIB:.2f} GiB there at most."
         )
+    if lies_in_memory(Path(scratch)):
+        raise InputError(f"The scratch folder {scratch} lies in memory itself (tmpfs). Name one on a disk.")
     return scratch
+
+
+def lies_in_memory(folder: Path) -> bool:
+    """Tell whether a folder's file system is kept in memory."""
+    mounts = Path("/proc/mounts")
+    if not mounts.exists():
+        return False
+    place = folder.resolve()
+    found = ("", "")
+    for line in mounts.read_text().splitlines():
+        _, mount, kind, *_ = line.split()
+        if place.is_relative_to(mount) and len(mount) >= len(found[0]):
+            found = (mount, kind)
+    return found[1] in ("tmpfs", "ramfs")

@@ -143,6 +143,7 @@ def reconstruct_volume(
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
         empty.append(solver.empty if isinstance(solver, DouglasRachford) else EmptyPlanes())
+        planned = run.memory_used()
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
@@ -160,7 +161,7 @@ def reconstruct_volume(
         seconds=sum(o.seconds for o in outcomes),
         empty_planes=tuple(empty),
         warnings=(*scaled.warnings, *_uncertified(empty)),
-        provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": str(run.plan)},
+        provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": planned},
     )
 
 

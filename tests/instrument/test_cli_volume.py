@@ -84,6 +84,10 @@ def test_voxel_sizes_of_a_calibration_reach_the_file(files, tmp_path, run):
         (["--model", "local"], "several places of the field"),
         (["--prior", "tv-haar"], "not for volumes"),
         (["--z-mm", "3"], "do not apply"),
+        (["--noise", "loud"], "--noise 'loud' is not understood"),
+        (["--noise", "1,2,3"], "read noise in counts"),
+        (["--noise=-1"], "standard deviation in counts"),
+        (["--memory", "0.00001"], "Bin the images or take fewer depths"),
     ],
 )
 def test_refuses_in_words(files, arguments, words, run):
@@ -106,6 +110,53 @@ def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     assert code == 2
     assert "is for volumes" in output
     assert not out.exists()
+
+
+def test_noise_is_passed_on_and_reduced_by_binning(files, run):
+    folder, image, out = files
+    common = ("--volume", folder, "--image", image, "--out", out, "-n", "1", "--force")
+    assert run(*common, "--noise", "8")[0] == 0
+    assert json.loads(out.with_suffix(".json").read_text())["provenance"]["noise_deviation"] == [8.0]
+    assert run(*common, "--noise", "8", "--bin", "2")[0] == 0
+    assert json.loads(out.with_suffix(".json").read_text())["provenance"]["noise_deviation"] == [4.0]
+
+
+@pytest.mark.parametrize("option", [("--scratch", "."), ("--memory", "4")])
+def test_memory_is_a_matter_of_volumes(files, run, option):
+    folder, image, out = files
+    code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, *option)
+    assert code == 2
+    assert f"{option[0]} is for volumes" in output
+
+
+def test_a_picture_with_the_local_model(tmp_path, run):
+    """From a calibration over the field to a picture; the response falls off towards the edge (Eq. 5.1)."""
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE // 2
+
+    def seen(row, column):
+        response = np.exp(-((y + row) ** 2 + (x + column) ** 2) / (2 * 14.0**2))
+        return np.roll(psf(1), (row, column), (0, 1)) * response
+
+    z_um, pitch_um, distance_mm = 10_000.0, 10.0, 5.0
+    scale = -pitch_um * z_um / (1000 * distance_mm)
+    places = [(r, c) for r in (-6, 0, 6) for c in (-6, 0, 6)]
+    psfs = np.stack([seen(r, c)[None] for r, c in places]).astype(np.float32)
+    positions = np.array([(c * scale, r * scale, z_um + r / 2) for r, c in places])
+    calibration = Calibration(psfs, positions, geometry=Geometry(pitch_um, distance_mm))
+    save_calibration(calibration, tmp_path / "calibration")
+    photograph = 5 * seen(4, -3) + np.random.default_rng(1).normal(OFFSET, 2, (SIZE, SIZE))
+    image, out = tmp_path / "image.tif", tmp_path / "picture.tif"
+    tifffile.imwrite(image, photograph.astype(np.uint16))
+    common = ("--calibration", tmp_path / "calibration", "--image", image, "--dark", OFFSET, "--prior", "l1")
+    code, output = run(*common, "--model", "local", "--noise", 2, "--out", out)
+    assert code == 0, output
+    assert "Model local: as asked" in output
+    picture = tifffile.imread(out)
+    assert picture.shape == (SIZE, SIZE)
+    assert np.unravel_index(picture.argmax(), picture.shape) == (SIZE // 2 + 4, SIZE // 2 - 3)
+    record = json.loads(out.with_suffix(".json").read_text())
+    assert record["provenance"]["model"] == "local"
+    assert record["provenance"]["noise_deviation"] == [2.0]
 
 
 def test_simulated_volumes_are_called_so(files, run, tmp_path):

@@ -1,12 +1,14 @@
 """The solver of the local and low-rank models against FISTA, on small problems."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from recon import fft, threads
 from recon.operators import BackgroundRemoval, Convolution3D, Erasures, FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
-from recon.solvers import Fista, StoppingRules
+from recon.solvers import Fista, StoppingRules, StopReason
 from recon.volume.operator_admm import OperatorAdmm
 
 POINTS = np.array([(y, x) for y in (-6, 0, 6) for x in (-6, 0, 6)], float)
@@ -82,6 +84,38 @@ def test_reaches_the_minimiser_that_fista_reaches(kind, harder):
     assert value(outcome.solution) == pytest.approx(value(best), rel=1e-4 if kind == "l1" else 6e-4)
     residual = float(np.linalg.norm(operator.forward(outcome.solution) - reduced))
     assert outcome.history[-1].data_residual == pytest.approx(residual, rel=1e-3)
+
+
+def solver(data=None, **options):
+    camera, central, clean = problem()
+    return OperatorAdmm(
+        camera, central, clean if data is None else data, 0.5, axis_weights=(0.5, 1.0, 1.0), **options
+    )
+
+
+def test_goes_on_from_a_checkpoint():
+    whole, first, second = solver(), solver(), solver()
+    whole.run(StoppingRules(iterations=12, tolerance=0))
+    first.run(StoppingRules(iterations=5, tolerance=0))
+    second.restore(first.checkpoint())
+    while second.iteration < 12:
+        second.step()
+        second.iteration += 1
+    np.testing.assert_array_equal(second.solution, whole.solution)
+
+
+def test_stops_on_nan_and_on_request():
+    _, _, data = problem()
+    bad = data.copy()
+    bad[0, 3, 3] = np.nan
+    lost = solver(bad).run(StoppingRules(iterations=20))
+    assert lost.stop_reason is StopReason.NOT_FINITE
+    assert len(lost.history) <= 2
+    assert not lost.solution.any()
+    cancel = threading.Event()
+    stopped = solver().run(cancel=cancel, callback=lambda *_: cancel.set())
+    assert stopped.stop_reason is StopReason.CANCELLED
+    assert len(stopped.history) == 1
 
 
 def test_needs_a_tenth_of_the_iterations_of_fista():

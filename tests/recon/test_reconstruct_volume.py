@@ -1,6 +1,7 @@
 """Whole reconstructions of volumes, from measurements not made with the reconstruction's model."""
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -147,7 +148,8 @@ def test_warm_start_callback_and_cancel():
     assert np.linalg.norm(warm.volume - cold.volume) < 0.3 * np.linalg.norm(cold.volume)
 
 
-def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path):
+def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "lies_in_memory", lambda folder: False)
     plan = memory.plan("tv", (1, DEPTHS, 80, 80), calibration().psfs.size, DEPTHS * SIZE**2)
     half = (plan.work + plan.state / 2) / (1 - memory.KEPT_FREE) / memory.GIB
     with pytest.raises(InputError, match="name a scratch folder"):
@@ -158,6 +160,39 @@ def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path):
     same = reconstruct_volume(measurement(), calibration(), iterations=5)
     np.testing.assert_array_equal(result.volume, same.volume)
     assert not list(tmp_path.iterdir()), "scratch files are removed"
+    assert "GiB of the state in files" in result.provenance["memory"]
+    assert "in files" not in same.provenance["memory"]
+    monkeypatch.setattr(memory, "lies_in_memory", lambda folder: True)
+    with pytest.raises(InputError, match="lies in memory itself"):
+        reconstruct_volume(measurement(), calibration(), memory_gib=half, scratch=tmp_path)
+
+
+@pytest.mark.parametrize("prior", ["l1", "tv"])
+def test_only_what_does_not_fit_goes_to_disk(tmp_path, monkeypatch, prior):
+    monkeypatch.setattr(memory, "lies_in_memory", lambda folder: False)
+    stores = []
+    storage = memory.Storage
+
+    def noted(*args):
+        stores.append(storage(*args))
+        return stores[-1]
+
+    monkeypatch.setattr(memory, "Storage", noted)
+    kind = "tv" if prior == "tv" else "l1"
+    plan = memory.plan(kind, (1, DEPTHS, 80, 80), calibration().psfs.size, DEPTHS * SIZE**2)
+    limit = (plan.work + 0.6 * plan.state) / (1 - memory.KEPT_FREE) / memory.GIB
+    result = reconstruct_volume(
+        measurement(), calibration(), prior=prior, iterations=5, memory_gib=limit, scratch=tmp_path
+    )
+    assert 0.3 * plan.state < stores[-1].on_disk < 0.8 * plan.state
+    same = reconstruct_volume(measurement(), calibration(), prior=prior, iterations=5)
+    np.testing.assert_array_equal(result.volume, same.volume)
+
+
+def test_a_folder_in_memory_is_known_by_its_mount():
+    assert not memory.lies_in_memory(Path("/proc"))
+    if Path("/dev/shm").exists():
+        assert memory.lies_in_memory(Path("/dev/shm/no/such"))
 
 
 def test_plan_counts_the_volumes():
