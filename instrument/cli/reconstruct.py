@@ -40,6 +40,7 @@ class Method(enum.StrEnum):
 
     ADMM = "admm"
     ADMM_SENSOR = "admm-sensor"
+    ADMM_GPU = "admm-gpu"
     FISTA = "fista"
     WIENER = "wiener"
 
@@ -182,7 +183,7 @@ def reconstruct(
         typer.Option(
             "--method",
             "-m",
-            help="admm: best; admm-sensor: dense scenes on many pixels; fista: plain; wiener: one shot.",
+            help="admm: best; admm-sensor: dense scenes; admm-gpu: on a GPU; fista: plain; wiener: one shot.",
         ),
     ] = Method.ADMM,
     prior: Annotated[
