@@ -59,7 +59,7 @@ class SecondDisplaySlm(Slm):
         """Claim the output by the name that the configuration gives it."""
         assert isinstance(options, SecondDisplayOptions)
         given = options.model_dump(include={"output", "model", "serial_number", "index"}, exclude_none=True)
-        return ("display output " + ", ".join(f"{key} {value}" for key, value in given.items()),)
+        return ("display " + ", ".join(f"{key} {value}" for key, value in given.items()),)
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:

@@ -291,6 +291,13 @@ def open_files() -> int:
     return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
+def test_two_programs_do_not_share_an_output() -> None:
+    assert SecondDisplaySlm.claims(options()) == ("display output SLM-1",)
+    assert SecondDisplaySlm.claims(options(output=None, model="PLUTO", index=2)) == (
+        "display model PLUTO, index 2",
+    )
+
+
 def test_nothing_is_left_behind(slm: SecondDisplaySlm) -> None:
     process = process_of(slm)
     before = open_files()
