@@ -57,16 +57,26 @@ def _cell(position: float, k: int) -> tuple[int, float]:
 
 
 @njit(nogil=True, cache=True)
-def _between(nodes: Any, y: int, x: int, height: int, width: int) -> tuple[float, float]:
-    """Displacement at the centre of cell ``(y, x)``, bilinear between nodes that span the whole mask."""
+def _row(nodes: Any, y: int, height: int, row: Any) -> None:
+    """Interpolate the nodes, which span the whole mask, to the centres of mask row ``y``: (columns, 2)."""
     v = (y + 0.5) / height * (nodes.shape[0] - 1)
-    u = (x + 0.5) / width * (nodes.shape[1] - 1)
-    j, i = min(int(v), nodes.shape[0] - 2), min(int(u), nodes.shape[1] - 2)
-    v, u = v - j, u - i
-    a, b, c, d = (1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u
-    dy = a * nodes[j, i, 0] + b * nodes[j, i + 1, 0] + c * nodes[j + 1, i, 0] + d * nodes[j + 1, i + 1, 0]
-    dx = a * nodes[j, i, 1] + b * nodes[j, i + 1, 1] + c * nodes[j + 1, i, 1] + d * nodes[j + 1, i + 1, 1]
-    return dy, dx
+    j = min(int(v), nodes.shape[0] - 2)
+    v -= j
+    for i in range(nodes.shape[1]):
+        row[i, 0] = (1 - v) * nodes[j, i, 0] + v * nodes[j + 1, i, 0]
+        row[i, 1] = (1 - v) * nodes[j, i, 1] + v * nodes[j + 1, i, 1]
+
+
+@njit(nogil=True, cache=True)
+def _place(row: Any, y: int, x: int, width: int) -> tuple[float, float]:
+    """Where cell ``(y, x)`` lies on the SLM, from :func:`_row`, mask pixels."""
+    u = (x + 0.5) / width * (row.shape[0] - 1)
+    i = min(int(u), row.shape[0] - 2)
+    u -= i
+    return (
+        y + row[i, 0] + u * (row[i + 1, 0] - row[i, 0]),
+        x + row[i, 1] + u * (row[i + 1, 1] - row[i, 1]),
+    )
 
 
 @njit(nogil=True, cache=True)
@@ -75,16 +85,20 @@ def fill_displaced(
 ) -> None:
     """As :func:`fill`, but cell ``(y, x)`` sees the SLM at ``(y + dy, x + dx)``, weighted by area."""
     height, width = mask.shape
+    row = np.empty((nodes.shape[1], 2))
     for y in range(start, stop):
+        _row(nodes, y, height, row)
         for x in range(width):
-            dy, dx = _between(nodes, y, x, height, width)
-            j, in_j = _cell(y + dy, k)
-            i, in_i = _cell(x + dx, k)
+            at_y, at_x = _place(row, y, x, width)
+            j, in_j = _cell(at_y, k)
+            i, in_i = _cell(at_x, k)
             value = field[y, x] * 0
-            for row, wy in ((j, in_j), (j + 1, 1 - in_j)):
-                for column, wx in ((i, in_i), (i + 1, 1 - in_i)):
-                    if 0 <= row < slm.shape[0] and 0 <= column < slm.shape[1]:
-                        value += slm[row, column] * (wy * wx)
+            for b in range(1 if in_j == 1 else 2):
+                wy = 1 - in_j if b else in_j
+                for a in range(1 if in_i == 1 else 2):
+                    wx = 1 - in_i if a else in_i
+                    if 0 <= j + b < slm.shape[0] and 0 <= i + a < slm.shape[1]:
+                        value += slm[j + b, i + a] * (wy * wx)
             field[y, x] = value * table[mask[y, x]] * hy[y] * hx[x]
 
 
@@ -94,16 +108,20 @@ def gather_displaced(
 ) -> None:
     """Adjoint of :func:`fill_displaced` for mask rows ``start`` to ``stop``, added to the whole ``out``."""
     height, width = mask.shape
+    row = np.empty((nodes.shape[1], 2))
     for y in range(start, stop):
+        _row(nodes, y, height, row)
         for x in range(width):
-            dy, dx = _between(nodes, y, x, height, width)
-            j, in_j = _cell(y + dy, k)
-            i, in_i = _cell(x + dx, k)
+            at_y, at_x = _place(row, y, x, width)
+            j, in_j = _cell(at_y, k)
+            i, in_i = _cell(at_x, k)
             value = field[y, x] * np.conj(table[mask[y, x]] * hy[y] * hx[x])
-            for row, wy in ((j, in_j), (j + 1, 1 - in_j)):
-                for column, wx in ((i, in_i), (i + 1, 1 - in_i)):
-                    if 0 <= row < out.shape[0] and 0 <= column < out.shape[1]:
-                        out[row, column] += value * (wy * wx)
+            for b in range(1 if in_j == 1 else 2):
+                wy = 1 - in_j if b else in_j
+                for a in range(1 if in_i == 1 else 2):
+                    wx = 1 - in_i if a else in_i
+                    if 0 <= j + b < out.shape[0] and 0 <= i + a < out.shape[1]:
+                        out[j + b, i + a] += value * (wy * wx)
 
 
 @njit(nogil=True, cache=True, fastmath=True)

@@ -108,7 +108,7 @@ class ScatteringDisplay:
         self._coarse = mask.shape
         pitch_mm = spec.mask_pitch_um * 1e-3 / n
         fy, fx = (scipy.fft.fftfreq(m, pitch_mm).astype(np.float32) for m in self._mask.shape)
-        self._f2 = (fy[:, None] ** 2 + fx[None, :] ** 2) * np.float32(np.pi * spec.wavelength_nm * 1e-6)
+        self._f2 = tuple(f**2 * np.float32(np.pi * spec.wavelength_nm * 1e-6) for f in (fy, fx))
 
     def irradiance(self, phase_rad: npt.NDArray[np.floating], pose: MaskPose) -> Image:
         """Return the light on the camera's pixels, float32 (height, width).
@@ -149,8 +149,11 @@ class ScatteringDisplay:
         if pose.z_um == 0 and not tilted:
             return field
         spectrum = scipy.fft.fft2(field, overwrite_x=True, workers=self.threads)
-        spectrum *= np.exp(np.complex64(-1j * pose.z_um * 1e-3) * self._f2)
-        slope = spectrum * (np.complex64(-1j) * self._f2) if tilted else None
+        down, across = (np.exp(np.complex64(-1j * pose.z_um * 1e-3) * f2) for f2 in self._f2)
+        slope = np.empty_like(spectrum) if tilted else None
+        _propagate(spectrum, down, across)
+        if slope is not None:
+            _slope(spectrum, slope, *self._f2)
         field = scipy.fft.ifft2(spectrum, overwrite_x=True, workers=self.threads)
         if slope is not None:
             # The tilt moves the mask by some ten micrometres at its border: first order in z is enough.
@@ -169,20 +172,17 @@ class ScatteringDisplay:
         spec, n = self.spec, self.spec.oversampling
         height, width = self._coarse
         far = scipy.fft.fft2(field, overwrite_x=True, workers=self.threads)
-        # The sampled cells' own envelope; then only the field of view is kept, twice as finely sampled.
-        ey, ex = (np.sinc(scipy.fft.fftfreq(m)).astype(np.float32) for m in far.shape)
-        far *= ey[:, None]
-        far *= ex
+        # Only the field of view is kept, twice as finely sampled, with the sampled cells' own envelope.
         rows = scipy.fft.fftfreq(height, 1 / height).astype(int)
         columns = scipy.fft.fftfreq(width, 1 / width).astype(int)
-        inside = scipy.fft.ifft2(far[np.ix_(rows, columns)], overwrite_x=True, workers=self.threads)
+        ey, ex = (np.sinc(scipy.fft.fftfreq(m)).astype(np.complex64) for m in far.shape)
+        inside = far[np.ix_(rows, columns)]
+        _propagate(inside, ey[rows], ex[columns])
+        inside = scipy.fft.ifft2(inside, overwrite_x=True, workers=self.threads)
         fine = scipy.fft.fft2(inside, (2 * height, 2 * width), workers=self.threads)
         scale = 1.0 / (n**4 * height * width)
-        intensity = np.square(fine.real) + np.square(fine.imag)
-        intensity = np.fft.fftshift(intensity)
-        sums = np.zeros((intensity.shape[0] + 1, intensity.shape[1] + 1))
-        np.cumsum(intensity, axis=0, out=sums[1:, 1:], dtype=np.float64)
-        np.cumsum(sums[1:, 1:], axis=1, out=sums[1:, 1:])
+        sums = np.zeros((fine.shape[0] + 1, fine.shape[1] + 1))
+        _add_up(fine, sums)
         sensor = np.empty(spec.sensor_shape, np.float32)
         _integrate(
             sums,
@@ -234,6 +234,36 @@ def _resample(
                     if weight > 0.0 and 0 <= column + c < slm.shape[1]:
                         total += weight * slm[row + r, column + c]
             field[i, j] = total
+
+
+@compiled
+def _propagate(spectrum: Complex, down: Complex, across: Complex) -> None:
+    """Multiply by a column times a row, in place."""
+    for i in range(spectrum.shape[0]):
+        for j in range(spectrum.shape[1]):
+            spectrum[i, j] *= down[i] * across[j]
+
+
+@compiled
+def _slope(spectrum: Complex, slope: Complex, fy2: Image, fx2: Image) -> None:
+    """Write the derivative of a spectrum with respect to distance."""
+    for i in range(spectrum.shape[0]):
+        for j in range(spectrum.shape[1]):
+            value = spectrum[i, j] * (fy2[i] + fx2[j])
+            slope[i, j] = complex(value.imag, -value.real)
+
+
+@compiled
+def _add_up(field: Complex, sums: npt.NDArray[np.float64]) -> None:
+    """Write ``sums[i, j]``: intensity above row ``i`` and left of column ``j``, the axis in the middle."""
+    height, width = field.shape
+    for i in range(height):
+        row = field[(i + height - height // 2) % height]
+        total = 0.0
+        for j in range(width):
+            value = row[(j + width - width // 2) % width]
+            total += value.real * value.real + value.imag * value.imag
+            sums[i + 1, j + 1] = sums[i, j + 1] + total
 
 
 @compiled
