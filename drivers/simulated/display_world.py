@@ -62,6 +62,9 @@ class DisplayOptions(DriverOptions):
     yaw_mrad: float = Field(-1.5, description="Tilt of the mask about y.")
     magnification: float = Field(0.001, description="Of the relay, less one.")
     relay_distortion_um: float = Field(3.0, description="Displacement of the SLM's image at its corners.")
+    relay_centre_um: tuple[float, float] = Field(
+        (0.0, 0.0), description="x, y of the relay's axis, which its distortion is centred on."
+    )
     lens_distortion: float = Field(
         0.002, ge=-0.05, le=0.05, description="Of the Fourier lens at the middle of the field's border."
     )
@@ -160,6 +163,7 @@ class DisplayWorld(Surroundings):
                 focal_mm=options.focal_mm,
                 magnification=options.magnification,
                 relay_distortion_um=options.relay_distortion_um,
+                relay_centre_um=options.relay_centre_um,
                 dc_power=options.dc_power,
                 dc_phase_rad=options.dc_phase_rad,
                 fill=options.fill,

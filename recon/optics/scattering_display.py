@@ -48,6 +48,8 @@ class DisplaySpec:
         Of the relay from mask to SLM coordinates, less one.
     relay_distortion_um : float
         Radial (third order) displacement of the SLM's image at the mask's corners.
+    relay_centre_um : (float, float)
+        ``(x, y)`` of the relay's axis, which its distortion is centred on.
     dc_power, dc_phase_rad : float
         Share of the light that the SLM's surface reflects unmodulated.
     fill : float
@@ -69,6 +71,7 @@ class DisplaySpec:
     focal_mm: float = 35.0
     magnification: float = 0.0
     relay_distortion_um: float = 0.0
+    relay_centre_um: tuple[float, float] = (0.0, 0.0)
     dc_power: float = 0.0
     dc_phase_rad: float = 0.0
     fill: float = 1.0
@@ -144,6 +147,7 @@ class ScatteringDisplay:
             (1 + spec.magnification) * np.cos(pose.roll_mrad * 1e-3),
             (1 + spec.magnification) * np.sin(pose.roll_mrad * 1e-3),
             spec.relay_distortion_um / corner_um**3,
+            *spec.relay_centre_um,
         )
         tilted = pose.pitch_mrad != 0 or pose.yaw_mrad != 0
         if pose.z_um == 0 and not tilted:
@@ -208,6 +212,8 @@ def _resample(
     cosine: float,
     sine: float,
     cubic: float,
+    centre_x_um: float,
+    centre_y_um: float,
 ) -> None:
     """Average the SLM's image over every cell of the mask's frame; dark outside the SLM."""
     height, width = field.shape
@@ -218,9 +224,10 @@ def _resample(
             x_mask = (j - 0.5 * (width - 1)) * pitch_um
             x = cosine * x_mask - sine * y_mask + shift_x_um
             y = sine * x_mask + cosine * y_mask + shift_y_um
-            stretch = 1.0 + cubic * (x * x + y * y)
-            u = x * stretch / slm_pitch_um + 0.5 * slm.shape[1] - 0.5 * part
-            v = y * stretch / slm_pitch_um + 0.5 * slm.shape[0] - 0.5 * part
+            across, down = x - centre_x_um, y - centre_y_um
+            stretch = cubic * (across * across + down * down)
+            u = (x + stretch * across) / slm_pitch_um + 0.5 * slm.shape[1] - 0.5 * part
+            v = (y + stretch * down) / slm_pitch_um + 0.5 * slm.shape[0] - 0.5 * part
             column, row = int(np.floor(u)), int(np.floor(v))
             right = max(0.0, u + part - (column + 1)) / part
             below = max(0.0, v + part - (row + 1)) / part

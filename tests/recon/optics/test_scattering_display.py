@@ -83,8 +83,29 @@ def test_free_space_keeps_the_energy_and_can_be_undone():
     here = optics._on_mask(PHASE, MaskPose())
     there = optics._on_mask(PHASE, MaskPose(z_um=500.0))
     assert np.sum(np.abs(there) ** 2) == pytest.approx(np.sum(np.abs(here) ** 2), rel=1e-4)
-    back = np.fft.ifft2(np.fft.fft2(there) * np.exp(1j * 0.5 * optics._f2))
+    back = np.fft.ifft2(np.fft.fft2(there) * np.exp(1j * 0.5 * np.add.outer(*optics._f2)))
     np.testing.assert_allclose(back, here, atol=1e-3)
+
+
+def test_a_decentred_relay_distorts_about_its_own_axis():
+    """A dark pixel at the relay's axis stays where it is; elsewhere it moves by the cube of the distance."""
+    spec = replace(SPEC, relay_distortion_um=40.0, relay_centre_um=(120.0, -80.0))
+    y, x = (np.arange(n) - (n - 1) / 2 for n in SHAPE)
+    row, column = np.abs(y * 16 + 80).argmin(), np.abs(x * 16 - 120).argmin()
+
+    def place(at, spec):
+        phase = np.zeros(SHAPE)
+        phase[row, at] = np.pi
+        field = ScatteringDisplay(spec, np.pi * BITS)._on_mask(phase, MaskPose())
+        weight = np.abs(field - 1)[30:-30, 30:-30].sum(axis=0)  # the SLM's border moves too
+        return 2.0 * float(weight @ np.arange(len(weight)) / weight.sum())
+
+    straight = replace(spec, relay_distortion_um=0.0)
+    assert place(column, spec) == pytest.approx(place(column, straight), abs=0.02)
+    corner_um = 0.5 * 4.0 * np.hypot(128, 160)
+    # The cells that see the pixel lie closer to the axis, 160 um to the right of it.
+    moved = place(column - 10, spec) - place(column - 10, straight)
+    assert moved == pytest.approx(40.0 * 160**3 / corner_um**3, rel=0.1)
 
 
 def test_a_tilt_is_another_distance_at_each_place():
