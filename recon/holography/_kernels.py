@@ -103,6 +103,33 @@ def fill_displaced(
 
 
 @njit(nogil=True, cache=True)
+def mean_power(nodes: Any, mask_shape: Any, slm_shape: Any, k: int) -> tuple[float, float]:
+    """Mean light behind a displaced mask of random phases and of equal ones, relative to a mask in place.
+
+    A cell that sees two SLM pixels averages their phases away; one beside the SLM sees nothing.
+    """
+    height, width = mask_shape
+    row = np.empty((nodes.shape[1], 2))
+    mixed = covered = 0.0
+    for y in range(height):
+        _row(nodes, y, height, row)
+        for x in range(width):
+            at_y, at_x = _place(row, y, x, width)
+            j, in_j = _cell(at_y, k)
+            i, in_i = _cell(at_x, k)
+            total = 0.0
+            for b in range(2):
+                wy = 1 - in_j if b else in_j
+                for a in range(2):
+                    wx = 1 - in_i if a else in_i
+                    if 0 <= j + b < slm_shape[0] and 0 <= i + a < slm_shape[1]:
+                        mixed += (wy * wx) ** 2
+                        total += wy * wx
+            covered += total * total
+    return mixed / (height * width), covered / (height * width)
+
+
+@njit(nogil=True, cache=True)
 def gather_displaced(
     out: Any, field: Any, mask: Any, table: Any, hy: Any, hx: Any, nodes: Any, k: int, start: int, stop: int
 ) -> None:

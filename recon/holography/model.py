@@ -9,7 +9,8 @@ In symbols (Kuo 2020, Eqs. 7.8, 7.15, 7.19, 7.22 and A.7), DC term ``d`` and env
     L   = 1/2 mean(g^2)                      summed over planes
 
 Only the kept lags of ``F I`` are ever formed, and ``I`` only a few rows at a time. Intensities are in units
-of the mean that an SLM of amplitude 1 gives, so ``L`` does not depend on sizes.
+of the mean that an SLM of amplitude 1 and random phases gives, so ``L`` does not depend on sizes, nor on the
+light that a displaced mask loses where its cells see two SLM pixels.
 """
 
 from __future__ import annotations
@@ -92,26 +93,27 @@ class HologramModel:
         self._real: np.dtype[Any] = np.empty(0, self.dtype).real.dtype
         unfiltered = self.loss.kind == "none"
         self.band = make_band(display.slm_shape, display.factor, grid, unfiltered=unfiltered)
-        self._field = np.zeros((frames, *self.band.shape), self.dtype)
-        self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
-        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / frames)
-        response = display.mask.response(display.wavelength_nm) * aperture
-        self._table = response.astype(self.dtype)
-        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
-        ey, ex = display.envelope(self.band.shape)
-        self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
-        spectra = [target.spectrum(display, self.band) for target in self.targets]
-        self._wanted = [spectrum.astype(self.dtype) for spectrum, _ in spectra]
+        # What needs room to be computed comes before the large arrays, one after the other.
+        spectra = [self._spectrum_of(target) for target in self.targets]
+        self._wanted = [spectrum for spectrum, _ in spectra]
         self.peaks = tuple(peak for _, peak in spectra)
-        self._cutoff = 0.0 if unfiltered else self.band.cutoff
         self._weights: npt.NDArray[Any] | None = None
         if self.loss.kind == "spatial":
             height, width = self.band.seen_shape
             self._weights = (self.loss.weights_on((height, width)) ** 2).astype(self._real)
             self._small = np.empty((height, width // 2 + 1), self.dtype)
             self._seen = np.empty((height, width), self._real)
+        self._field = np.zeros((frames, *self.band.shape), self.dtype)
+        self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, dtype=self._real)
+        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / frames / self._mean_power())
+        response = display.mask.response(display.wavelength_nm) * aperture
+        self._table = response.astype(self.dtype)
+        self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
+        ey, ex = display.envelope(self.band.shape)
+        self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
+        self._cutoff = 0.0 if unfiltered else self.band.cutoff
 
     @property
     def nbytes(self) -> int:
@@ -186,6 +188,24 @@ class HologramModel:
         return out
 
     # Steps -------------------------------------------------------------------------------------
+    def _spectrum_of(self, target: Target) -> tuple[ComplexArray, float]:
+        spectrum, peak = target.spectrum(self.display, self.band)
+        return spectrum.astype(self.dtype), peak
+
+    def _mean_power(self) -> float:
+        """Return the mean light that passes from an SLM of random phases, relative to a mask in place."""
+        from recon.holography import _kernels
+
+        display = self.display
+        if self._nodes is None:
+            return 1.0
+        mixed, covered = _kernels.mean_power(
+            self._nodes, display.mask.shape, display.slm_shape, display.factor
+        )
+        if covered == 0:
+            raise InputError("The mask is displaced so far that it sees nothing of the SLM.")
+        return float((1 - display.dc.power) * mixed + display.dc.power * covered)
+
     def _check(self, slm: ComplexArray) -> ComplexArray:
         expected = (self.frames, *self.display.slm_shape)
         if slm.shape != expected:
@@ -283,13 +303,28 @@ class HologramModel:
             in_blocks(gather, out.shape[0], grain=16)
             return
         edges = [height * band // _BANDS for band in range(_BANDS + 1)]
-        parts = np.zeros((_BANDS, *out.shape), self.dtype)
+        parts = [_rows_seen(nodes, edges[n], edges[n + 1], height, k, out.shape[0]) for n in range(_BANDS)]
+        sums = [np.zeros((last - first, out.shape[1]), self.dtype) for first, last in parts]
 
         def scatter(start: int, stop: int) -> None:
-            for band in range(start, stop):
+            for n in range(start, stop):
+                moved = nodes - np.array([parts[n][0] * k, 0], nodes.dtype)
                 _kernels.gather_displaced(
-                    parts[band], field, mask, self._table, hy, hx, nodes, k, edges[band], edges[band + 1]
+                    sums[n], field, mask, self._table, hy, hx, moved, k, edges[n], edges[n + 1]
                 )
 
         in_blocks(scatter, _BANDS)
-        out += parts.sum(axis=0)
+        for (first, last), part in zip(parts, sums, strict=True):
+            out[first:last] += part
+
+
+def _rows_seen(
+    nodes: npt.NDArray[Any], start: int, stop: int, height: int, k: int, slm_rows: int
+) -> tuple[int, int]:
+    """Return the SLM rows that mask rows ``start`` to ``stop`` may see through a displacement."""
+    per_node = (nodes.shape[0] - 1) / height
+    around = nodes[int(start * per_node) : int(np.ceil(stop * per_node)) + 1, :, 0]
+    first = int(np.floor((start + around.min()) / k))
+    last = int(np.floor((stop + around.max()) / k)) + 2
+    first = min(max(first, 0), slm_rows)
+    return first, max(min(last, slm_rows), first)

@@ -137,21 +137,24 @@ def compute_hologram(
         if complex_slm or initial is not None:
             raise InputError("The one-step method takes no start and has no form for a complex SLM.")
         return one_step(model, seed=seed)
-    if initial is None:
-        phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, shape).astype(np.float32)
-        start = np.exp(1j * phases)
-    else:
-        start = initial if complex_slm else _unit(initial)
-    variable = _Complex(model) if complex_slm else _Phase(model)
+    search: _Search
     if method == "lbfgs":
-        search: _Search = _Lbfgs(variable, start)
+        variable = _Complex(model) if complex_slm else _Phase(model)
+        search = _Lbfgs(variable, variable.pack(_start(initial, shape, seed, complex_slm)))
     elif method == "nesterov":
-        search = _Nesterov(model, start, complex_slm)
+        search = _Nesterov(model, _start(initial, shape, seed, complex_slm), complex_slm)
     else:
         raise InputError(f"The method is 'lbfgs', 'nesterov' or 'one_step', not {method!r}.")
     history, reason = _run(search, budget or Budget(), callback, cancel)
     slm = search.slm / max(float(np.abs(search.slm).max()), 1.0) if complex_slm else search.slm
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
+
+
+def _start(initial: Array | None, shape: tuple[int, ...], seed: int, complex_slm: bool) -> Array:
+    if initial is not None:
+        return initial if complex_slm else _unit(initial)
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, shape).astype(np.float32)
+    return np.asarray(np.exp(1j * phases))
 
 
 def one_step(model: HologramModel, *, seed: int = 0) -> Hologram:
@@ -213,8 +216,8 @@ class _Phase:
         # dL/dphi = 2 Im(gradient conj(s)); formed in place of the gradient's imaginary part.
         found.gradient.imag *= slm.real
         found.gradient.real *= slm.imag
+        found.gradient.imag -= found.gradient.real
         gradient: Array = 2 * found.gradient.imag
-        gradient -= 2 * found.gradient.real
         return _Point(found.loss, found.seen_psnr_db), gradient.ravel()
 
 
@@ -263,15 +266,15 @@ class _Lbfgs(_Search):
     MEMORY = 3
     FIRST_STEP_RAD = 0.5
 
-    def __init__(self, variable: _Phase | _Complex, start: Array) -> None:
+    def __init__(self, variable: _Phase | _Complex, x: Array) -> None:
         self.variable = variable
-        self.x = variable.pack(start)
+        self.x = x
         self.point, self.gradient = variable.evaluate(self.x)
         self.pairs: deque[tuple[Array, Array, float]] = deque(maxlen=self.MEMORY)
 
     @property
     def slm(self) -> Array:
-        return self.variable.field(self.x)
+        return self.variable.field(self.x.copy())  # steps are taken in place
 
     def step(self) -> _Point | None:
         for _ in range(2):
@@ -297,6 +300,8 @@ class _Lbfgs(_Search):
         direction *= direction.dtype.type(1.0 / (rho * float(y @ y)))
         for (s, y, rho), weight in zip(self.pairs, reversed(weights), strict=True):
             direction += direction.dtype.type(weight - rho * float(y @ direction)) * s
+        if len(self.pairs) == self.MEMORY:
+            self.pairs.popleft()  # used for the last time: its room is needed while the step is tried
         return direction
 
     def _search(self, step: Array) -> _Point | None:
@@ -304,16 +309,18 @@ class _Lbfgs(_Search):
         slope = float(step @ self.gradient)
         if not slope < 0:
             return None
+        taken = self.x
         for _ in range(12):
-            x = self.x + step
-            point, gradient = self.variable.evaluate(x)
+            taken += step
+            point, gradient = self.variable.evaluate(taken)
             if point.loss <= self.point.loss + 1e-4 * slope:
                 change = np.subtract(gradient, self.gradient, out=self.gradient)
                 curvature = float(step @ change)
                 if curvature > 1e-10 * float(change @ change):
                     self.pairs.append((step, change, 1.0 / curvature))
-                self.x, self.point, self.gradient = x, point, gradient
+                self.point, self.gradient = point, gradient
                 return point
+            taken -= step
             bend = point.loss - self.point.loss - slope
             shorter = float(np.clip(-slope / (2 * bend), 0.1, 0.5)) if bend > 0 else 0.25
             step *= step.dtype.type(shorter)

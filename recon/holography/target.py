@@ -64,7 +64,9 @@ class Target:
             known[:] = True
         rows = np.where(2 * np.abs(y) <= image.shape[0], y, 0) % image.shape[0]
         columns = np.minimum(x, spectrum.shape[1] - 1)
-        return np.where(known, spectrum[np.ix_(rows, columns)], 0), peak
+        kept = spectrum[np.ix_(rows, columns)]
+        kept[~known] = 0
+        return kept, peak
 
 
 @dataclass(frozen=True, slots=True)
