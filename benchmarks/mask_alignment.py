@@ -1,11 +1,13 @@
 """Mask alignment from random starts on the simulated display, which knows the truth and does not tell.
 
-Each start draws shift, depth, rotation, tilts and relay magnification, with DC term, pixel fill, relay and
-lens distortion, camera offset and noise always on; the procedure is told none of it. Afterwards a hologram
-is photographed: computed for a perfectly placed mask and shown before aligning, computed with the pose found,
-and computed with the truth for a bench without misalignment. Writes a line a start::
+Each start draws shift, depth, rotation, tilts, relay magnification and distortion (up to 1.5 mask pixels at
+the corners, about an axis up to 0.8 mm off), with DC term, pixel fill, lens distortion, camera offset, noise
+and 8-bit phase always on; the procedure is told none of it. Afterwards a hologram is photographed: computed
+for a perfectly placed mask and shown before aligning, computed with the pose found, and computed with the
+truth for a bench without misalignment. Writes a line a start; run again, it goes on where it ended::
 
     python benchmarks/mask_alignment.py --starts 20 --out mask-alignment
+    python benchmarks/mask_alignment.py --kind tilt --starts 4 --out alone-tilt
 """
 
 from __future__ import annotations
@@ -30,13 +32,31 @@ from instrument.hologram_job import prepare_target
 from instrument.sample_images import load_sample
 from recon.holography import Budget, DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera
-from recon.holography.pose import Pose
+from recon.holography.pose import Pose, nodes_of
 
-ITERATIONS = 40
+ITERATIONS = 30
 
 
-def draw(seed: int) -> dict[str, str]:
-    """Return the options of one start."""
+KINDS = {
+    "shift": ("shift_um",),
+    "depth": ("z_um",),
+    "rotation": ("roll_mrad",),
+    "tilt": ("pitch_mrad", "yaw_mrad"),
+    "magnification": ("magnification",),
+    "distortion": ("relay_distortion_um", "relay_centre_um"),
+}
+
+
+def draw(seed: int, kind: str = "all") -> dict[str, str]:
+    """Return the options of one start; ``kind`` leaves everything else at zero."""
+    options = _draw(seed)
+    for other, names in KINDS.items():
+        if kind not in ("all", other):
+            options |= {name: "[0.0, 0.0]" if options[name].startswith("[") else "0.0" for name in names}
+    return options
+
+
+def _draw(seed: int) -> dict[str, str]:
     rng = np.random.default_rng(1000 + seed)
     x, y = rng.uniform(-288, 288, 2)  # 72 mask pixels of 4 um
     half_width = 640.0  # mask pixels
@@ -48,6 +68,8 @@ def draw(seed: int) -> dict[str, str]:
         "pitch_mrad": f"{rng.uniform(-5, 5):.3f}",
         "yaw_mrad": f"{rng.uniform(-5, 5):.3f}",
         "magnification": f"{rng.uniform(-0.003, 0.003):.6f}",
+        "relay_distortion_um": f"{rng.uniform(-6, 6):.2f}",
+        "relay_centre_um": "[{:.0f}, {:.0f}]".format(*rng.uniform(-800, 800, 2)),
     }
 
 
@@ -60,43 +82,37 @@ def configuration(options: dict[str, str]) -> str:
     return f"{head}\n[simulated_display]{tail}"
 
 
-def true_pose(world: DisplayWorld) -> tuple[Pose, float]:
-    """Return the true pose without the cubic term, and the relay's cubic term at the corners, mask pixels."""
+def true_pose(world: DisplayWorld) -> Pose:
+    """Return the true pose, without the relay's distortion."""
     pose, options = world.pose(), world.options
     pitch = options.mask_pitch_um
-    return (
-        Pose(
-            pose.shift_x_um / pitch,
-            pose.shift_y_um / pitch,
-            pose.roll_mrad,
-            options.magnification,
-            0.0,
-            pose.z_um,
-            pose.pitch_mrad,
-            pose.yaw_mrad,
-        ),
-        options.relay_distortion_um / pitch,
+    return Pose(
+        pose.shift_x_um / pitch,
+        pose.shift_y_um / pitch,
+        pose.roll_mrad,
+        options.magnification,
+        0.0,
+        pose.z_um,
+        pose.pitch_mrad,
+        pose.yaw_mrad,
     )
 
 
 def true_displacement(world: DisplayWorld, mask_shape: tuple[int, int]) -> np.ndarray:
-    """Return the true displacement field on nodes, cubic term as the simulated relay has it."""
-    pose, cubic = true_pose(world)
-    field = pose.displacement(mask_shape)
-    height, width = mask_shape
-    y, x = np.meshgrid(
-        (np.linspace(0, 1, field.shape[0]) - 0.5) * height,
-        (np.linspace(0, 1, field.shape[1]) - 0.5) * width,
-        indexing="ij",
-    )
-    sx, sy = x + field[..., 1], y + field[..., 0]
-    stretch = cubic * (sx**2 + sy**2) / (0.5 * np.hypot(height, width)) ** 3
-    return np.stack([sy * (1 + stretch) - y, sx * (1 + stretch) - x], axis=-1)
+    """Return the true displacement field on nodes, distorted as the simulated relay does it."""
+    options = world.options
+    field = true_pose(world).displacement(mask_shape)
+    y, x = nodes_of(mask_shape)
+    centre_x, centre_y = (c / options.mask_pitch_um for c in options.relay_centre_um)
+    across, down = x + field[..., 1] - centre_x, y + field[..., 0] - centre_y
+    cubic = options.relay_distortion_um / options.mask_pitch_um / (0.5 * np.hypot(*mask_shape)) ** 3
+    stretch = cubic * (across**2 + down**2)
+    return field + np.stack([stretch * down, stretch * across], axis=-1)
 
 
-def residual(world: DisplayWorld, pose: Pose, mask_shape: tuple[int, int]) -> float:
+def residual(world: DisplayWorld, found: np.ndarray, mask_shape: tuple[int, int]) -> float:
     """Return the rms distance between true and found displacement over the mask, mask pixels."""
-    difference = true_displacement(world, mask_shape) - pose.displacement(mask_shape)
+    difference = true_displacement(world, mask_shape) - found
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
 
 
@@ -106,10 +122,11 @@ def hologram(display: Display, target: object) -> np.ndarray:
     return compute_hologram(model, budget=Budget(iterations=ITERATIONS)).slm[0]
 
 
-def one_start(seed: int, plain: np.ndarray | None) -> tuple[dict[str, object], np.ndarray]:
+def one_start(seed: int, kind: str, plain: np.ndarray | None) -> tuple[dict[str, object], np.ndarray]:
     """Run one start; ``plain`` is the hologram for a perfectly placed mask."""
-    config = parse_config(configuration(draw(seed)), None)
-    line: dict[str, object] = {"start": seed, **draw(seed)}
+    options = draw(seed, kind)
+    config = parse_config(configuration(options), None)
+    line: dict[str, object] = {"start": seed, "kind": kind, **options}
     with Bench(config).open() as bench:
         assert bench.stage is not None
         assert bench.slm is not None
@@ -128,17 +145,20 @@ def one_start(seed: int, plain: np.ndarray | None) -> tuple[dict[str, object], n
             line |= {"success": False, "said": str(error), "frames": io.frames}
             return line, plain
         shape = known.mask.shape
-        left = true_pose(world)[0]
+        left = true_pose(world)
+        field = report.displacement(shape)
         line |= {
             "success": True,
             "frames": report.frames,
             "seconds": round(time.perf_counter() - began, 1),
             "efficiency": round(report.efficiency, 3),
-            "residual_px": round(residual(world, report.pose, shape), 3),
+            "predicted_lost_db": round(report.psnr_lost_db, 2),
+            "repeatability_db": round(report.repeatability_db, 2),
+            "residual_px": round(residual(world, field, shape), 3),
             "z_left_um": round(left.z_um, 1),
             "tilt_left_mrad": round(float(np.hypot(left.pitch_mrad, left.yaw_mrad)), 2),
         }
-        aligned = replace(known, displacement=report.pose.displacement(shape))
+        aligned = replace(known, displacement=field)
         shots = {"mean_per_ms": report.brightness_per_ms}
         after = capture_hologram(
             io, [hologram(aligned, target)], aligned, target, report.camera, **shots, average=2
@@ -148,7 +168,7 @@ def one_start(seed: int, plain: np.ndarray | None) -> tuple[dict[str, object], n
         before = capture_hologram(io, [plain], known, target, report.camera, **shots, average=2)
         line["psnr_before_db"] = round(before.scores.psnr_db, 2)
     still = dict.fromkeys(("z_um", "roll_mrad", "pitch_mrad", "yaw_mrad"), "0.0") | {"shift_um": "[0.0, 0.0]"}
-    config = parse_config(configuration({**draw(seed), **still}), None)
+    config = parse_config(configuration({**options, **still}), None)
     with Bench(config).open() as bench:
         assert bench.slm is not None
         (world,) = bench.shared.values()
@@ -168,20 +188,39 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--starts", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--kind", choices=["all", *KINDS], default="all")
     parser.add_argument("--out", type=Path, default=Path("mask-alignment"))
     options = parser.parse_args()
-    lines: list[dict[str, object]] = []
+    path = options.out.with_suffix(".csv")
+    lines = read(path) if path.exists() else []
+    done = {int(str(line["start"])) for line in lines}
     plain = None
     for seed in range(options.first, options.first + options.starts):
-        line, plain = one_start(seed, plain)
+        if seed in done:
+            continue
+        line, plain = one_start(seed, options.kind, plain)
         lines.append(line)
         print({k: v for k, v in line.items() if k not in draw(0)}, flush=True)
-        write(options.out.with_suffix(".csv"), lines)
-    good = [line for line in lines if line["success"]]
+        write(path, lines)
+    good = [line for line in lines if str(line["success"]) == "True"]
     print(f"SIMULATED: {len(good)} of {len(lines)} starts aligned")
-    for name in ("frames", "residual_px", "efficiency", "psnr_before_db", "psnr_after_db", "psnr_perfect_db"):
+    for name in (
+        "frames",
+        "residual_px",
+        "efficiency",
+        "predicted_lost_db",
+        "psnr_before_db",
+        "psnr_after_db",
+        "psnr_perfect_db",
+    ):
         values = np.array([line[name] for line in good], float)
         print(f"{name}: median {np.median(values):.3f}, worst {values.min():.3f} to {values.max():.3f}")
+
+
+def read(path: Path) -> list[dict[str, object]]:
+    """Read what an earlier run wrote."""
+    with path.open(newline="") as file:
+        return [dict(line) for line in csv.DictReader(file)]
 
 
 def write(path: Path, lines: list[dict[str, object]]) -> None:

@@ -114,7 +114,24 @@ def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     io.show(np.ones(display.slm_shape, complex))
     frame = io.photograph(camera.exposure_ms)
     found = register_camera(frame, display, across)
-    rows, columns = found.pixels(np.array([-0.3, 0.3]), np.array([-0.3, 0.3]))
+    return found, _inner_mean(frame, found)
+
+
+def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
+    """Return counts a millisecond of the mean intensity of random phases.
+
+    A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
+    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
+    """
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
+    io.show(np.exp(1j * phases))
+    full = (1 << io.bench.camera.significant_bits) - 1
+    return _inner_mean(io.photograph(full / (12 * mean_per_ms)), camera)
+
+
+def _inner_mean(frame: Array, camera: CameraMap) -> float:
+    """Return the mean over the inner field of view, the mask pixels' envelope divided out."""
+    rows, columns = camera.pixels(np.array([-0.3, 0.3]), np.array([-0.3, 0.3]))
     inner = frame[round(rows[0]) : round(rows[1]), round(columns[0]) : round(columns[1])]
     envelope = (np.sinc(np.linspace(-0.3, 0.3, 101)) ** 2).mean() ** 2
-    return found, float(inner.mean() / envelope)
+    return float(inner.mean() / envelope)

@@ -82,6 +82,7 @@ def measure_flatness(
     pose: Pose,
     table: SlmCalibration,
     *,
+    rest: Array | None = None,
     pictures: int = 10,
     progress: Progress | None = None,
 ) -> SlmCalibration:
@@ -95,6 +96,8 @@ def measure_flatness(
         Of the mask, from an alignment; the stage must be where that left it.
     table : SlmCalibration
         With the look-up table, which is used from here on.
+    rest : ndarray, (rows, columns, 2), optional
+        Smooth displacement beyond the pose's, from the alignment.
     pictures : int
         In the last of four steps.
 
@@ -105,6 +108,7 @@ def measure_flatness(
     """
     io.correction = table.correction
     eye = SpotCamera(io, display)
+    eye.maker.rest = rest
     eye.register()
     step = 0.8
     jacobian = flatness_jacobian(step)

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.atomic import write_text
 from instrument.errors import FileError
 from recon.holography import Display
-from recon.holography.pose import NAMES, Pose
+from recon.holography.pose import NAMES, NODES, Pose
 
 FORMAT = "diffuserbench mask alignment"
 
@@ -28,6 +29,8 @@ class Alignment:
         Left over with the stage at ``stage_position``.
     error : mapping of parameter name to float
         Standard uncertainties.
+    rest : ndarray, float64, (rows, columns, 2)
+        Smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask pixels.
     efficiency : float
         Spot brightness over the model's ideal.
     stage_position : mapping of axis name to float
@@ -39,6 +42,7 @@ class Alignment:
 
     pose: Pose
     error: Mapping[str, float]
+    rest: npt.NDArray[np.float64]
     efficiency: float
     stage_position: Mapping[str, float]
     mask_shape: tuple[int, int]
@@ -59,12 +63,12 @@ class Alignment:
                 "alignment",
                 f"holds for a mask of {self.mask_shape} pixels; this display's has {display.mask.shape}.",
             )
-        return replace(display, displacement=self.pose.displacement(self.mask_shape))
+        return replace(display, displacement=self.pose.displacement(self.mask_shape) + self.rest)
 
 
 def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -> None:
     """Write an alignment with further facts; errors as ``write_text``."""
-    record = {"format": FORMAT, **asdict(alignment), **facts}
+    record = {"format": FORMAT, **asdict(alignment), "rest": alignment.rest.round(4).tolist(), **facts}
     write_text(path, json.dumps(record, indent=1) + "\n")
 
 
@@ -88,10 +92,14 @@ def load_alignment(path: Path) -> Alignment:
         pose = Pose(**{name: float(record["pose"][name]) for name in NAMES})
         if not np.isfinite(pose.vector()).all():
             raise ValueError("the pose is not finite")
+        rest = np.array(record["rest"], float)
+        if rest.shape != (*NODES, 2) or not np.isfinite(rest).all():
+            raise ValueError(f"'rest' should be {(*NODES, 2)} numbers, not {rest.shape}")
         height, width = record["mask_shape"]
         return Alignment(
             pose,
             dict(record["error"]),
+            rest,
             float(record["efficiency"]),
             dict(record["stage_position"]),
             (int(height), int(width)),

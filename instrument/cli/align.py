@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from calibration_routines.display_io import DisplayBench
@@ -40,7 +41,10 @@ def mask(
     ] = Path("alignment.json"),
     reach: Annotated[float, typer.Option("--reach", help="Largest shift to look for, mask pixels.")] = 72.0,
     depth_um: Annotated[float, typer.Option("--depth-um", help="Largest distance to look for.")] = 1000.0,
-    moves: Annotated[int, typer.Option("--moves", min=0, help="Stage moves at most; 0: nothing moves.")] = 2,
+    moves: Annotated[int, typer.Option("--moves", min=0, help="Stage moves at most; 0: nothing moves.")] = 4,
+    sections: Annotated[
+        str, typer.Option("--sections", metavar="ROWSxCOLUMNS", help="Of the SLM, measured one by one.")
+    ] = "3x5",
     max_frames: Annotated[int, typer.Option("--max-frames", min=10)] = 100,
     slm_calibration: Annotated[
         Path | None,
@@ -50,9 +54,12 @@ def mask(
 ) -> None:
     """Find the mask's pose by spots on the camera, move the stage, and store what is left as an alignment.
 
-    The camera must see the whole field of view. The search moves nothing; the stage (homed before) then takes
-    out shift, distance, rotation and tilts as far as its axes go. Give the file to hologram --alignment.
+    The camera must see the whole field of view. The search moves nothing. Then a small move and back tells
+    which way the stage's axes go and how well it comes back (it is homed before); it takes out shift,
+    distance, rotation and clear tilts until a move promises less than that. What stays is measured section
+    by section. Give the file to hologram --alignment.
     """
+    division = _division(sections)
     figure = out.with_suffix(".png")
     for file in (out, figure):
         if file.exists() and not force:
@@ -67,7 +74,9 @@ def mask(
             stage.home()
         display = bench_display(opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um))
         io = DisplayBench(opened, opened.config.display.slm_binning, correction)
-        settings = AlignmentSettings(reach=reach, depth_um=depth_um, moves=moves, max_frames=max_frames)
+        settings = AlignmentSettings(
+            reach=reach, depth_um=depth_um, moves=moves, max_frames=max_frames, division=division
+        )
         with progress_bar() as bar:
             task = bar.add_task("align mask", total=max_frames, note="")
             report = MaskAlignment(
@@ -78,6 +87,9 @@ def mask(
             "bench": opened.label,
             "frames": report.frames,
             "found_at": dict(zip(NAMES, map(float, report.found_at.vector()), strict=True)),
+            "psnr_lost_db": report.psnr_lost_db,
+            "repeatability_db": None if np.isnan(report.repeatability_db) else report.repeatability_db,
+            "axis_directions": report.directions,
             "camera_residual_px": report.camera.residual_px,
             "log": report.log,
         }
@@ -86,7 +98,8 @@ def mask(
 
         write_alignment_figure(
             figure,
-            report.pose,
+            report.pose.displacement(display.mask.shape),
+            report.rest,
             display.mask.shape,
             report.efficiencies,
             "Mask alignment",
@@ -100,6 +113,7 @@ def _alignment(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, int
     return Alignment(
         report.pose,
         dict(zip(NAMES, map(float, report.error), strict=True)),
+        report.rest,
         report.efficiency,
         bench.stage.commanded_position() if bench.stage else {},
         mask_shape,
@@ -113,4 +127,26 @@ def _tell(report: AlignmentReport, alignment: Alignment) -> None:
         f"Aligned with {report.frames} frames{mark}: spots at {100 * report.efficiency:.0f} % of the ideal"
     )
     for name, value, error in zip(NAMES, report.pose.vector(), report.error, strict=True):
-        typer.echo(f"  {name:<12}{value:+10.4f} +- {error:.4f}")
+        if name != "cubic":  # part of the smooth rest
+            typer.echo(f"  {name:<12}{value:+10.4f} +- {error:.4f}")
+    size = np.hypot(report.rest[..., 0], report.rest[..., 1])
+    typer.echo(f"  smooth rest {np.sqrt(np.mean(size**2)):.2f} mask pixels rms, {size.max():.2f} at most")
+    typer.echo(
+        f"  what remains costs a hologram about {report.psnr_lost_db:.2f} dB"
+        + (
+            ""
+            if np.isnan(report.repeatability_db)
+            else f"; stage repeatable to {report.repeatability_db:.2f} dB"
+        )
+    )
+    reversed_axes = [name for name, direction in report.directions.items() if direction < 0]
+    if reversed_axes:
+        typer.echo(f"  these axes go against their names: {', '.join(reversed_axes)}")
+
+
+def _division(text: str) -> tuple[int, int]:
+    try:
+        rows, columns = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise BenchError(f"--sections {text!r}: write ROWSxCOLUMNS, for example 3x5.") from None
+    return rows, columns

@@ -57,7 +57,7 @@ def slm(
         if place is not None:
             bring_mask(opened, place.stage_position)
             display = bench_display(opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um))
-            found = measure_flatness(io, display, place.pose, found, progress=show)
+            found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=show)
         simulated = bool(opened.simulated_kinds)
         facts = {"bench": opened.label, "simulated": simulated, "frames": found.frames}
         found.correction.save(out, facts)

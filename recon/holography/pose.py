@@ -51,20 +51,13 @@ class Pose:
         """Return the pose with some parameters replaced."""
         return replace(self, **values)
 
-    def displacement(
-        self, mask_shape: tuple[int, int], nodes: tuple[int, int] = (13, 23)
-    ) -> npt.NDArray[np.float64]:
+    def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
         """Return the displacement field for :class:`recon.holography.Display`.
 
-        It is (rows, columns, 2), in mask pixels. Nodes span the mask from edge to edge; 13 x 23 of them hold
-        a third-order field to a few per mille.
+        It is (*NODES, 2), in mask pixels.
         """
         height, width = mask_shape
-        y, x = np.meshgrid(
-            (np.linspace(0, 1, nodes[0]) - 0.5) * height,
-            (np.linspace(0, 1, nodes[1]) - 0.5) * width,
-            indexing="ij",
-        )
+        y, x = nodes_of(mask_shape)
         c, s = np.cos(self.roll_mrad * 1e-3), np.sin(self.roll_mrad * 1e-3)
         corner = 0.5 * np.hypot(height, width)
         r2 = x**2 + y**2
@@ -72,6 +65,17 @@ class Pose:
         sx = (1 + self.scale) * (c * x - s * y) + self.shift_x + radial * x
         sy = (1 + self.scale) * (s * x + c * y) + self.shift_y + radial * y
         return np.stack([sy - y, sx - x], axis=-1)
+
+
+NODES = (13, 23)
+"""Of displacement fields, from edge to edge of the mask; they hold a third-order field to a few per mille."""
+
+
+def nodes_of(mask_shape: tuple[int, int]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return y and x of the nodes of displacement fields, mask pixels from the centre."""
+    y, x = ((np.linspace(0, 1, n) - 0.5) * size for n, size in zip(NODES, mask_shape, strict=True))
+    grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
+    return grid_y, grid_x
 
 
 NAMES = tuple(field.name for field in fields(Pose))

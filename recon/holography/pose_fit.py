@@ -100,6 +100,11 @@ class PoseProbe:
         total = np.maximum(plus + minus, 1e-12)
         g = (plus - minus) / total
         sigma = noise / np.sqrt(len(amplitude)) * np.sqrt(2) / total
+        if len(amplitude) > 2:
+            # Spots differ by more than the speckle around them where something is not modelled.
+            single = amplitude[:, 0:16:2] - amplitude[:, 1:16:2]
+            scatter = np.sqrt(single.var(axis=0, ddof=1) / len(amplitude)) / total
+            sigma *= max(1.0, float(np.sqrt(np.mean((scatter / sigma) ** 2))))
         weighted = self.jacobian() / sigma[:, None]
         likely = (self.steps / prior) ** 2
         # Without the unit term a picture that tells nothing would throw the pose far away.

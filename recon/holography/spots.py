@@ -25,11 +25,22 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A spot to focus: where (integer bins of the mask's spectrum from the axis), and for which pose."""
+    """A spot to focus.
+
+    Attributes
+    ----------
+    row, column : int
+        Where, in integer bins of the mask's spectrum from the axis.
+    pose : Pose
+        For which it is bright.
+    section : (slice, slice) or None
+        Rows and columns of the SLM that make it; all of them by default.
+    """
 
     row: int
     column: int
     pose: Pose
+    section: tuple[slice, slice] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +67,11 @@ def depth_um(display: Display) -> float:
     return 1.5 * (display.slm_pitch_um * 1e-3) ** 2 / (display.wavelength_nm * 1e-6) * 1e3
 
 
+FLAT = 0.1
+"""A tilt that moves the corners by less than this part of :func:`depth_um` costs a spot less than 1 % of its
+light and is not computed."""
+
+
 class SpotMaker:
     """Computes spot patterns for one display.
 
@@ -65,7 +81,14 @@ class SpotMaker:
         Its ``displacement`` is not used: poses say where the mask is.
     threads : int
         For the Fourier transforms.
+
+    Attributes
+    ----------
+    rest : ndarray, float64, (rows, columns, 2), or None
+        Displacement beyond that of the poses, on the nodes of :meth:`Pose.displacement`, mask pixels.
     """
+
+    rest: npt.NDArray[np.float64] | None = None
 
     def __init__(self, display: Display, *, threads: int = 1) -> None:
         self.display = display
@@ -99,17 +122,29 @@ class SpotMaker:
         """Return the SLM field that focuses one spot, complex64 (height, width) of the SLM."""
         from recon.holography import _kernels
 
-        wave = self._at_slm(spot)
-        pose = spot.pose
-        nodes = (pose.displacement(self.display.mask.shape) * (self.fine / self.display.factor)).astype(
-            np.float32
-        )
+        nodes = spot.pose.displacement(self.display.mask.shape)
+        if self.rest is not None:
+            nodes += self.rest
+        # The mean displacement by a phase ramp, what differs from it by area: weighing the coarse grid's
+        # cells costs light that depends on the place between them, which would pass for a shift.
+        mean = _mean_of(nodes, spot.section, self.display.slm_shape)
+        wave = self._at_slm(spot, mean)
+        nodes = (nodes - mean) * (self.fine / self.display.factor)
+        rows = (0, self.shape[0])
+        if spot.section is not None:
+            margin = int(np.abs(nodes[..., 0]).max()) + 2
+            first, last = spot.section[0].start * self.fine, spot.section[0].stop * self.fine
+            rows = (max(first - margin, 0), min(last + margin, self.shape[0]))
         out = np.zeros(self.display.slm_shape, np.complex64)
         one, row, column = np.ones(1, np.complex64), self._ones[:, 0], self._ones[0]
         _kernels.gather_displaced(
-            out, wave, self._levels, one, row, column, nodes, self.fine, 0, self.shape[0]
+            out, wave, self._levels, one, row, column, nodes.astype(np.float32), self.fine, *rows
         )
-        return out
+        if spot.section is None:
+            return out
+        part = np.zeros_like(out)
+        part[spot.section] = out[spot.section]
+        return part
 
     def pattern(self, spots: Sequence[Spot], *, seed: int = 0) -> SpotPattern:
         """Superpose spots with random phases and keep the phase of the sum."""
@@ -157,14 +192,18 @@ class SpotMaker:
         window: npt.NDArray[np.complex64] = self._spectrum[np.ix_(rows, columns)]
         return window
 
-    def _at_slm(self, spot: Spot) -> npt.NDArray[np.complex64]:
-        """Field in the SLM's image plane, two samples per SLM pixel, in the mask's frame."""
+    def _at_slm(self, spot: Spot, shift: npt.NDArray[np.float64]) -> npt.NDArray[np.complex64]:
+        """Field in the SLM's image plane, two samples per SLM pixel, in the frame of a shifted mask."""
         pose = spot.pose
+        height, width = self.display.mask.shape
         spectrum = self._window(spot) * self._centre
+        spectrum *= np.exp(-2j * np.pi * self._rows * (shift[0] / height)).astype(np.complex64)[:, None]
+        spectrum *= np.exp(-2j * np.pi * self._columns * (shift[1] / width)).astype(np.complex64)
         if pose.z_um:
             spectrum *= self._free_space(pose.z_um)
         wave = scipy.fft.ifft2(spectrum, workers=self.threads)
-        if pose.pitch_mrad or pose.yaw_mrad:
+        reach = abs(pose.pitch_mrad * self._y_mm[-1]) + abs(pose.yaw_mrad * self._x_mm[-1])  # um at a corner
+        if reach > FLAT * depth_um(self.display):
             depth = 1e-3 * (pose.pitch_mrad * self._y_mm[:, None] + pose.yaw_mrad * self._x_mm)
             depth = depth.astype(np.float32)
             # Second order in the depth: the probes tilt by far more than the mask ever is.
@@ -188,6 +227,22 @@ class SpotMaker:
         """
         kept = (1.0 if self.display.factor == 1 else np.pi / 4) * (1.0 if count == 1 else np.pi / 4)
         return kept * self.display.slm_shape[0] * self.display.slm_shape[1] / count
+
+
+def _mean_of(
+    nodes: npt.NDArray[np.float64], section: tuple[slice, slice] | None, slm_shape: tuple[int, int]
+) -> npt.NDArray[np.float64]:
+    """Return the displacement (y, x) in the middle of a section, or of the SLM."""
+    parts = section or tuple(slice(0, n) for n in slm_shape)
+    place = [
+        (part.start + part.stop) / (2 * n) * (count - 1)
+        for part, n, count in zip(parts, slm_shape, nodes.shape[:2], strict=True)
+    ]
+    j, i = (min(int(p), n - 2) for p, n in zip(place, nodes.shape[:2], strict=True))
+    v, u = place[0] - j, place[1] - i
+    left, right = (nodes[j, n] * (1 - v) + nodes[j + 1, n] * v for n in (i, i + 1))
+    middle: npt.NDArray[np.float64] = left * (1 - u) + right * u
+    return middle
 
 
 def spread_spots(

@@ -45,7 +45,7 @@ def small(**changes: str) -> str:
     return text
 
 
-SETTINGS = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, refinements=2)
+SETTINGS = AlignmentSettings(reach=8.0, depth_um=100.0, spots=25, refinements=2, section_pictures=2)
 
 
 def aligned(bench: Bench, settings: AlignmentSettings = SETTINGS):
@@ -84,7 +84,51 @@ def test_frames_are_counted_and_limited() -> None:
         aligned(bench, few)
 
 
+NEAR = {"shift_um": "[6.0, -4.0]", "z_um": "200.0", "roll_mrad": "0.5", "magnification": "0.0005"}
+
+
+def with_axes(bench: Bench, change) -> DisplayWorld:
+    """Connect the stage's carriage to the mask in another way."""
+    (world,) = bench.shared.values()
+    assert isinstance(world, DisplayWorld)
+    plain = world._stage
+    world.mount_mask(lambda: change(dict(plain())))
+    return world
+
+
 @pytest.mark.slow
+def test_axes_that_go_the_other_way_are_found_out_and_used() -> None:
+    with Bench(parse_config(small(**NEAR), None)).open() as bench:
+        turn = {"x_um": -1, "z_um": -1}
+        world = with_axes(bench, lambda at: {name: turn.get(name, 1) * value for name, value in at.items()})
+        report = aligned(bench)
+        assert report.directions == {"x_um": -1, "y_um": 1, "z_um": -1, "roll_mrad": 1}
+        assert any("reversed: x_um, z_um" in words for words in report.log)
+        left = world.pose()
+    assert np.hypot(left.shift_x_um, left.shift_y_um) < 4.0
+    assert abs(left.z_um) < 80
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "axis"),
+    [
+        (lambda at: at | {"y_um": 0.0}, "y_um"),
+        (lambda at: at | {"x_um": at["y_um"], "y_um": at["x_um"]}, "x_um"),
+    ],
+    ids=["stuck", "exchanged"],
+)
+def test_an_axis_that_does_something_else_ends_the_alignment_in_words(change, axis) -> None:
+    with Bench(parse_config(small(**NEAR), None)).open() as bench:
+        assert bench.stage is not None
+        with_axes(bench, change)
+        with pytest.raises(AlignmentFailedError, match=f"Axis {axis} of .* was moved by .* the spots say"):
+            aligned(bench)
+        assert bench.stage.commanded_position() == {axis.name: 0.0 for axis in bench.stage.axes}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_from_the_command_line_to_a_photographed_hologram(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,11 +146,17 @@ def test_from_the_command_line_to_a_photographed_hologram(
     assert first["shift_y"] == pytest.approx(-42.0 / 4, abs=0.4)
     assert first["roll_mrad"] == pytest.approx(4.0, abs=1.0)
     assert first["scale"] == pytest.approx(0.002, abs=0.0012)
-    assert first["z_um"] == pytest.approx(150.0, abs=60.0)
+    assert first["z_um"] == pytest.approx(150.0, abs=90.0)
     assert found.stage_position["x_um"] == pytest.approx(-31.0, abs=3.0)
     assert abs(found.pose.shift_x) < 0.6
     assert 0.3 < found.efficiency < 1.1
-    assert min(found.error.values()) > 0
+    assert all(error > 0 for name, error in found.error.items() if name != "cubic")
+    facts = json.loads(Path("alignment.json").read_text())
+    assert facts["axis_directions"] == {"x_um": 1, "y_um": 1, "z_um": 1, "roll_mrad": 1}
+    assert 0 < facts["psnr_lost_db"] < 3
+    assert 0 <= facts["repeatability_db"] < 3
+    assert found.pose.cubic == 0
+    assert np.abs(found.rest).max() < 1.5
     assert Path("alignment.png").exists()
     aligned_to = ["--alignment", "alignment.json"]
     assert main(["hologram", "picture.png", "--out", "sharp.png", "-n", "30", *aligned_to]) == 0
