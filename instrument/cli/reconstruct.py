@@ -245,6 +245,12 @@ def reconstruct(
             "--figure", metavar="FILE", help="Also a summary figure (.png, .pdf, .svg).", show_default=False
         ),
     ] = None,
+    device: Annotated[
+        str,
+        typer.Option(
+            "--device", metavar="cpu|gpu", help="Of a volume: where to compute (pictures: --method admm-gpu)."
+        ),
+    ] = "cpu",
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
     allow_saturated: Annotated[
         bool,
@@ -289,6 +295,7 @@ def reconstruct(
             noise=parse_noise(noise),
             scratch=scratch,
             memory_gib=memory_gib,
+            device=device,
             tau=tau,
             iterations=iterations,
             time_s=time_s,
@@ -300,6 +307,7 @@ def reconstruct(
         "--no-background": not background,
         "--scratch": scratch is not None,
         "--memory": memory_gib is not None,
+        "--device": device != "cpu",
     }
     for option, is_given in for_volumes.items():
         if is_given:

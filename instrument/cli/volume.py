@@ -15,6 +15,7 @@ from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_job import DarkChoice
 from instrument.volume_file import write_volume
 from instrument.volume_job import volume_job
+from recon.gpu.namespace import DEVICES
 from recon.noise import NoiseModel
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.volume.channel import PRIORS
@@ -39,6 +40,7 @@ def reconstruct_to_volume(
     noise: NoiseModel | float | None,
     scratch: Path | None,
     memory_gib: float | None,
+    device: str,
     tau: float | None,
     iterations: int | None,
     time_s: float | None,
@@ -47,6 +49,9 @@ def reconstruct_to_volume(
 ) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted."""
     chosen_model = next((m for m in MODELS if m == model), None)
+    chosen_device = next((d for d in DEVICES if d == device), None)
+    if chosen_device is None:
+        raise BenchError(f"--device {device!r} is not known; choose one of {', '.join(DEVICES)}.")
     chosen_prior = next((p for p in PRIORS if p == (prior or "tv")), None)
     if chosen_model is None:
         raise BenchError(f"--model {model!r} is not known; choose one of {', '.join(MODELS)}.")
@@ -78,6 +83,7 @@ def reconstruct_to_volume(
                 noise=job.binned_noise(noise),
                 scratch=scratch,
                 memory_gib=memory_gib,
+                device=chosen_device,
                 iterations=limit,
                 time_s=time_s,
                 tolerance=1e-3 if tolerance is None else tolerance,

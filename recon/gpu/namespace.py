@@ -14,6 +14,7 @@ Namespace = Any
 """A module with NumPy's functions: ``numpy`` or ``cupy``."""
 
 Device = Literal["cpu", "gpu"]
+DEVICES: tuple[Device, ...] = ("cpu", "gpu")
 
 
 def array_namespace(device: Device) -> Namespace:

@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from recon import fft
 from recon.errors import InputError
+from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation, array_namespace
+from recon.gpu.namespace import Device
 from recon.operators import (
     BackgroundRemoval,
     Convolution3D,
@@ -74,7 +76,7 @@ class ChannelProblem:
         Axis weights of TV.
     drop_empty : bool
         With l1: leave out planes that stay empty.
-    memory_gib, scratch : optional
+    memory_gib, scratch, device : optional
         As :func:`recon.reconstruct_volume`.
     """
 
@@ -90,7 +92,14 @@ class ChannelProblem:
         drop_empty: bool = True,
         memory_gib: float | None = None,
         scratch: Path | str | None = None,
+        device: Device = "cpu",
     ) -> None:
+        # Before any work: what is missing for the device is said at once.
+        self._namespace = array_namespace(device)
+        if device != "cpu" and model != "convolution":
+            raise InputError(
+                f"The {model} model runs on the cpu only. Choose the model convolution for the {device}."
+            )
         self.data = scaled.data[channel : channel + 1]
         self.valid = scaled.valid[channel]
         self.prior = prior
@@ -198,6 +207,8 @@ class ChannelProblem:
         weight = 0.0 if self.prior == "nonnegative" else tau * peak
         if isinstance(self.camera, SpatiallyVarying):
             return self._general(self.camera, weight, start), tau
+        if self._namespace is not np:
+            return self._plain(self.camera, weight, start), tau
         if kind == "l1":
             return (
                 DouglasRachford(
@@ -227,6 +238,28 @@ class ChannelProblem:
                 storage=self._storage,
             ),
             tau,
+        )
+
+    def _plain(self, camera: Convolution3D, weight: float, start: Array | None) -> Solver:
+        """Return the solver that runs on the device's arrays."""
+        plain = DepthCamera(
+            self._namespace,
+            camera.channel_spectrum(0),
+            camera.grid_shape,
+            camera.sensor_window,
+            self.valid,
+            self._removal,
+        )
+        start = None if start is None else start[0]
+        if not self.prior.startswith("tv"):
+            return PlainDouglasRachford(plain, self.data[0], weight, initial=start)
+        return PlainTotalVariation(
+            plain,
+            self.data[0],
+            weight,
+            axis_weights=self.weights,
+            isotropic=self.prior == "tv-isotropic",
+            initial=start,
         )
 
     def _peak(self, data: Array) -> float:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from recon.checks import check_psf
 from recon.errors import InputError
+from recon.gpu.namespace import Device
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
 from recon.preparation import Field, channel_noise, data_of, require_same_pixels
@@ -48,6 +49,7 @@ def reconstruct_volume(
     initial: VolumeReconstruction | None = None,
     memory_gib: float | None = None,
     scratch: Path | str | None = None,
+    device: Device = "cpu",
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
 ) -> VolumeReconstruction:
@@ -87,6 +89,9 @@ def reconstruct_volume(
         How much memory may be taken; default what is free.
     scratch : path, optional
         Folder on a fast disk for what does not fit into memory. Without it a volume too large is refused.
+    device : "cpu" or "gpu"
+        Where to compute. The GPU needs CuPy (``pip install "diffuserbench[gpu]"``), about three times the
+        memory that the CPU takes, and the convolution model.
     callback : callable, optional
         ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one, and may be
         called until ``callback`` returns.
@@ -128,6 +133,7 @@ def reconstruct_volume(
             drop_empty=drop_empty,
             memory_gib=memory_gib,
             scratch=scratch,
+            device=device,
         )
         start = None if initial is None else run.start(_channel(initial.volume, channel), window)
         solver, relative = run.solver(tau, start)

@@ -6,6 +6,7 @@ import types
 import numpy as np
 import pytest
 
+import recon
 from recon.errors import InputError, StructureError
 from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation, array_namespace
 from recon.gpu.namespace import require_memory
@@ -168,14 +169,41 @@ def test_on_a_gpu_as_on_the_host():
 
 
 def test_the_gpus_method_makes_the_picture_or_says_what_to_install(monkeypatch, shoot):
-    import recon.gpu
-
     shot = shoot()
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
             recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
-    monkeypatch.setattr(recon.gpu, "array_namespace", lambda _device: np)
+    monkeypatch.setattr("recon.gpu.array_namespace", lambda _device: np)
     plain = recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
     assert plain.image.dtype == np.float32
     assert psnr(plain.image, shot.truth) > 26
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
+    rng = np.random.default_rng(5)
+    psfs = rng.random((3, 1, 16, 18)).astype(np.float32) ** 8
+    calibration = recon.Calibration(
+        psfs, np.stack([0 * np.ones(3), 0 * np.ones(3), np.arange(1.0, 4)], axis=1)
+    )
+    x = np.zeros((1, 3, *Convolution3D(psfs, (16, 18)).grid_shape), np.float32)
+    x[0, 1, 14:18, 15:20] = 5
+    measurement = Convolution3D(psfs, (16, 18)).forward(x)[0] + rng.normal(0, 0.05, (16, 18))
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "cupy", None)
+        with pytest.raises(InputError, match="needs CuPy"):
+            recon.reconstruct_volume(measurement, calibration, prior=prior, device="gpu")
+    options = {"prior": prior, "iterations": 40, "tolerance": 0}
+    host = recon.reconstruct_volume(measurement, calibration, drop_empty=False, **options)
+    # Another module than numpy, with its functions: what a GPU's is to the code.
+    twin = types.ModuleType("twin")
+    twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
+    monkeypatch.setattr("recon.gpu.total_variation.require_memory", lambda *_: None)
+    monkeypatch.setattr("recon.gpu.douglas_rachford.require_memory", lambda *_: None)
+    monkeypatch.setattr("recon.volume.channel.array_namespace", lambda _device: twin)
+    device = recon.reconstruct_volume(measurement, calibration, device="gpu", **options)
+    assert host.volume.max() > 0
+    np.testing.assert_allclose(device.volume, host.volume, atol=2e-3 * host.volume.max())
+    with pytest.raises(InputError, match=r"local model|several places"):
+        recon.reconstruct_volume(measurement, calibration, device="gpu", model="local")
