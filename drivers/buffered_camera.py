@@ -173,11 +173,13 @@ class BufferedCamera(Camera):
         self.close()
         self._lost = None
         self._connect()
+        remembered = dict(self._remembered)  # bringing one back may forget another
         try:
             for name in _ORDER:
-                if name in self._remembered:
-                    self._remembered[name]()
+                if name in remembered:
+                    remembered[name]()
         except BaseException:
+            self._remembered = remembered
             self.close()
             raise
 
@@ -213,6 +215,10 @@ class BufferedCamera(Camera):
     def _remember(self, name: str, again: Callable[[], object]) -> None:
         """Keep how a setting is made again after a reconnection; the latest counts."""
         self._remembered[name] = again
+
+    def _forget(self, name: str) -> None:
+        """Let a setting be as after opening: another one has undone it."""
+        self._remembered.pop(name, None)
 
     # Taking images --------------------------------------------------------------------------------
     @property

@@ -33,7 +33,6 @@ class AravisCamera(AravisImageSettings):
         self._stream: Any = None
         self._woken = threading.Event()
         self._statistics: dict[str, int] = {}
-        self._line_bytes: int | None = None
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:

@@ -212,6 +212,7 @@ class AravisImageSettings(AravisSettings):
                 )
             self._binning = int(made[0])
         self._apply_roi(Roi(0, 0, *self._sensor))
+        self._forget("roi")
         self._remember("binning", lambda: self.set_binning(binning))
         return self._binning
 

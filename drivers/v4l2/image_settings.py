@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from drivers.camera import Roi, TriggerMode
 from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import LimitError
+from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.pixels import prepare
 from drivers.v4l2.formats import V4l2Format
 from drivers.v4l2.geometry import (
@@ -108,9 +108,21 @@ class V4l2ImageSettings(V4l2Settings):
                 f"has no pixel format {pixel_format!r}.",
                 f"It offers {', '.join(self.pixel_formats)}.",
             )
-        roi, whole = self._roi, self._whole
-        self._apply_format(wanted)
-        if roi != whole and self._whole == whole:
+        before, roi, whole = self._format, self._roi, self._whole
+        try:
+            self._apply_format(wanted)
+        except DeviceLostError:
+            raise
+        except (
+            DeviceError
+        ):  # the driver may have another one now, whose bytes must not pass for the old one's
+            self._apply_format(before)
+            if roi != whole:
+                self.set_roi(roi)
+            raise
+        if self._whole != whole:
+            self._forget("roi")
+        elif roi != whole:
             self.set_roi(roi)
         self._remember("pixel_format", lambda: self.set_pixel_format(pixel_format))
         return self._format.name

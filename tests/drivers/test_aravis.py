@@ -102,6 +102,16 @@ def test_pixels_are_those_of_the_region(fake: AravisCamera) -> None:
     assert set(np.unique(steps)) <= {1, -254}
 
 
+def test_a_region_that_binning_ended_does_not_come_back(fake: AravisCamera) -> None:
+    fake.set_roi(Roi(0, 0, 128, 256))
+    fake.set_binning(1)
+    whole = fake.roi
+    assert whole != Roi(0, 0, 128, 256)
+    fake.close()
+    fake.open()
+    assert fake.roi == whole
+
+
 def test_it_is_labelled_simulated_and_found(fake: AravisCamera) -> None:
     assert fake.identity.simulated
     assert (fake.identity.vendor, fake.identity.model) == ("Aravis", "Fake")

@@ -342,6 +342,41 @@ def test_unplugging_ends_a_wait_and_opening_again_restores_the_settings() -> Non
     assert kernel.opened == 0
 
 
+def test_a_region_that_a_new_format_ended_does_not_come_back() -> None:
+    kernel = FakeKernel(formats=("GREY", "Y16 "))
+    kernel.shapes["GREY"] = (24, 40)
+    with camera_on(kernel) as camera:
+        camera.set_roi(Roi(8, 8, 32, 48))
+        camera.set_pixel_format("Mono8")
+        assert camera.roi == Roi(0, 0, 24, 40)
+        kernel.unplugged = True
+        with pytest.raises(DeviceLostError):
+            camera.snap()
+        kernel.unplugged = False
+        camera.open()
+        assert (camera.pixel_format, camera.roi) == ("Mono8", Roi(0, 0, 24, 40))
+        camera.set_roi(Roi(4, 4, 8, 8))
+        kernel.unplugged = True
+        with pytest.raises(DeviceLostError):
+            camera.snap()
+        kernel.unplugged = False
+        for _ in range(2):  # what is restored is remembered further on
+            camera.close()
+            camera.open()
+            assert (camera.pixel_format, camera.roi) == ("Mono8", Roi(4, 4, 8, 8))
+
+
+def test_a_format_that_was_not_taken_leaves_the_one_before() -> None:
+    kernel = FakeKernel(formats=("Y10 ", "GREY", "Y16 "))
+    with camera_on(kernel) as camera:
+        camera.set_roi(Roi(8, 8, 32, 48))
+        kernel.taken_for["GREY"] = "Y10 "
+        with pytest.raises(DeviceError, match="takes Y10 instead of Mono8"):
+            camera.set_pixel_format("Mono8")
+        assert (camera.pixel_format, camera.roi) == ("Mono16", Roi(8, 8, 32, 48))
+        assert camera.snap().image.max() > 1023
+
+
 def test_unplugging_is_noticed_by_settings_too() -> None:
     kernel = FakeKernel()
     camera = camera_on(kernel)

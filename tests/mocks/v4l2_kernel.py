@@ -79,6 +79,10 @@ class FakeKernel:
         self.controls = _controls()
         self.frames_per_s = 200.0
         self.line_padding = 0
+        self.shapes: dict[str, tuple[int, int]] = {}
+        """Largest images of formats that have others than ``shape``."""
+        self.taken_for: dict[str, str] = {}
+        """Formats that the driver offers, but takes another one instead."""
         self.crop_step = 0
         """Steps of the sensor's regions; 0: it cannot crop."""
         self.exposure_step = 1
@@ -191,7 +195,7 @@ class FakeKernel:
 
     def _enum_sizes(self, d: object) -> int:
         index, code = struct.unpack_from("I4s", d, 0)
-        sizes = [(16, 32), self.shape]
+        sizes = [(16, 32), self.shapes.get(code.decode(), self.shape)]
         if code.decode() not in self.formats or index >= len(sizes):
             return errno.EINVAL
         height, width = sizes[index]
@@ -213,7 +217,9 @@ class FakeKernel:
             return errno.EBUSY
         width, height, code = struct.unpack_from("II4s", d, 8)
         self.code = code.decode() if code.decode() in self.formats else self.formats[0]
-        sizes = [(16, 32), self.shape, self.crop[2:]]
+        self.code = self.taken_for.get(self.code, self.code)
+        sizes = [(16, 32), self.shapes.get(self.code, self.shape)]
+        sizes += [self.crop[2:]] if self.crop_step else []
         self.size = min(sizes, key=lambda s: abs(s[0] - height) + abs(s[1] - width))
         self._g_fmt(d)
         return 0
