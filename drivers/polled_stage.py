@@ -50,7 +50,8 @@ class PolledStage(Stage):
 
     What it takes care of: targets are refused whole; STOP overtakes, also a move that is just being sent; a
     blocked axis, one that halts early and a controller that reports a fault end in an error, never in a
-    position taken for the target; a lost connection closes the stage, and ``open`` brings it back.
+    position taken for the target; Ctrl-C stops what it no longer waits for; a lost connection closes the
+    stage, and ``open`` brings it back.
 
     A subclass implements the methods that begin with an underscore. ``_state``, ``_start`` and
     ``_start_homing`` return at once. Faults that ``_state`` reports end moves and refuse new ones, but not
@@ -118,7 +119,9 @@ class PolledStage(Stage):
         """Connect and stop whatever moves; see the interface."""
         if self._identity is not None and self._is_connected:
             return
-        self._disconnect()  # what a lost connection left behind
+        if self._identity is not None:  # of several controllers, those that were not lost may be moving
+            self._halt_what_is_left()
+        self._disconnect()
         try:
             self._identity, self._axes = self._connect()
             self._motion = None
@@ -269,12 +272,24 @@ class PolledStage(Stage):
                 motion.ended = True
                 self._halt_after(error)  # some axes may have begun
                 raise
+            except BaseException as error:  # Ctrl-C
+                self._stop_after(error)
+                raise
         if self._stops != stops:
             self._halt()
             raise self._stopped(motion.homing)
 
     def _follow(self, motion: _Motion, timeout_s: float | None) -> None:
-        """Wait until a motion has ended, and say how."""
+        """Wait until a motion has ended, and say how; Ctrl-C ends it."""
+        try:
+            self._watch(motion, timeout_s)
+        except DeviceError:
+            raise
+        except BaseException as error:  # nothing moves on that nobody waits for
+            self._stop_after(error)
+            raise
+
+    def _watch(self, motion: _Motion, timeout_s: float | None) -> None:
         began_s = moved_s = time.monotonic()
         last: Mapping[str, float] = {}
         seen_moving, rested_s = False, None
@@ -392,6 +407,13 @@ class PolledStage(Stage):
             self._halt()
         except DeviceError as another:
             error.add_note(f"Nor could it be told to stop: {another}")
+
+    def _stop_after(self, error: BaseException) -> None:
+        """Stop, and learn where the axes are; that this fails becomes a note."""
+        try:
+            self.stop()
+        except DeviceError as another:
+            error.add_note(f"Nor could it be stopped: {another}")
 
     def _blocked(self, motion: _Motion) -> DeviceTimeoutError:
         motion.ended = True

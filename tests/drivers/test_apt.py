@@ -358,6 +358,20 @@ def test_closing_stops_the_controllers_that_are_left(
     servo.port.plug_in()
 
 
+def test_opening_in_vain_stops_the_controllers_that_are_left(
+    stage: AptStage, servo: AptController, rack: AptController
+) -> None:
+    stage.move_to({"x_um": 6000.0, "z_um": -8000.0}, wait=False)
+    servo.port.unplug()
+    while stage._is_connected:
+        time.sleep(0.005)
+    with pytest.raises(DeviceError, match="no port"):
+        stage.open()
+    wait_for(lambda: not rack.axes[0].motion.moving)
+    assert rack.axes[0].motion.place < 6_553_600
+    servo.port.plug_in()
+
+
 def test_the_zero_of_an_inertia_drive_is_kept_as_long_as_its_power(inertia: AptController) -> None:
     stage = stage_of(x_um=inertia_axis(inertia, 1))
     with stage:

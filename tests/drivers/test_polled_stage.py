@@ -40,6 +40,7 @@ class ScriptedStage(PolledStage):
         self.ignores_stop = False
         self.stops_lost = 0
         self.as_sent: Callable[[], None] = lambda: None
+        self.as_asked: Callable[[], None] = lambda: None
         self._read_s = time.monotonic()
 
     @property
@@ -62,6 +63,7 @@ class ScriptedStage(PolledStage):
         self.connected = False
 
     def _state(self) -> StageState:
+        self.as_asked()
         if self.fault:
             raise self.fault
         now_s = time.monotonic()
@@ -232,9 +234,32 @@ def test_a_lost_stage_closes_without_a_word_and_opens_again(stage: ScriptedStage
     assert not stage.is_open
     stage.open()
     assert stage.is_open
+    assert stage.halts == 1  # tried, in case that a part of it is left
     stage.connected = False
     stage.close()
-    assert stage.halts == 1  # tried, in case that a part of it is left
+    assert stage.halts == 2
+
+
+@pytest.mark.parametrize("where", ["sending", "waiting"])
+def test_ctrl_c_stops_the_move(stage: ScriptedStage, where: str) -> None:
+    def interrupt() -> None:
+        if where == "sending":
+            stage.targets["x_um"] = 50.0
+            raise KeyboardInterrupt
+        stage.as_asked = raise_once
+
+    def raise_once() -> None:
+        stage.as_asked = lambda: None
+        raise KeyboardInterrupt
+
+    stage.as_sent = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        stage.move_to({"x_um": 50.0, "y_um": 50.0})
+    stage.as_sent = lambda: None
+    assert stage.halts == 1
+    assert not stage.is_moving
+    assert stage.commanded_position() == pytest.approx(stage.position(), abs=1.0)
+    stage.move_to({"x_um": 1.0})
 
 
 def test_opening_stops_what_moves() -> None:
