@@ -19,6 +19,8 @@ from drivers.illuminate.sequencer import Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
 
 _log = logging.getLogger(__name__)
+_OVERTAKE_S = 0.2
+"""What is still busy so long after ``off`` began to send after it was cancelled, and is cancelled again."""
 
 
 class IlluminateOptions(DriverOptions):
@@ -56,6 +58,8 @@ class IlluminateLedArray(LedArray):
         self.link = Link(options.port, self.name, self.reply_s)
         self.commanding = threading.RLock()
         self._darkenings = 0
+        self._confirming = False
+        """Whether ``off`` asks for its confirmation: another ``off`` need not cancel that."""
         self._geometry: Geometry | None = None
         self._pattern = OFF
         self._color: Rgb | None = None
@@ -252,10 +256,17 @@ class IlluminateLedArray(LedArray):
             raise DeviceNotOpenError(self.name)
         self._darkenings += 1
         self.link.darken_at_once()
-        with self.commanding:
+        while not self.commanding.acquire(timeout=_OVERTAKE_S):
+            if not self._confirming:
+                self.link.darken_at_once()
+        try:
+            self._confirming = True
             self._confirm_darkness()
             self._pattern = OFF
             self._color = self._auto_clear = None
+        finally:
+            self._confirming = False
+            self.commanding.release()
 
     def _confirm_darkness(self) -> None:
         while True:

@@ -247,6 +247,35 @@ def test_off_says_when_the_light_may_be_on(
         array.silent = False
 
 
+def test_off_overtakes_a_sequence_that_begins_meanwhile(
+    array: IlluminateEmulator, leds: IlluminateLedArray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leds.sequencer.load([leds.single(k) for k in range(3)])
+    command, darken = leds.link.command, leds.link.darken_at_once
+    about_to_run, overtaken = threading.Event(), threading.Event()
+
+    def late(words: bytes, timeout_s: float | None = None) -> list[bytes]:
+        if words.startswith(b"rseq"):
+            about_to_run.set()
+            assert overtaken.wait(10)
+        return command(words, timeout_s)
+
+    def notice() -> None:
+        darken()
+        overtaken.set()
+
+    monkeypatch.setattr(leds.link, "command", late)
+    monkeypatch.setattr(leds.link, "darken_at_once", notice)
+    thread, outcome = in_background(lambda: leds.sequencer.run(50, 400))  # a minute
+    assert about_to_run.wait(10)
+    stopper, stopped = in_background(leds.off)
+    stopper.join(20)
+    assert stopped == [None]
+    assert not array.lit.any()
+    thread.join(20)
+    assert isinstance(outcome[0], StoppedError)
+
+
 # Sequences and triggers --------------------------------------------------------------------------
 def test_a_sequence_runs_in_the_array(array: IlluminateEmulator, leds: IlluminateLedArray) -> None:
     patterns = [
