@@ -43,6 +43,22 @@ def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Sce
     )
 
 
+def make_slide(options: WorldOptions, preset: Preset, distance_um: float, number: int) -> Scene:
+    """Build a flat slide of beads where the scene is; each ``number`` has its beads at other places."""
+    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
+    sensor_um = preset.sensor.shape[0] * preset.sensor.pitch_um
+    height_um = FIELD_SHARE * sensor_um * z_um / distance_um
+    if options.scene_height_mm is not None:
+        height_um = 1e3 * options.scene_height_mm
+    return bead_volume(
+        options.beads,
+        (height_um, height_um),
+        (z_um, z_um),
+        diameter_um=options.bead_diameter_um,
+        seed=options.seed + 1000 * (number + 1),
+    )
+
+
 def sample_picture() -> npt.NDArray[np.float32]:
     """Load the photograph that ships with matplotlib, ``(600, 512, 3)`` float32 linear brightness, 0 to 1."""
     path = cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)

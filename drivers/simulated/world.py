@@ -14,7 +14,7 @@ from drivers.device import DriverOptions
 from drivers.simulated.clock import Clock
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.presets import PRESETS, Preset
-from drivers.simulated.scene_choice import make_scene
+from drivers.simulated.scene_choice import make_scene, make_slide
 from drivers.simulated.surroundings import Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
@@ -217,6 +217,10 @@ class SimulatedWorld(Surroundings):
             self._scene_number += 1
             for key in [key for key in self._cache if key[0] == "scene"]:
                 del self._cache[key]
+
+    def change_slide(self, number: int) -> None:
+        """Put a slide of beads in front of the camera; each ``number`` has them at other places."""
+        self.set_scene(make_slide(self.options, self.preset, self.distance_um, number))
 
     @property
     def geometry(self) -> Geometry:

@@ -12,7 +12,7 @@ from rich.console import Console
 from calibration_routines import AxialSweep, GridSweep, PointSweep, axial_planes, grid_sweep
 from calibration_routines.angular_response import load_response
 from instrument.bench import Bench
-from instrument.cli import calibrate_angular, calibrate_dpc, calibrate_slm
+from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.sweeping import take_sweep
 from instrument.errors import BenchError
@@ -91,6 +91,7 @@ def calibrate() -> None:
 app.command(epilog=calibrate_slm.EPILOG)(calibrate_slm.slm)
 app.command(epilog=calibrate_angular.EPILOG)(calibrate_angular.angular)
 app.command(epilog=calibrate_dpc.EPILOG)(calibrate_dpc.dpc)
+app.command(epilog=calibrate_beads.EPILOG)(calibrate_beads.beads)
 
 
 @app.command(

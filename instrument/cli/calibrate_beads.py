@@ -1,0 +1,149 @@
+"""``diffuserbench calibrate beads``: PSFs over the field from photographs of bead slides, without a stage."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from calibration_routines.beads import (
+    BeadCalibration,
+    BeadSlides,
+    bench_geometry,
+    calibrate_beads,
+    mean_images,
+    photograph_slides,
+)
+from instrument.calibration_file import save_calibration
+from instrument.cli.app import BenchOption, examples, open_and_say, operator
+from instrument.cli.progress import one_task
+from instrument.errors import BenchError, FileError
+from instrument.images import read_image
+from recon.blind import BlindSettings
+from recon.types import Geometry
+
+EPILOG = examples(
+    "diffuserbench calibrate beads --z 2.5 --binning 4             photographs 9 slides, then solves",
+    "diffuserbench calibrate beads --z 2.5 slide-*.tif --pixel-um 11.6 --distance-mm 3.8 --window 221x221",
+)
+
+
+def beads(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[IMAGE]...", help="Photographs of beads; left out: taken on the bench."),
+    ] = None,
+    z: Annotated[float, typer.Option("--z", metavar="MM", help="Depth of the slide.")] = 2.5,
+    images: Annotated[int, typer.Option("--images", min=2, help="Photographs to take.")] = 9,
+    average: Annotated[int, typer.Option(min=1, help="Frames a photograph.")] = 4,
+    binning: Annotated[int, typer.Option(min=1, help="Software binning, on top of the camera's.")] = 1,
+    psfs: Annotated[str, typer.Option("--psfs", metavar="RxC", help="Rows and columns of PSFs.")] = "5x5",
+    rank: Annotated[int, typer.Option("--rank", min=1, help="Highest rank tried.")] = 6,
+    iterations: Annotated[int, typer.Option("--iterations", "-n", min=1, help="Of each half-step.")] = 100,
+    tau: Annotated[float, typer.Option("--tau", help="Sparsity of the beads, relative.")] = 0.03,
+    reach: Annotated[
+        float, typer.Option("--reach", help="Part of the sensor's field that the PSFs span.")
+    ] = 0.8,
+    window: Annotated[
+        str | None,
+        typer.Option(
+            "--window",
+            metavar="HxW",
+            help="Pixels that hold a PSF. Default: from the aperture.",
+            show_default=False,
+        ),
+    ] = None,
+    dark: Annotated[float, typer.Option("--dark", help="With files: the dark level, counts.")] = 0.0,
+    pixel_um: Annotated[
+        float | None, typer.Option("--pixel-um", help="With files: pixel pitch.", show_default=False)
+    ] = None,
+    distance_mm: Annotated[
+        float | None,
+        typer.Option("--distance-mm", help="With files: from diffuser to sensor.", show_default=False),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FOLDER", help="The calibration.")] = Path(
+        "calibration-beads"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace a calibration that exists.")] = False,
+    bench: BenchOption = None,
+) -> None:
+    """Recover k x k PSFs from a few photographs of some twenty beads at unknown places: no stage is needed.
+
+    Blind deconvolution under a rank constraint that is raised step by step (Kuo 2020, Eqs. 5.11-5.13).
+    Between photographs the slide is moved by any amount: the operator is asked, or the simulated bench does
+    it. Brightness and absolute place of the beads stay unknown: every PSF has unit light, their mean is
+    centred.
+    """
+    if out.exists() and not force:
+        raise FileError(out, "exists already.", "Choose another name, or replace it with --force.")
+    slides = BeadSlides(
+        z_um=1e3 * z,
+        images=images,
+        average=average,
+        binning=binning,
+        window_px=None if window is None else _size(window, "--window"),
+        solver=BlindSettings(
+            grid=_size(psfs, "--psfs"),
+            ranks=tuple(range(1, rank + 1)),
+            iterations=iterations,
+            tau=tau,
+            reach=reach,
+        ),
+    )
+    if files:
+        done = _from_files(files, slides, dark, pixel_um, distance_mm)
+    else:
+        with open_and_say(bench) as opened:
+            geometry = bench_geometry(opened, slides)
+            with one_task("bead slides") as advance:
+                taken = photograph_slides(
+                    opened, slides, ask=operator(), progress=lambda _what, share: advance(share, 1.0)
+                )
+            facts = {"bench": opened.label, "simulated": bool(opened.simulated_kinds)}
+        done = _solved(taken, slides, geometry, facts)
+    path = save_calibration(done.calibration, out, overwrite=force)
+    quality = done.calibration.quality
+    if done.calibration.provenance.get("simulated"):
+        typer.echo("SIMULATED: the photographs come from the simulated bench")
+    typer.echo(f"Beads found: {', '.join(map(str, quality['beads_found']))}")
+    misfits = ", ".join(f"{m:.3f}" for m in done.result.misfits)
+    typer.echo(f"Misfit by rank: {misfits}; kept rank {done.result.rank} ({done.result.stopped})")
+    typer.echo(f"Wrote {path}: {len(done.result.psfs)} PSFs at z = {z:g} mm")
+
+
+def _from_files(
+    files: list[Path], slides: BeadSlides, dark: float, pixel_um: float | None, distance_mm: float | None
+) -> BeadCalibration:
+    read = [read_image(path) for path in files]
+    taken = mean_images([image.pixels for image in read]) - np.float32(dark)
+    if slides.binning > 1:
+        raise BenchError("--binning is for photographs taken on the bench: bin the files beforehand.")
+    return _solved(
+        taken,
+        replace(slides, images=max(len(files), 2)),
+        Geometry(pixel_pitch_um=pixel_um, diffuser_distance_mm=distance_mm),
+        {"files": [str(path) for path in files], "simulated": any(i.is_simulated for i in read)},
+    )
+
+
+def _solved(
+    taken: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
+    slides: BeadSlides,
+    geometry: Geometry,
+    facts: dict[str, object],
+) -> BeadCalibration:
+    with one_task("blind deconvolution") as advance:
+        return calibrate_beads(
+            taken, slides, geometry, provenance=facts, progress=lambda _what, share: advance(share, 1.0)
+        )
+
+
+def _size(text: str, option: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if match is None:
+        raise BenchError(f"{option} {text!r} is not understood; write rows x columns, as 5x5.")
+    return int(match[1]), int(match[2])

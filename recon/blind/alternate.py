@@ -1,0 +1,270 @@
+"""Blind deconvolution of bead images: beads and PSFs in turn, the rank raised (Kuo 2020, Eqs. 5.11-5.13)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.blind.psf_step import BeadMixer, solve_psfs
+from recon.blind.start import first_psf, offset_of
+from recon.errors import InputError
+from recon.operators.interpolation import interpolation_weights
+from recon.operators.local_convolution import FieldOfPsfs, field_of, local_convolution
+from recon.priors import L1, NonNegativity
+from recon.registration import shifted
+from recon.solvers import Fista, StoppingRules
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+Progress = Callable[[str, float], object]
+
+BLOB_PX = 2
+"""How far around its brightest pixel a bead's light may lie."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSettings:
+    """How the bead images are solved.
+
+    Attributes
+    ----------
+    grid : (int, int)
+        Rows and columns of PSFs over the field.
+    ranks : sequence of int
+        The rank of each round, rising (Kuo 2020: raised after each alternating solve).
+    iterations : int
+        Of each half-step (Kuo 2020: 100).
+    tau : float
+        Weight of the beads' sparsity relative to ``max |A^H b|`` (Eq. 5.12).
+    reach : float
+        Part of the sensor that the outermost PSFs stand for: 0.8 puts them at 80 % of the way to its edge.
+    improvement : float
+        Relative decrease of the misfit below which a further round is not worth it.
+    """
+
+    grid: tuple[int, int] = (5, 5)
+    ranks: Sequence[int] = (1, 2, 3, 4, 5, 6)
+    iterations: int = 100
+    tau: float = 0.03
+    reach: float = 0.8
+    improvement: float = 0.02
+
+
+@dataclass(frozen=True)
+class BlindResult:
+    """PSFs over the field, found without knowing where any bead was.
+
+    What the images cannot tell is fixed by convention: each PSF's light sums to 1 (a bead's brightness and
+    the response at its place come as a product); the centre of light of their mean is the centre pixel (all
+    beads could be shifted one way and the PSF the other); and a bead is a point (all beads could be blurred
+    and the PSF be sharper).
+
+    Attributes
+    ----------
+    psfs : ndarray, float32, (n_psfs, psf height, psf width)
+        Registered to one another. Their noise is on both sides of zero: clipped, it would sum to a haze.
+    points : ndarray, (n_psfs, 2)
+        ``(row, column)`` from the axis in object pixels that each PSF stands for.
+    beads : ndarray, float32, (n_images, field height, field width)
+    rank : int
+        Of the last round that was kept.
+    misfits : tuple of float
+        ``||f(H, y) - b|| / ||b||`` after each round.
+    stopped : str
+        Why it ended.
+    sensor_shape : (int, int)
+    """
+
+    psfs: Floats
+    points: npt.NDArray[np.float64]
+    beads: Floats
+    rank: int
+    misfits: tuple[float, ...]
+    stopped: str
+    sensor_shape: tuple[int, int]
+
+    def on_sensor(self) -> Floats:
+        """Return each PSF where a source at its point casts it: (n_psfs, sensor height, sensor width)."""
+        height, width = self.sensor_shape
+        p_height, p_width = self.psfs.shape[1:]
+        result = np.zeros((len(self.psfs), height, width), np.float32)
+        for psf, image, (row, column) in zip(self.psfs, result, self.points, strict=True):
+            top = height // 2 - p_height // 2 + round(float(row))
+            left = width // 2 - p_width // 2 + round(float(column))
+            rows = slice(max(top, 0), min(top + p_height, height))
+            columns = slice(max(left, 0), min(left + p_width, width))
+            if rows.stop > rows.start and columns.stop > columns.start:
+                image[rows, columns] = psf[
+                    rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+                ]
+        return result
+
+
+def calibrate_from_beads(
+    images: Array,
+    psf_shape: tuple[int, int],
+    settings: BlindSettings | None = None,
+    *,
+    progress: Progress | None = None,
+) -> BlindResult:
+    """Recover PSFs over the field and the beads from images of beads at unknown places.
+
+    Parameters
+    ----------
+    images : ndarray, (n_images, height, width)
+        Background removed. Nine images of some twenty beads each were enough for the dissertation.
+    psf_shape : (int, int)
+        Window that holds the whole pattern: the aperture's shadow and what the diffuser bends beyond it.
+    settings : BlindSettings, optional
+    progress : callable, optional
+        Called with what is being done and the share done.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than two images, one is empty, or the window does not fit the sensor.
+    """
+    settings = settings or BlindSettings()
+    # Negative noise is kept: clipped, it would be a haze that PSFs and beads had to explain.
+    data = np.asarray(images, np.float32)
+    _check(data, psf_shape, settings)
+    tell = progress or (lambda _what, _share: None)
+    scale = np.float32(data.max())
+    data = np.asarray(data / scale, np.float32)
+    sensor = (data.shape[1], data.shape[2])
+    points = _points(sensor, settings)
+    field_shape, centre = field_of(sensor, psf_shape)
+    rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
+    weights = interpolation_weights(points, np.eye(len(points)), rows, columns).astype(np.float32)
+
+    tell("first PSF", 0.0)
+    psfs: Floats = np.repeat(first_psf(np.maximum(data, 0), psf_shape)[None], len(points), axis=0)
+    beads = np.zeros((len(data), *field_shape), np.float32)
+    norm = float(np.linalg.norm(data))
+    misfits: list[float] = []
+    best: tuple[Floats, Floats, int] | None = None
+    stopped = "the last rank was reached"
+    ranks = [r for r in settings.ranks if r <= len(points)]
+    for number, rank in enumerate(ranks):
+        share = number / len(ranks)
+        tell(f"rank {rank}: beads", share)
+        beads = _solve_beads(data, np.maximum(psfs, 0), points, beads, settings)
+        if not beads.any():
+            raise InputError(
+                "No bead was found: the first PSF explains nothing. Are the images of the same optics, with "
+                "several beads each and their background removed?"
+            )
+        tell(f"rank {rank}: PSFs", share + 0.5 / len(ranks))
+        mixer = BeadMixer(weights, beads, psf_shape, sensor)
+        psfs, half = solve_psfs(mixer, data, psfs, rank, settings.iterations)
+        psfs, beads = _by_convention(psfs, beads)
+        misfits.append(float(np.sqrt(2 * half)) / norm)
+        if best is not None and misfits[-1] > (1 - settings.improvement) * misfits[-2]:
+            stopped = f"rank {rank} fits only {1 - misfits[-1] / misfits[-2]:.1%} better"
+            if misfits[-1] < misfits[-2]:
+                best = (psfs, beads, rank)
+            break
+        best = (psfs, beads, rank)
+    assert best is not None
+    psfs, beads, rank = best
+    psfs = _seen_by_points(psfs, beads)
+    light = psfs.sum(axis=(1, 2), keepdims=True)
+    return BlindResult(
+        psfs=np.asarray(psfs / np.where(light > 0, light, 1), np.float32),
+        points=points,
+        beads=beads * scale,
+        rank=rank,
+        misfits=tuple(misfits),
+        stopped=stopped,
+        sensor_shape=sensor,
+    )
+
+
+def _check(data: Floats, psf_shape: tuple[int, int], settings: BlindSettings) -> None:
+    if data.ndim != 3 or len(data) < 2:
+        raise InputError(f"Two or more images (n, height, width) of beads are needed, not {data.shape}.")
+    if not np.isfinite(data).all():
+        raise InputError("An image of beads holds values that are not finite numbers.")
+    if not (data.max(axis=(1, 2)) > 0).all():
+        raise InputError("An image of beads holds no light.")
+    if any(p < 3 or p > n for p, n in zip(psf_shape, data.shape[1:], strict=True)):
+        raise InputError(
+            f"The PSF's window {psf_shape} must lie within the sensor {data.shape[1:]}: bin less, or use a "
+            "smaller aperture or a farther slide."
+        )
+    ranks = list(settings.ranks)
+    if not ranks or ranks != sorted(ranks) or ranks[0] < 1:
+        raise InputError(f"Ranks rise from 1 or more, not {ranks}.")
+    if min(settings.grid) < 1 or settings.iterations < 1 or not 0 < settings.tau < 1:
+        raise InputError("The grid and the iterations are at least 1, tau lies between 0 and 1.")
+
+
+def _points(sensor: tuple[int, int], settings: BlindSettings) -> npt.NDArray[np.float64]:
+    axes = [
+        np.linspace(-0.5, 0.5, k) * settings.reach * n if k > 1 else np.zeros(1)
+        for k, n in zip(settings.grid, sensor, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2).round()
+
+
+def _solve_beads(data: Floats, psfs: Floats, points: Array, start: Floats, settings: BlindSettings) -> Floats:
+    """Find the beads of each image with the PSFs fixed (Eq. 5.12): FISTA with a rigorous step."""
+    sensor = (data.shape[1], data.shape[2])
+    operator = local_convolution([FieldOfPsfs(psfs[:, None], points)], sensor)
+    found = np.empty_like(start)
+    for image, beads, out in zip(data, start, found, strict=True):
+        target = image[None]
+        weight = settings.tau * float(np.abs(operator.adjoint(target)).max())
+        solver = Fista(operator, target, L1(weight) + NonNegativity(), initial=beads[None, None])
+        outcome = solver.run(StoppingRules(iterations=settings.iterations, tolerance=1e-3))
+        out[...] = outcome.solution[0, 0]
+    return found
+
+
+def _seen_by_points(psfs: Floats, beads: Floats) -> Floats:
+    """Convolve PSFs with the mean shape of the beads found, so that a point casts what a bead did.
+
+    A bead between pixels is found as a small blob, and the PSF that fits it comes out sharper by as much.
+    Each blob is centred by its own centroid, between pixels, before the mean is taken.
+    """
+    height, width = psfs.shape[1:]
+    f_y, f_x = np.fft.fftfreq(height), np.fft.rfftfreq(width)
+    offsets = np.arange(-BLOB_PX, BLOB_PX + 1)
+    shape = np.zeros((height, len(f_x)), np.complex128)
+    total = 0.0
+    for image in beads:
+        for row, column in _peaks(image):
+            blob = image[row - BLOB_PX : row + BLOB_PX + 1, column - BLOB_PX : column + BLOB_PX + 1]
+            light = float(blob.sum())
+            middle = [float(blob.sum(axis=1 - axis) @ offsets) / light for axis in (0, 1)]
+            e_y = np.exp(-2j * np.pi * np.outer(f_y, offsets - middle[0]))
+            e_x = np.exp(-2j * np.pi * np.outer(offsets - middle[1], f_x))
+            # Bright beads tell the PSF, by the square of their light.
+            shape += light * (e_y @ blob @ e_x)
+            total += light**2
+    if total == 0:
+        return psfs
+    spectra = np.fft.rfft2(psfs) * (shape / total)
+    return np.asarray(np.fft.irfft2(spectra, s=(height, width)), np.float32)
+
+
+def _peaks(image: Floats) -> list[tuple[int, int]]:
+    """Return pixels brighter than their neighbours and a tenth of the brightest, away from the border."""
+    from scipy import ndimage
+
+    found = (image == ndimage.maximum_filter(image, 2 * BLOB_PX + 1)) & (image > 0.1 * image.max())
+    inside = np.zeros_like(found)
+    inside[BLOB_PX:-BLOB_PX, BLOB_PX:-BLOB_PX] = found[BLOB_PX:-BLOB_PX, BLOB_PX:-BLOB_PX]
+    return [(int(row), int(column)) for row, column in np.argwhere(inside)]
+
+
+def _by_convention(psfs: Floats, beads: Floats) -> tuple[Floats, Floats]:
+    """Centre the mean PSF and give it unit light; the beads are moved and scaled the other way."""
+    rows, columns = offset_of(psfs)
+    light = np.float32(psfs.sum() / len(psfs))
+    centred = np.asarray(shifted(psfs, -rows, -columns) / light, np.float32)
+    return centred, np.asarray(shifted(beads, rows, columns) * light, np.float32)

@@ -1,0 +1,129 @@
+"""The half-step for the PSFs, given the beads: least squares under a rank constraint (Kuo 2020, Eq. 5.13)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon import fft
+from recon.operators.base import Array
+from recon.operators.local_convolution import field_of
+
+Floats = npt.NDArray[np.float32]
+
+
+class BeadMixer:
+    """The map from PSFs to images with the beads fixed: ``b_i = C sum_j h_j * (M_j y_i)`` (Eq. 5.11).
+
+    Parameters
+    ----------
+    weights : ndarray, float32, (n_psfs, field height, field width)
+        The masks ``M_j``: interpolation weights, not negative.
+    beads : ndarray, float32, (n_images, field height, field width)
+        Not negative.
+    psf_shape, sensor_shape : (int, int)
+
+    Attributes
+    ----------
+    lipschitz : float
+        Bound of the squared norm: ``||S||_2^2`` with ``S_ij`` the sum of ``M_j y_i``. At each frequency the
+        map is the matrix of the transforms of ``M_j y_i``, whose entries are at most those at frequency zero
+        in absolute value because nothing is negative; the spectral norm of a matrix is at most that of a
+        non-negative one that dominates it, and cropping only lessens it.
+    """
+
+    def __init__(
+        self,
+        weights: Array,
+        beads: Array,
+        psf_shape: tuple[int, int],
+        sensor_shape: tuple[int, int],
+    ) -> None:
+        self.psf_shape, self.sensor_shape = psf_shape, sensor_shape
+        field_shape, _ = field_of(sensor_shape, psf_shape)
+        self._grid = fft.fast_shape(field_shape)
+        self._spectra = np.empty((len(beads), len(weights), *fft.spectrum_shape(self._grid)), np.complex64)
+        padded = np.zeros((len(weights), *self._grid), np.float32)
+        sums = np.empty((len(beads), len(weights)))
+        for i, image in enumerate(beads):
+            np.multiply(weights, image, out=padded[:, : field_shape[0], : field_shape[1]])
+            sums[i] = padded.sum(axis=(1, 2), dtype=np.float64)
+            fft.rfft(padded, out=self._spectra[i])
+        self.lipschitz = float(np.linalg.norm(sums, 2) ** 2)
+
+    def forward(self, psfs: Array) -> Floats:
+        """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
+        padded = np.zeros((len(psfs), *self._grid), np.float32)
+        padded[:, : self.psf_shape[0], : self.psf_shape[1]] = psfs
+        spectra = fft.rfft(padded)
+        seen = np.stack([np.einsum("jyx,jyx->yx", row, spectra) for row in self._spectra])
+        images = fft.irfft(seen, self._grid[1])
+        return np.ascontiguousarray(images[self._sensor])
+
+    def adjoint(self, images: Array) -> Floats:
+        """Return the exact transpose."""
+        padded = np.zeros((len(images), *self._grid), np.float32)
+        padded[self._sensor] = images
+        spectra = np.conj(fft.rfft(padded))
+        total = np.zeros(self._spectra.shape[1:], np.complex64)
+        for row, image in zip(self._spectra, spectra, strict=True):
+            total += row * image
+        # corr(y, r) = irfft(conj(Y) R) = irfft(conj(Y conj(R)))
+        back = fft.irfft(np.conj(total), self._grid[1])
+        return np.ascontiguousarray(back[:, : self.psf_shape[0], : self.psf_shape[1]])
+
+    @property
+    def _sensor(self) -> tuple[slice, slice, slice]:
+        (top, left), (height, width) = ((n - 1 for n in self.psf_shape), self.sensor_shape)
+        return slice(None), slice(top, top + height), slice(left, left + width)
+
+
+def limit_rank(psfs: Array, rank: int) -> Array:
+    """Return the nearest PSFs (n_psfs, height, width) that span at most ``rank`` dimensions."""
+    if rank >= len(psfs):
+        return psfs
+    columns = psfs.reshape(len(psfs), -1)
+    _, vectors = np.linalg.eigh(columns.astype(np.float64) @ columns.T.astype(np.float64))
+    kept = vectors[:, -rank:]
+    projection = (kept @ kept.T).astype(psfs.dtype)
+    limited: Array = (projection @ columns).reshape(psfs.shape)
+    return limited
+
+
+def solve_psfs(
+    mixer: BeadMixer, images: Array, start: Array, rank: int, iterations: int
+) -> tuple[Floats, float]:
+    """Fit PSFs of limited rank to images: FISTA whose prox is the projection on the rank (Eq. 5.13).
+
+    The set is not convex, so momentum is dropped whenever the misfit grows; the step ``1 / lipschitz`` then
+    makes every step a descent.
+
+    Returns
+    -------
+    ndarray, float32, (n_psfs, psf height, psf width)
+    float
+        ``||f(H, y) - b||^2 / 2``.
+    """
+    step = np.float32(1 / mixer.lipschitz)
+    x = limit_rank(np.asarray(start, np.float32), rank)
+    seen = mixer.forward(x)
+    misfit = _half_square(seen - images)
+    y, seen_y, t = x, seen, 1.0
+    for _ in range(iterations):
+        new = limit_rank(y - step * mixer.adjoint(seen_y - images), rank)
+        seen_new = mixer.forward(new)
+        misfit_new = _half_square(seen_new - images)
+        if misfit_new > misfit and t > 1:
+            y, seen_y, t = x, seen, 1.0
+            continue
+        t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
+        beta = np.float32((t - 1) / t_next)
+        y, seen_y = new + beta * (new - x), seen_new + beta * (seen_new - seen)
+        x, seen, misfit, t = new, seen_new, misfit_new, t_next
+    return x, misfit
+
+
+def _half_square(array: npt.NDArray[Any]) -> float:
+    return 0.5 * float(np.vdot(array, array).real)
