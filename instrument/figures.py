@@ -115,8 +115,10 @@ def summary_figure(summary: Summary) -> Figure:
 def save_figure(figure: Figure, path: Path | str) -> Path:
     """Write a figure as PNG (or what the name's ending says) and return its path."""
     target = Path(path)
-    is_png = target.suffix.lower() == ".png"
-    figure.savefig(target, pil_kwargs={"optimize": True} if is_png else None)
+    if target.suffix.lower() == ".png":
+        figure.savefig(target, pil_kwargs={"optimize": True})
+    else:  # other writers do not know the option, not even as None
+        figure.savefig(target)
     return target
 
 

@@ -50,6 +50,15 @@ def analyze(
             show_default=False,
         ),
     ] = None,
+    response: Annotated[
+        Path | None,
+        typer.Option(
+            "--response",
+            metavar="FILE",
+            help="Instead of --cutoff-deg: angular_response.json of calibrate angular.",
+            show_default=False,
+        ),
+    ] = None,
     fall_off_deg: Annotated[
         float | None,
         typer.Option(
@@ -85,6 +94,7 @@ def analyze(
     """
     import json
 
+    from calibration_routines.angular_response import load_response
     from instrument.analysis_figure import draw_analysis, facts
     from instrument.atomic import whole_file, write_text
     from instrument.calibration_file import load_calibration
@@ -100,12 +110,18 @@ def analyze(
             raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
     if z_mm is not None and not z_mm > 0:
         raise BenchError(f"--z-mm {z_mm:g}: a depth is above 0 mm, from the diffuser.")
+    if response is not None and (cutoff_deg, fall_off_deg) != (None, None):
+        raise BenchError("--response says what --cutoff-deg and --fall-off-deg would: give one of them.")
+    measured_response = None if response is None else load_response(response)
     folder = find_calibration(calibration)
     measured = load_calibration(folder)
     settings = AnalysisSettings(
         z_um=None if z_mm is None else 1e3 * z_mm,
         deflection_deg=deflection_deg,
-        cutoff_deg=_cutoff(cutoff_deg),
+        cutoff_deg=_cutoff(cutoff_deg)
+        if measured_response is None
+        else (measured_response.along_y.cut_off_deg, measured_response.along_x.cut_off_deg),
+        fall_off=None if measured_response is None else measured_response.fall_off(),
         fall_off_deg=fall_off_deg,
         lenslet_um=lenslet_um,
         wavelength_nm=wavelength_nm,

@@ -37,6 +37,7 @@ from recon.analysis.sampling import (
     voxel_grid,
 )
 from recon.errors import InputError
+from recon.optics.fall_off import FallOff
 from recon.refocus import central_psfs, refocus
 from recon.types import Calibration
 from recon.volume.model import choose_model, sort_by_depth
@@ -50,6 +51,8 @@ CONDITION_COUNTS: Mapping[Direction, tuple[int, ...]] = {"x": (2, 4, 9, 16), "z"
 SEPARATIONS = (1, 2, 3, 4, 5, 6, 8)
 CONDITION_PLANES = 13
 """Planes for groups in depth: four sources four planes apart."""
+STEEPEST = math.atan(40.0)
+"""Angle at which a response is taken to have ended."""
 MARGIN_PX = 24
 """Dark rim kept around the light of cropped PSFs, for shifts."""
 
@@ -65,10 +68,12 @@ class AnalysisSettings:
     deflection_deg : float
         Largest deflection by the diffuser, ``beta`` (dissertation: 0.5 degrees).
     cutoff_deg : (float, float) or None
-        Angle at which the sensor's response is down to 20 %, along y and x.
+        Angle at which the sensor's response is down to 20 %, along y and x; None where not known.
+    fall_off : callable, optional
+        The sensor's response as a function of the tangents along y and x, for the lateral sampling.
     fall_off_deg : float or None
-        Standard deviation of the sensor's angular response, as a Gaussian, for the lateral sampling; default
-        from ``cutoff_deg`` where known.
+        Standard deviation of the sensor's angular response, as a Gaussian, for the lateral sampling where
+        ``fall_off`` is not given; default from ``cutoff_deg`` where known.
     lenslet_um, wavelength_nm : float or None
         Of a microlens diffuser, for the axial sampling of Eq. 5.10.
     points : bool
@@ -79,7 +84,8 @@ class AnalysisSettings:
 
     z_um: float | None = None
     deflection_deg: float = 0.5
-    cutoff_deg: tuple[float, float] | None = None
+    cutoff_deg: tuple[float | None, float | None] | None = None
+    fall_off: FallOff | None = None
     fall_off_deg: float | None = None
     lenslet_um: float | None = None
     wavelength_nm: float | None = None
@@ -135,6 +141,7 @@ class Analysis:
         record = asdict(self)
         for name in ("psf", "autocorrelation"):
             del record[name]
+        del record["settings"]["fall_off"]
         result: dict[str, Any] = _plain(record)
         result["resolution"] = {
             "angle_deg": self.lateral.angle_deg(self.pitch_um, self.distance_um),
@@ -186,7 +193,7 @@ def analyse(
 
     support = support_extent_px(psf)
     cutoff = settings.cutoff_deg or (None, None)
-    if settings.cutoff_deg is None:
+    if None in cutoff:
         notes.append("The sensor's angular cut-off is not known: the field of view is the geometric one.")
     # The support at infinity is the aperture's, which is what Eq. 3.12 wants; a near source's is enlarged.
     far_support = [s / (1 + distance_um / depths[nearest]) for s in support]
@@ -319,9 +326,20 @@ def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]
 
 
 def _lateral_spacing(settings: AnalysisSettings, nearest_um: float, notes: list[str]) -> float | None:
+    if (fall_off := settings.fall_off) is not None:
+
+        def along_y(angles: Floats) -> Floats:
+            return fall_off(np.tan(np.minimum(angles, STEEPEST)), np.zeros_like(angles))
+
+        def along_x(angles: Floats) -> Floats:
+            return fall_off(np.zeros_like(angles), np.tan(np.minimum(angles, STEEPEST)))
+
+        return min(lateral_spacing_um(f, nearest_um) for f in (along_y, along_x))
     sigma = settings.fall_off_deg
     if sigma is None and settings.cutoff_deg is not None:
-        sigma = min(settings.cutoff_deg) / math.sqrt(2 * math.log(5))  # a Gaussian that falls to 20 % there
+        known = [angle for angle in settings.cutoff_deg if angle is not None]
+        if known:
+            sigma = min(known) / math.sqrt(2 * math.log(5))  # a Gaussian that falls to 20 % there
     if sigma is None:
         notes.append("The sensor's angular fall-off is not known: no lateral calibration spacing follows.")
         return None

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration_routines.angular_response import AngularResponse, Curve, save_response
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from instrument.calibration_file import save_calibration
 from instrument.cli import main
+from recon.analysis.sampling import gaussian_response, lateral_spacing_um
 from recon.types import Calibration, Geometry
 
 
@@ -50,6 +52,24 @@ def test_a_page_and_its_figures(
     assert "SIMULATED" in said.out
     assert "hyperfocal distance" in said.out
     assert "One place of the field" in said.err
+
+
+def test_a_measured_angular_response_limits_the_view(calibration: Path, tmp_path: Path) -> None:
+    angles = tuple(float(a) for a in range(-20, 21, 2))
+    narrow, wide = (
+        Curve(angles, tuple(float(np.exp(-0.5 * (a / sigma) ** 2)) for a in angles), (1.0,) * len(angles))
+        for sigma in (6.0, 9.0)
+    )
+    file = save_response(AngularResponse(narrow, wide), tmp_path / "response.json")
+    out = tmp_path / "page.pdf"
+    words = ["analyze", str(calibration), "--no-points", "--response", str(file), "--out", str(out)]
+    assert main(words) == 0
+    found = json.loads((tmp_path / "page.json").read_text())["analysis"]
+    assert found["view_x"]["half_deg"] == pytest.approx(0.5 + 6 * np.sqrt(2 * np.log(5)), abs=0.2)
+    assert found["lateral_spacing_um"] == pytest.approx(
+        lateral_spacing_um(gaussian_response(6.0), 25e3), rel=0.1
+    )
+    assert main([*words, "--force", "--cutoff-deg", "30"]) == 2
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,10 @@ BENCH = """
 data_folder = "runs"
 [camera]
 driver = "simulated"
+[led_array]
+driver = "simulated"
+[scene]
+control = "simulated"
 [simulated]
 preset = "microscope"
 scene = "beads"
