@@ -127,7 +127,7 @@ def analyse_sweep(
     """
     psfs: list[Float] = []
     quality: list[PsfQuality] = []
-    backgrounds: list[Float] = []
+    removed_in_all: Float | None = None
     reference_ms = 0.0
     for plane in planes:
         reference_ms = reference_ms or plane.exposure_ms
@@ -151,14 +151,15 @@ def analyse_sweep(
         quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
         psfs.append(cleaned * scale)
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
-        backgrounds.append(block_mean(removed, binning) + stray * scale)
-    if not psfs:
+        background = block_mean(removed, binning) + stray * scale
+        removed_in_all = background if removed_in_all is None else removed_in_all + background
+    if removed_in_all is None:
         raise ValueError("A sweep needs at least one point.")
     stacked = np.stack(psfs)
     judged, stages = judge_points(quality, stacked, binned(geometry, binning))
     return SweepAnalysis(
         psfs=stacked,
-        background=np.mean(backgrounds, axis=0, dtype=np.float32),
+        background=removed_in_all / np.float32(len(psfs)),
         quality=judged,
         reference_exposure_ms=reference_ms,
         stages=stages,

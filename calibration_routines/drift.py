@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration_routines.background import block_mean
 from recon.registration import register
 
 MAX_BRIGHTNESS_DRIFT = 0.03
 """Relative change of the source's light that is called a drift."""
 MAX_PLACE_DRIFT_PX = 0.5
 """Shift of the reference's pattern that is called a drift, pixels."""
+LARGEST_PX = 500_000
+"""Larger images are binned before patterns are registered: a twentieth of a pixel is told still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,8 @@ def judge_drift(
         How many points the sweep has.
     """
     first = visits[0]
+    factor = max(1, int(np.ceil(np.sqrt(first.size / LARGEST_PX))))
+    pattern = block_mean(first, factor)
     light = float(first.sum(dtype=np.float64))
     brightness, shifts = [1.0], [0.0]
     for visit in visits[1:]:
@@ -65,8 +70,9 @@ def judge_drift(
         if not light > 0 or not np.ptp(visit) > 0:
             shifts.append(float("nan"))
             continue
-        found = register(visit, first)
-        shifts.append(float(np.hypot(found.rows, found.columns)) if found.reliable else float("inf"))
+        found = register(block_mean(visit, factor), pattern)
+        shift = factor * float(np.hypot(found.rows, found.columns))
+        shifts.append(shift if found.reliable else float("inf"))
     findings = []
     for k in range(1, len(visits)):
         where = f"between points {before_point[k - 1] + 1} and {min(before_point[k], last_point)}"

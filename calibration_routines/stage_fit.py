@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from calibration_routines.background import block_mean
+from calibration_routines.drift import LARGEST_PX
 from calibration_routines.psf_quality import MAX_STEP_PX, PsfQuality, judge_sweep, with_finding
 from recon.registration import Registration, register
 from recon.types import Geometry
@@ -28,7 +29,6 @@ MAX_GAIN_ERROR = 0.03
 MAX_ROTATION_MRAD = 35.0
 """Rotation of the stage's axes against the sensor's that is called wrong (2 degrees)."""
 _OUTLIER_PX = 0.3  # residuals beyond this count less and less in the fit
-_LARGEST_PX = 500_000  # larger images are binned for the registration: a twentieth of a pixel still
 _LEAST_POINTS = 4  # fewer determine the map exactly: nothing is left to judge
 _NEAR_PX, _NEAR_PART = 40.0, 0.2  # where a pattern is looked for: pixels, and part of its shift
 _FAR_PROMINENCE = 3.0  # a pattern found elsewhere must stand out more: few spots resemble many places
@@ -152,7 +152,7 @@ def _judge_depth(
     """Register a depth's PSFs to the central one; puts steps, similarities and findings into ``judged``."""
     here = judged[centre]
     nominal = _nominal(geometry, here.z_um)
-    factor = max(1, int(np.ceil(np.sqrt(psfs[0, 0].size / _LARGEST_PX))))
+    factor = max(1, int(np.ceil(np.sqrt(psfs[0, 0].size / LARGEST_PX))))
     reference = block_mean(psfs[centre].mean(axis=0), factor)
     places, shifts, seen = [], [], []
     for index in others:

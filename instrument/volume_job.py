@@ -11,6 +11,7 @@ from instrument.erasures import Choice
 from instrument.images import read_stack
 from instrument.preparation import Crop, darkest_block
 from instrument.reconstruction_job import DarkChoice, Job, job_from_calibration, job_with
+from instrument.store.layout import STATE
 from recon.types import Calibration
 
 
@@ -28,9 +29,9 @@ def volume_job(
     Parameters
     ----------
     psfs : Path
-        A calibration folder, a multi-page TIFF or array, or a folder with one image file a depth, in the
-        order of their names (the photograph itself may lie there too). Integer PSFs lose their darkest
-        level; float ones are taken to be free of any offset.
+        A calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one image
+        file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs lose
+        their darkest level; float ones are taken to be free of any offset.
     image, dark, crop, binning, erasures
         As :func:`instrument.reconstruction_job.job_from_calibration`.
 
@@ -38,7 +39,7 @@ def volume_job(
     ------
     FileError, BenchError
     """
-    if psfs.is_dir() and is_calibration(psfs):
+    if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
         return job_from_calibration(psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
     stack = read_stack(psfs, leave_out=image).pixels
     pixels = stack.astype(np.float32)

@@ -14,9 +14,11 @@ from calibration_routines import (
     PointSweep,
     axial_planes,
     calibrate_sweep,
+    expose_scene,
     finish_sweep,
     grid_sweep,
     lateral_spacing,
+    photograph,
 )
 from calibration_routines.drift import judge_drift
 from calibration_routines.feature_size import feature_size_px, optical_binning
@@ -29,8 +31,11 @@ from instrument.errors import BenchError
 from instrument.resume import prepare_resume
 from instrument.runner import RunStatus
 from instrument.store import RunCondition
+from recon import metrics
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
 from recon.types import Geometry
+from recon.volume.model import ModelName
+from recon.volume.reconstruct import reconstruct_volume
 
 TINY = """
 [camera]
@@ -52,6 +57,7 @@ fall_off_sigma_deg = 12
 """
 Z_UM = 100e3
 POINTS = tuple((x, y, Z_UM) for y in (-10e3, 0.0, 10e3) for x in (-15e3, 0.0, 15e3))
+MODELS_COMPARED: tuple[ModelName, ...] = ("convolution", "local")
 SWEEP = PointSweep(POINTS, kind="lateral", average=2, dark_frames=2, reference_every=4)
 
 
@@ -89,6 +95,32 @@ def test_a_lateral_sweep_is_good_and_agrees_with_the_stage(bench: Bench, tmp_pat
     # not normalised: the sensor's response dims what comes from the side
     light = loaded.psfs.sum(axis=(1, 2, 3))
     assert light[3] < 0.9 * light[4]
+
+
+@pytest.mark.slow
+def test_a_close_scene_needs_the_lateral_calibration(tmp_path: Path) -> None:
+    """The whole way: sweep, photograph, reconstruct; light by wave optics at continuous places."""
+    text = TINY.replace("fall_off_sigma_deg = 12", "fall_off_sigma_deg = 8")
+    text += 'scene = "bars"\nscene_distance_mm = 12\nscene_height_mm = 3.4\nscene_rgb = [0, 1, 0]\n'
+    with open_bench(parse_config(text, None)) as bench:
+        assert bench.stage is not None
+        bench.stage.home()
+        grid = grid_sweep(bench, (12e3,), response=gaussian_fall_off(8.0))
+        done = calibrate_sweep(bench, PointSweep(grid.points_um, kind="lateral", average=2), tmp_path)
+        photo = photograph(bench, expose_scene(bench).exposure_ms, tmp_path, average=2, dark_frames=2)
+        truth = world_of(bench).ground_truth(photo.measurement.shape[:2], 26.0)
+    assert done.findings == ()
+    quality = {}
+    for model in MODELS_COMPARED:
+        found = reconstruct_volume(
+            photo.measurement,
+            load_calibration(done.path),
+            model=model,
+            iterations=30,
+            estimate_background=False,
+        )
+        quality[model] = metrics.psnr(found.volume[0].reshape(truth.shape), truth, fit_scale=True)
+    assert quality["local"] > quality["convolution"] + 5
 
 
 def test_a_point_where_the_stage_slipped_is_taken_again(bench: Bench, tmp_path: Path) -> None:
