@@ -79,6 +79,9 @@ class Dlpc900Slm(Slm):
         self._closing = threading.Event()
         self._blanked = 0
         """How often ``blank`` was called; uploads begun before it end."""
+        self._blanking = 0
+        """How many calls of ``blank`` are under way; uploads begun meanwhile end."""
+        self._counting = threading.Lock()
         self._board: Board | None = None
         self._firmware = ""
         self._tag = ""
@@ -270,8 +273,14 @@ class Dlpc900Slm(Slm):
     def blank(self) -> None:
         """Show all zeros, ahead of an upload that is under way: that ends with a StoppedError."""
         board = self._require()
-        self._blanked += 1
-        self._show(np.zeros(board.shape, np.uint8), gives_way=False)
+        with self._counting:
+            self._blanked += 1
+            self._blanking += 1
+        try:
+            self._show(np.zeros(board.shape, np.uint8), gives_way=False)
+        finally:
+            with self._counting:
+                self._blanking -= 1
         self._closing.wait(self.settle_ms * 1e-3)
 
     @property
@@ -346,7 +355,8 @@ class Dlpc900Slm(Slm):
     def _upload(self, image: bytes, initialise: Command, load: Command, began: int | None) -> None:
         self._link.write(initialise, (0).to_bytes(2, "little") + len(image).to_bytes(4, "little"))
         for start in range(0, len(image), commands.LOAD_BYTES):
-            if self._closing.is_set() or began not in (None, self._blanked):
+            blanked = began is not None and (self._blanking or began != self._blanked)
+            if self._closing.is_set() or blanked:
                 raise StoppedError(self.name, "was closed or blanked during an upload.")
             part = image[start : start + commands.LOAD_BYTES]
             self._link.write(load, len(part).to_bytes(2, "little") + part)

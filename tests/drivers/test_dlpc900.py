@@ -421,6 +421,34 @@ def test_closing_and_blanking_end_an_upload(
     device.close()
 
 
+def test_an_upload_that_begins_while_blanking_is_under_way_ends_too(
+    board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with slm(compression="none") as device:
+        blanking, ended = threading.Event(), threading.Event()
+
+        def late(levels: np.ndarray, compression: str) -> bytes:
+            if not levels.any():
+                blanking.set()
+                assert ended.wait(10)
+            return encode(levels, compression)
+
+        monkeypatch.setattr("drivers.dlpc900.slm.encode", late)
+        stopping = threading.Thread(target=device.blank)
+        stopping.start()
+        assert blanking.wait(10)
+        try:
+            with pytest.raises(StoppedError):
+                device.display(pattern())
+        finally:
+            ended.set()
+            stopping.join(10)
+        assert board.shown is not None
+        assert not board.shown.any()
+        device.display(pattern())  # afterwards all is as before
+        np.testing.assert_array_equal(board.shown, pattern())
+
+
 def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
