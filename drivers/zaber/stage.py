@@ -88,7 +88,8 @@ class ZaberStage(PolledStage):
         self.options = options
         self._maps = {name: axis.axis_map(name) for name, axis in options.axes.items()}
         self._chain = Chain(options.port, self.name, options.baud_rate)
-        self._without_checksums: list[int] = []
+        self._without_checksums: set[int] = set()
+        """Devices that were found without and have not been put back, over lost connections too."""
         self._lost_reference: set[str] = set()
 
     @classmethod
@@ -132,18 +133,21 @@ class ZaberStage(PolledStage):
     def _connect(self) -> tuple[DeviceIdentity, tuple[StageAxis, ...]]:
         self._chain.open()
         devices = sorted({axis.device for axis in self.options.axes.values()})
-        self._without_checksums = [device for device in devices if not self._chain.have_checksums(device)]
+        for device in devices:
+            if not self._chain.have_checksums(device):
+                self._without_checksums.add(device)
         axes = tuple(self._axis(name, axis) for name, axis in self.options.axes.items())
         return self._identify(devices), axes
 
     def _disconnect(self) -> None:
         if self._chain.is_open:
-            for device in self._without_checksums:
+            for device in sorted(self._without_checksums):
                 try:
                     self._chain.no_checksums(device)
                 except DeviceError as error:
                     _log.warning("%s: device %d goes on sending checksums: %s", self.name, device, error)
-        self._without_checksums = []
+                else:
+                    self._without_checksums.remove(device)
         self._chain.close()
 
     def _identify(self, devices: list[int]) -> DeviceIdentity:

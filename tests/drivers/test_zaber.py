@@ -242,6 +242,25 @@ def test_checksums_are_put_back(chain: ZaberChain) -> None:
     assert chain.devices[2].settings["comm.checksum"] == "1"
 
 
+def test_checksums_are_put_back_after_a_reconnection_too(chain: ZaberChain) -> None:
+    stage = stage_on(chain)
+    stage.open()
+    chain.port.unplug()
+    while stage.is_open:
+        time.sleep(0.005)
+    chain.port.plug_in()
+    stage.open()
+    stage.close()
+    assert {device.settings["comm.checksum"] for device in chain.devices.values()} == {"0"}
+
+
+def test_checksums_are_put_back_when_another_device_is_missing(chain: ZaberChain) -> None:
+    del chain.devices[2]
+    with pytest.raises(DeviceTimeoutError, match="device 2 did not answer"):
+        stage_on(chain).open()
+    assert chain.devices[1].settings["comm.checksum"] == "0"
+
+
 def test_unplugged_and_plugged_in_again(stage: ZaberStage, chain: ZaberChain) -> None:
     stage.move_to({"x_um": 6000.0}, wait=False)
     chain.port.unplug()
