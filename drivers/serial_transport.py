@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import termios
 import threading
 import time
 from collections.abc import Callable
@@ -241,7 +242,7 @@ class SerialTransport:
         try:
             port.write(data)
             port.flush()
-        except (serial.SerialException, OSError) as error:
+        except (serial.SerialException, OSError, termios.error) as error:  # the last from flush
             raise self._lost(error) from error
 
     def _exchange(self, command: bytes, matcher: Matcher, timeout_s: float, ticket: int) -> list[bytes]:

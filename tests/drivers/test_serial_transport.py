@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -103,6 +105,18 @@ def test_a_driver_that_chokes_on_a_message_is_told_of_at_once(device: PtyDevice)
         get(port, 1)
     assert time.monotonic() - began < 15
     port.close()
+
+
+def test_a_port_that_is_lost_while_bytes_drain_is_named(
+    port: SerialTransport, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drain() -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(port._serial, "flush", drain)
+    with pytest.raises(DeviceError, match="was lost on"):
+        get(port, 1)
+    assert not port.is_open
 
 
 def test_silence_is_a_timeout_that_says_what_came_so_far(device: PtyDevice, port: SerialTransport) -> None:
