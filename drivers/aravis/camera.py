@@ -33,6 +33,8 @@ class AravisCamera(AravisImageSettings):
         self._stream: Any = None
         self._woken = threading.Event()
         self._statistics: dict[str, int] = {}
+        self._line_bytes: int | None = None
+        """Bytes from line to line where the camera pads lines."""
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
