@@ -75,7 +75,13 @@ class _Window(QWindow):
         self.setFlags(flags)
         self.setCursor(Qt.CursorShape.BlankCursor)
         self.setGeometry(screen.geometry())
-        self._store = QBackingStore(self)
+        self._store: QBackingStore | None = QBackingStore(self)
+
+    def end(self) -> None:
+        """Remove the window; its backing store must go first."""
+        self._store = None
+        self.destroy()
+        self.deleteLater()
 
     def event(self, event: QEvent) -> bool:
         if event.type() == QEvent.Type.Close:
@@ -89,17 +95,20 @@ class _Window(QWindow):
 
     def paint(self) -> None:
         """Draw the image and wait until the display server has it."""
+        store = self._store
+        if store is None:  # removed meanwhile
+            return
         whole = QRect(0, 0, self.width(), self.height())
         ratio = self.devicePixelRatio()
-        self._store.resize(whole.size())
-        self._store.beginPaint(QRegion(whole))
-        painter = QPainter(self._store.paintDevice())
+        store.resize(whole.size())
+        store.beginPaint(QRegion(whole))
+        painter = QPainter(store.paintDevice())
         painter.scale(1 / ratio, 1 / ratio)  # undo the desktop's scaling: one image pixel, one display pixel
         painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_Source)
         painter.drawImage(QPointF(0, 0), self.image)
         painter.end()
-        self._store.endPaint()
-        self._store.flush(QRegion(whole))
+        store.endPaint()
+        store.flush(QRegion(whole))
         QGuiApplication.sync()
 
 
@@ -300,8 +309,7 @@ class PatternScreen:
     def _remove_window(self) -> None:
         window, self._window = self._window, None
         if window is not None:
-            window.destroy()
-            window.deleteLater()
+            window.end()
 
     def _name(self) -> str:
         return self._output.name if self._output is not None else "?"

@@ -6,6 +6,7 @@ Started by ``test_second_display`` with the names of some of the functions below
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -20,7 +21,11 @@ from drivers.second_display.options import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
 
 OPTIONS = SecondDisplayOptions(
-    output="SLM-1", pixel_pitch_um=8.0, settle_ms=0, refreshes_to_wait=0, check_by_screenshot=True
+    output=os.environ.get("SLM_OUTPUT", "SLM-1"),
+    pixel_pitch_um=8.0,
+    settle_ms=0,
+    refreshes_to_wait=0,
+    check_by_screenshot=True,
 )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
+import json
 import os
 import shutil
 import subprocess
@@ -150,6 +151,25 @@ def test_the_output_shows_the_levels_and_the_desk_nothing(monkeypatch: pytest.Mo
         slm.display(ramp(slm.shape))
         np.testing.assert_array_equal(shot(1280, 0, 800, 600), np.repeat(ramp(slm.shape)[..., None], 3, 2))
         assert not shot(0, 0, 1280, 1024).any()
+
+
+@pytest.mark.usefixtures("outputs")
+@pytest.mark.parametrize("factor", ["1", "1.5"])
+def test_a_qt_program_shows_the_levels_whatever_the_desktops_scale(factor: str) -> None:
+    found = subprocess.run(
+        [sys.executable, "-m", "tests.drivers.qt_program", "exact", "clicks_and_keys"],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        env=os.environ | {"SLM_OUTPUT": "DUMMY1", "QT_SCALE_FACTOR": factor},
+        timeout=60,
+        check=False,
+    )
+    assert found.stderr == ""
+    assert json.loads(found.stdout) == {
+        "exact": {"here": True, "same": True},
+        "clicks_and_keys": {"visible": True, "same": True, "goes_on": True},
+    }
 
 
 @pytest.mark.usefixtures("outputs")
