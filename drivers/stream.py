@@ -232,11 +232,13 @@ class FrameStream:
                     metadata = self.camera.next_frame_into(
                         self._scratch if buffer is None else buffer, _POLL_S
                     )
-                except DeviceTimeoutError:
+                except DeviceTimeoutError as error:
                     silent_s += time.monotonic() - began_s
                     limit_s = _SILENCE_S + 3 * self.camera.exposure_ms / 1e3
                     if self.camera.trigger_mode == "free_run" and silent_s > limit_s:
-                        raise
+                        raise DeviceTimeoutError(
+                            error.device, f"has sent no frame for {silent_s:.1f} s.", error.remedy
+                        ) from error
                     continue
                 silent_s = 0.0
                 self._note_clock(metadata.device_time_ns, metadata.host_time_ns)
