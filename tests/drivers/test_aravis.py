@@ -92,6 +92,18 @@ def test_no_frame_is_lost_while_frame_ids_wrap(fake: AravisCamera) -> None:
     assert fake.stream_statistics["n_completed_buffers"] >= 200
 
 
+@pytest.mark.usefixtures("port")
+def test_block_ids_of_gige_vision_wrap_without_a_loss() -> None:
+    with ArvFakeCamera(), camera_of(ADDRESS) as camera:
+        camera.set_pixel_format("Mono8")
+        camera.set_exposure_ms(1.0)
+        camera.set_roi(Roi(0, 0, 64, 64))
+        camera.start_sequence(64)
+        frames = [camera.next_frame(5).metadata for _ in range(150)]
+        camera.stop_sequence()
+    assert [metadata.frame_id for metadata in frames] == list(range(150))
+
+
 def test_pixels_are_those_of_the_region(fake: AravisCamera) -> None:
     """The fake draws (x + y + frame id) modulo 255, and a gain of 0 and 10 ms leave it as it is."""
     fake.set_exposure_ms(10.0)
