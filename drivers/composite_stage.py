@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from typing import Any, ClassVar, Self, cast
@@ -18,6 +19,9 @@ from drivers.stage import Stage, StageAxis
 from drivers.stage_axes import check_target
 
 _NAME = "composite"
+_STOP_AGAIN_S = 0.1
+_ENDED_S = 2.0
+"""More than a part that moves no longer may need to say how its move ended."""
 
 
 class StagePart(BaseModel):
@@ -108,6 +112,9 @@ class CompositeStage(Stage):
         self._commanding = threading.RLock()
         self._counting = threading.Lock()
         self._stops = 0
+        self._homing_in: int | None = None
+        """The thread that homes."""
+        self._home_over = threading.Event()
 
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
@@ -221,10 +228,16 @@ class CompositeStage(Stage):
         """Home part after part, in the order of ``bench.toml``; blocks until done."""
         self._require()
         stops = self._stops
-        for part in self._parts.values():
-            if self._stops != stops:
-                raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
-            part.home()
+        self._home_over.clear()
+        self._homing_in = threading.get_ident()
+        try:
+            for part in self._parts.values():
+                if self._stops != stops:
+                    raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
+                part.home()
+        finally:
+            self._homing_in = None
+            self._home_over.set()
 
     def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
         """Move the named axes to absolute positions, all parts at once; see the interface."""
@@ -263,6 +276,7 @@ class CompositeStage(Stage):
         moving = self._moving
         if not moving:
             return
+        began_s = time.monotonic()
         late: DeviceTimeoutError | None = None
         with ThreadPoolExecutor(len(moving)) as pool:
             waits: dict[Future[None], str] = {
@@ -271,12 +285,13 @@ class CompositeStage(Stage):
             try:
                 for done in as_completed(waits):
                     error = done.exception()
-                    if (
-                        isinstance(error, DeviceTimeoutError)
-                        and timeout_s
-                        and self._parts[waits[done]].is_moving
-                    ):
-                        late = error  # it is the caller who waits no longer
+                    over = timeout_s is not None and time.monotonic() - began_s >= timeout_s
+                    if isinstance(error, DeviceTimeoutError) and over:  # the caller waits no longer
+                        part = self._parts[waits[done]]
+                        if part.is_moving:
+                            late = error
+                        else:  # it has ended meanwhile: where it should, or it says so
+                            part.wait(_ENDED_S)
                     elif error is not None:
                         raise error
             except BaseException as error:  # Ctrl-C too: the threads end when their parts have stopped
@@ -292,6 +307,9 @@ class CompositeStage(Stage):
         with self._counting:
             self._stops += 1  # whoever is about to move or home another part sees it
         self._stop_parts(self._parts)
+        if self._homing_in not in (None, threading.get_ident()):
+            while not self._home_over.wait(_STOP_AGAIN_S):  # a part may only just have begun to home
+                self._stop_parts(self._parts)
 
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Estimated seconds for a move; the parts move together, so the slowest counts."""

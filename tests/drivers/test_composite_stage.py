@@ -150,6 +150,41 @@ def test_waiting_no_longer_stops_nothing(stage: CompositeStage) -> None:
     stage.wait(30.0)
 
 
+def test_looking_whether_a_move_has_ended_stops_nothing(stage: CompositeStage) -> None:
+    target = middle(stage)
+    stage.move_to(target, wait=False)
+    with pytest.raises(DeviceTimeoutError, match="still moves"):
+        stage.wait(0.0)
+    stage.wait(30.0)
+    assert stage.position() == pytest.approx(target, abs=5.0)
+
+
+def test_a_part_that_arrives_when_the_wait_is_over_stops_no_other(stage: CompositeStage) -> None:
+    tilt, xyz, target = stage._parts["tilt"], stage._parts["xyz"], middle(stage)
+    wait_tilt, wait_xyz = tilt.wait, xyz.wait
+    asked_again = threading.Event()
+
+    def arrives_late(timeout_s: float | None = None) -> None:
+        try:
+            wait_tilt(timeout_s)
+            asked_again.set()
+        except DeviceTimeoutError:
+            while tilt.is_moving:
+                time.sleep(0.002)
+            raise
+
+    def is_late(timeout_s: float | None = None) -> None:
+        asked_again.wait(5)
+        wait_xyz(timeout_s)
+
+    tilt.wait, xyz.wait = arrives_late, is_late  # type: ignore[method-assign]
+    stage.move_to(target, wait=False)
+    with pytest.raises(DeviceTimeoutError, match="still moves"):
+        stage.wait(0.01)
+    stage.wait(30.0)
+    assert stage.position() == pytest.approx(target, abs=5.0)
+
+
 def test_stop_between_homing_two_parts_homes_no_more(board: GrblController, chain: ZaberChain) -> None:
     with composite(board, chain) as stage:
         parts = list(stage._parts.values())
@@ -163,6 +198,42 @@ def test_stop_between_homing_two_parts_homes_no_more(board: GrblController, chai
         with pytest.raises(StoppedError, match="homing was stopped"):
             stage.home()
         assert not parts[1].is_homed
+
+
+def test_stop_as_a_part_is_about_to_home_stops_its_homing(board: GrblController, chain: ZaberChain) -> None:
+    with composite(board, chain) as stage:
+        tilt = stage._parts["tilt"]
+        home, stop = tilt.home, tilt.stop
+        about_to, stopped = threading.Event(), threading.Event()
+        for axis in chain.devices[1].axes:
+            axis.set_place(12_000)
+            axis.speed_per_s = 2_000  # six seconds
+
+        def late() -> None:
+            about_to.set()
+            assert stopped.wait(10)
+            home()
+
+        def noticed() -> None:
+            stop()
+            stopped.set()
+
+        tilt.home, tilt.stop = late, noticed  # type: ignore[method-assign]
+        outcome: list[object] = []
+
+        def run() -> None:
+            try:
+                outcome.append(stage.home())
+            except DeviceError as error:
+                outcome.append(error)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        assert about_to.wait(10)
+        stage.stop()
+        thread.join(20)
+        assert isinstance(outcome[0], StoppedError)
+        assert not tilt.is_homed
 
 
 def test_a_part_that_does_not_open_closes_the_others_and_is_named(
