@@ -334,7 +334,7 @@ def _facts(axes: Axes, a: Analysis) -> None:
             rows.append((name, 0.0, 8.5, _FAINT))
         rows += [(line, 0.02, 9.5, _INK) for line in textwrap.wrap(value, 46)]
     for note in a.notes:
-        rows += [(line, 0.0, 7.0, _FAINT) for line in textwrap.wrap(note, 72)]
+        rows += [(line, 0.0, 7.0, _FAINT) for line in textwrap.wrap(note, 62)]
     step = min(1.0 / sum(size for *_, size, _ in rows), 0.0045)
     y = 1.03
     for text, indent, size, color in rows:

@@ -21,9 +21,9 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
-SAME_DEPTH = 1e-3
-"""Relative difference of the scale below which a calibrated PSF serves as it is: a hundredth of a pixel or
-so at the edge of a pattern of some hundred pixels would be interpolation for nothing."""
+SAME_DEPTH = 1e-4
+"""Difference of scale below which a calibrated PSF serves as it is: a twentieth of a pixel at the edge of a
+pattern 1000 pixels wide."""
 LEAST_LIKENESS = 0.5
 """Scaled neighbours less alike than this are not mixed: the mixture would be a double image."""
 TYPICAL_DEFLECTION_DEG = 0.25
@@ -166,8 +166,8 @@ def refocus(
 def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocused | None]:
     """Return a calibration of one PSF at ``z_um``, and how it was made (None where it was calibrated).
 
-    Where the calibration has the depth (to a thousandth of the pattern's scale), its PSFs are returned as
-    they are. Raises as :func:`refocus`.
+    Where the calibration has the depth (to :data:`SAME_DEPTH` of the pattern's scale), its PSFs are returned
+    as they are. Raises as :func:`refocus`.
     """
     z = calibration.source_positions_um[:, 2]
     distance_um = _distance_um(calibration)
@@ -215,6 +215,9 @@ def _mixed(
     depths: npt.NDArray[np.float64], psfs: Floats, z_um: float, distance_um: float
 ) -> tuple[Floats, list[int], list[float]]:
     """Return the PSF at ``z_um``, the planes it was made of and their weights."""
+    exact = np.flatnonzero(np.abs(depths / z_um - 1) < 1e-9)  # but for rounding
+    if exact.size:
+        return psfs[exact[0]], [int(exact[0])], [1.0]
     above = int(np.searchsorted(depths, z_um))
     if above in (0, len(depths)):
         nearest = min(above, len(depths) - 1)

@@ -77,6 +77,7 @@ def test_a_calibrated_depth_is_left_as_it_is() -> None:
     same, made = at_depth(calibration, 100e3)
     assert same is calibration
     assert made is None
+    np.testing.assert_array_equal(refocus(calibration, 1 / (1 / 100e3)).psf, calibration.psfs[1])
     other, made = at_depth(calibration, 75e3)
     assert made is not None
     assert len(other.psfs) == 1
