@@ -1,8 +1,11 @@
 """Procedures: a plan, the analysis of its frames, a Calibration."""
 
+from calibration_routines.angular import AngularSweep, measure_angular_response
+from calibration_routines.angular_response import AngularResponse, load_response
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose
 from calibration_routines.axial_exposure import SweepExposures, expose_source, expose_sweep
 from calibration_routines.axial_plan import AxialSweep, planes_needed
+from calibration_routines.dpc import DiffuserSurface, DpcSetup, measure_diffuser
 from calibration_routines.errors import CalibrationError
 from calibration_routines.field_response import FieldResponse, measure_field_response
 from calibration_routines.grid_plan import GridSweep, grid_sweep
@@ -13,9 +16,13 @@ from calibration_routines.sweep_plan import PointSweep, Sweep, check_sweep, swee
 from calibration_routines.sweep_record import is_sweep
 
 __all__ = [
+    "AngularResponse",
+    "AngularSweep",
     "AutoExposure",
     "AxialSweep",
     "CalibrationError",
+    "DiffuserSurface",
+    "DpcSetup",
     "ExposureOutcome",
     "FieldResponse",
     "GridSweep",
@@ -36,6 +43,9 @@ __all__ = [
     "grid_sweep",
     "is_sweep",
     "lateral_spacing",
+    "load_response",
+    "measure_angular_response",
+    "measure_diffuser",
     "measure_field_response",
     "photograph",
     "planes_needed",

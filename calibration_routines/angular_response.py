@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError
 from instrument.atomic import write_text
+from instrument.errors import FileError
 from recon.optics.fall_off import FallOff
 
 CUT_OFF = 0.2
@@ -146,7 +146,7 @@ def load_response(file: Path | str) -> AngularResponse:
 
     Raises
     ------
-    CalibrationError
+    FileError
         When the file cannot be read or is something else.
     """
     path = Path(file)
@@ -162,8 +162,8 @@ def load_response(file: Path | str) -> AngularResponse:
             curves[0], curves[1], tuple(data["findings"]), str(data["bench"]), bool(data["simulated"])
         )
     except OSError as error:
-        raise CalibrationError(f"{path} cannot be read: {error.strerror or error}.") from error
+        raise FileError(path, f"cannot be read: {error.strerror or error}.") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{path} is no angular response ({error}). calibrate angular writes one."
+        raise FileError(
+            path, f"is no angular response ({error}).", "calibrate angular writes one."
         ) from error

@@ -32,6 +32,8 @@ from recon.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slop
 OVERFILL = 1.3
 """Aperture of the lit half circles over the objective's. More than 1, so that deflected light enters on one
 side as it leaves on the other (docs/decisions/0016-dpc.md)."""
+LEAST_LEDS = 24
+"""Inside the objective's aperture: fewer, and slopes show in steps, as single LEDs cross the pupil's edge."""
 BANDS = ("red", "green", "blue")
 RESULT_FILE, HEIGHT_FILE = "dpc.json", "height_um.npy"
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
@@ -216,12 +218,15 @@ def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
 def _illumination_na(array: LedArray, setup: DpcSetup) -> float:
     wanted = OVERFILL * setup.objective_na
     radius = np.hypot(array.led_na[:, 0], array.led_na[:, 1])
-    if not (np.count_nonzero(radius <= setup.objective_na) >= 8 and radius.max() > 1.1 * setup.objective_na):
+    if not (
+        np.count_nonzero(radius <= setup.objective_na) >= LEAST_LEDS
+        and radius.max() > 1.1 * setup.objective_na
+    ):
         raise BenchError(
             f"The LED array reaches an aperture of {radius.max():.3g} with "
             f"{np.count_nonzero(radius <= setup.objective_na)} LEDs inside the objective's "
-            f"{setup.objective_na:g}; wanted are 8 inside or more, and a tenth beyond. Change the array's "
-            "distance, or the objective."
+            f"{setup.objective_na:g}; wanted are {LEAST_LEDS} inside or more, and a tenth beyond. Change "
+            "the array's distance, or the objective."
         )
     return float(min(wanted, radius.max() * (1 + 1e-9)))
 

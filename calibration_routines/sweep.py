@@ -7,7 +7,7 @@ or without the bench.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -58,6 +58,8 @@ from instrument.runner import Progress
 from instrument.store import Run, RunCondition
 from recon.types import Calibration, Geometry
 
+Analysed = Callable[[int, int], None]
+"""Takes how many PSFs have been analysed, and how many there are."""
 FOLDER = "calibration"
 """Name of the calibration's folder inside the run's folder."""
 _RETAKE_DIMMING = 0.7  # a PSF that saturated is taken again with this part of its exposure
@@ -106,6 +108,7 @@ def calibrate_sweep(
     *,
     exposures: SweepExposures | None = None,
     on_progress: Progress | None = None,
+    on_analysis: Analysed | None = None,
 ) -> SweepCalibration:
     """Take a sweep and save its calibration inside the run's folder.
 
@@ -120,6 +123,8 @@ def calibrate_sweep(
         From :func:`~calibration_routines.expose_sweep`, which is called when None.
     on_progress : callable, optional
         Called with a :class:`~instrument.runner.RunStatus` after every frame.
+    on_analysis : callable, optional
+        Called with how many PSFs have been analysed, and how many there are.
 
     Returns
     -------
@@ -139,11 +144,15 @@ def calibrate_sweep(
     runner = prepare(bench, sweep_plan(sweep, exposures.exposures_ms), where, on_progress=on_progress)
     record = SweepRecord(sweep, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
     write_text(runner.path / SWEEP_FILE, to_json(record))
-    return _finished(_complete(runner.execute()), record, bench, on_progress)
+    return _finished(_complete(runner.execute()), record, bench, on_progress, on_analysis)
 
 
 def finish_sweep(
-    run: Path | str, bench: Bench | None = None, *, on_progress: Progress | None = None
+    run: Path | str,
+    bench: Bench | None = None,
+    *,
+    on_progress: Progress | None = None,
+    on_analysis: Analysed | None = None,
 ) -> SweepCalibration:
     """Make the calibration of a sweep's complete run, e.g. of one that was resumed.
 
@@ -153,7 +162,8 @@ def finish_sweep(
         The run's folder.
     bench : Bench, optional
         For retakes; without one, PSFs that need them are only flagged.
-    on_progress : callable, optional
+    on_progress, on_analysis : callable, optional
+        As :func:`calibrate_sweep`.
 
     Raises
     ------
@@ -164,11 +174,15 @@ def finish_sweep(
     """
     path = Path(run)
     record = read_record(path)
-    return _finished(_complete(Run.open(path)), record, bench, on_progress)
+    return _finished(_complete(Run.open(path)), record, bench, on_progress, on_analysis)
 
 
 def _finished(
-    run: Run, record: SweepRecord, bench: Bench | None, on_progress: Progress | None
+    run: Run,
+    record: SweepRecord,
+    bench: Bench | None,
+    on_progress: Progress | None,
+    on_analysis: Analysed | None,
 ) -> SweepCalibration:
     """Analyse, take again what needs it, judge the source, save."""
     sweep, exposures = record.sweep, record.exposures
@@ -178,7 +192,7 @@ def _finished(
         sweep = _binned_to_resolution(run, sweep, dark)
     runs = [run]
     takes = dict.fromkeys(sweep.points_um, run)
-    analysis = _analysed(takes, sweep, dark, record.geometry)
+    analysis = _analysed(takes, sweep, dark, record.geometry, on_analysis)
     for _ in range(sweep.retakes if bench is not None else 0):
         again = [q for q in analysis.quality if q.retake]
         if not again or bench is None:
@@ -193,7 +207,7 @@ def _finished(
         takes.update({point: retake for point, _ in points})
         renewed = present | dict(points)
         exposures = replace(exposures, exposures_ms=tuple(renewed[point] for point in sweep.points_um))
-        analysis = _analysed(takes, sweep, dark, record.geometry)
+        analysis = _analysed(takes, sweep, dark, record.geometry, on_analysis)
     drift = _drift(run, sweep, dark)
     good = not any(q.findings for q in analysis.quality) and not any(s.findings for s in analysis.stages)
     calibration = Calibration(
@@ -238,16 +252,24 @@ def _full_scale(run: Run) -> int:
 
 
 def _analysed(
-    takes: Mapping[Position, Run], sweep: Sweep, dark: DarkModel, geometry: Geometry
+    takes: Mapping[Position, Run],
+    sweep: Sweep,
+    dark: DarkModel,
+    geometry: Geometry,
+    on_analysis: Analysed | None,
 ) -> SweepAnalysis:
     return analyse_sweep(
-        _planes(takes, sweep), dark, geometry, dct_order=sweep.dct_order, binning=sweep.binning
+        _planes(takes, sweep, on_analysis), dark, geometry, dct_order=sweep.dct_order, binning=sweep.binning
     )
 
 
-def _planes(takes: Mapping[Position, Run], sweep: Sweep) -> Iterator[PlaneFrames]:
+def _planes(
+    takes: Mapping[Position, Run], sweep: Sweep, on_analysis: Analysed | None
+) -> Iterator[PlaneFrames]:
     central = {axis_point(sweep, z_um) for z_um in depths_um(sweep)}
-    for point in sweep.points_um:
+    for done, point in enumerate(sweep.points_um):
+        if on_analysis is not None:
+            on_analysis(done, len(sweep.points_um))
         run = takes[point]
         steps = [step for step in run.steps(PSF) if step.source_um is None or step.source_um == point]
         yield PlaneFrames(

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep
 from calibration_routines.sweep import FOLDER
+from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.cli.progress import progress_bar
+from instrument.cli.progress import one_task, progress_bar
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.cli.sweeping import describe_result
 from instrument.resume import prepare_resume
@@ -40,7 +41,7 @@ def resume(
     if found.condition is RunCondition.COMPLETED and not found.missing():
         typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
         if is_sweep(run) and not (run / FOLDER).exists():
-            describe_result(Console(), finish_sweep(run))
+            _finish(run, None)
         return
     with open_and_say(bench or run / BENCH_TOML) as opened:
         home_if_needed(opened, found.plan)
@@ -52,7 +53,14 @@ def resume(
         typer.echo(f"Found {findings}", err=True)
         done = carry_out(opened, runner)
         if is_sweep(run) and done.condition is RunCondition.COMPLETED:
-            describe_result(Console(), finish_sweep(run, opened))
+            _finish(run, opened)
+
+
+def _finish(run: Path, bench: Bench | None) -> None:
+    """Make a sweep's calibration of its complete run, with retakes where there is a bench."""
+    with one_task("Analysing") as advance:
+        done = finish_sweep(run, bench, on_analysis=advance)
+    describe_result(Console(), done)
 
 
 def _close_recording(run: Run) -> None:

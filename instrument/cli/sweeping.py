@@ -20,7 +20,7 @@ from calibration_routines import (
 from calibration_routines.sweep_plan import DARK, depths_um, reference_point
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
-from instrument.cli.progress import one_task
+from instrument.cli.progress import one_task, progress_bar
 from instrument.plan import Plan, estimate
 
 _MOST_LINES = 12  # findings printed; all of them are in calibration.json
@@ -53,13 +53,16 @@ def take_sweep(
         exposures = expose_sweep(bench, sweep)
     describe_exposures(console, exposures)
     describe_plan(console, bench, sweep, sweep_plan(sweep, exposures.exposures_ms), folder)
-    with one_task("Sweeping") as advance:
+    with progress_bar() as bar:
+        frames = bar.add_task("Sweeping", total=None, note="")
+        psfs = bar.add_task("Analysing", total=None, note="", visible=False)
         done = calibrate_sweep(
             bench,
             sweep,
             folder,
             exposures=exposures,
-            on_progress=lambda status: advance(status.done, status.total),
+            on_progress=lambda status: bar.update(frames, completed=status.done, total=status.total),
+            on_analysis=lambda count, total: bar.update(psfs, completed=count, total=total, visible=True),
         )
     describe_result(console, done)
 

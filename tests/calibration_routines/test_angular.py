@@ -10,11 +10,10 @@ import pytest
 
 from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
 from calibration_routines.angular_response import AngularResponse, Curve, load_response
-from calibration_routines.errors import CalibrationError
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
-from instrument.errors import BenchError
+from instrument.errors import BenchError, FileError
 from recon.optics.fall_off import gaussian_fall_off
 
 TINY = """
@@ -95,5 +94,5 @@ def test_a_cut_off_that_was_not_reached_is_none() -> None:
 def test_a_file_that_is_no_response_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"format": "else"}')
     for name in ("a.json", "missing.json"):
-        with pytest.raises(CalibrationError, match=name):
+        with pytest.raises(FileError, match=name):
             load_response(tmp_path / name)
