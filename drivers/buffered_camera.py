@@ -75,6 +75,10 @@ class _Run:
     roi: tuple[int, int, int, int]
     binning: int
     stopping: bool = False
+    begun: bool = False
+    """Whether the counter has seen a number."""
+    lost_first: int = 0
+    """Frames that are known to be lost before the first whole one."""
     incomplete: int = 0
     misnumbered: int = 0
 
@@ -360,6 +364,7 @@ class BufferedCamera(Camera):
             if not (raw.complete and self._decode(raw.data, image)):
                 run.incomplete += 1
                 self._incomplete += 1
+                self._count_from(raw.number, run)
                 return None
         finally:
             self._give_back(raw)
@@ -383,6 +388,13 @@ class BufferedCamera(Camera):
             saturated_fraction=float(np.count_nonzero(image >= full_scale) / image.size),
         )
 
+    def _count_from(self, number: int, run: _Run) -> None:
+        """Count from an incomplete frame on, which the first whole one comes after."""
+        if run.counter is not None and not run.begun:
+            run.begun = True
+            run.counter.lost(number)
+            run.lost_first = 1
+
     def _count_lost(self, number: int, run: _Run) -> int:
         if run.counter is None or run.snapping:
             return 0
@@ -398,7 +410,8 @@ class BufferedCamera(Camera):
                 ) from error
             _log.warning("%s: %s: frames lost here are not counted", self.name, error)
             return 0
-        run.misnumbered = 0
+        run.misnumbered, run.begun = 0, True
+        lost, run.lost_first = lost + run.lost_first, 0
         return lost
 
     def _timeout(self, run: _Run, timeout_s: float) -> DeviceTimeoutError:

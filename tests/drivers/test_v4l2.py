@@ -135,6 +135,20 @@ def test_lost_and_damaged_frames_are_counted_exactly() -> None:
     assert [m.frame_id for m in frames] == [0, 1, 2, 5, 7, 8, 11, 12, 13, 14]
 
 
+def test_frames_damaged_before_the_first_whole_one_are_counted() -> None:
+    kernel = FakeKernel()
+    kernel.damaged, kernel.lost = {0, 2}, {1}
+    with camera_on(kernel) as camera:
+        camera.set_exposure_ms(1.0)
+        for first in (0, 5):  # in each sequence anew
+            camera.start_sequence(4)
+            frames = [camera.next_frame(5).metadata for _ in range(2)]
+            camera.stop_sequence()
+            # Sequence numbers 3 4 arrive whole.
+            assert [m.dropped_before for m in frames] == [3, 0]
+            assert [m.frame_id for m in frames] == [first + 3, first + 4]
+
+
 def test_a_camera_that_does_not_number_its_frames_is_refused_in_words() -> None:
     kernel = FakeKernel()
     kernel.numbered = False
