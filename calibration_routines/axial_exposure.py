@@ -12,6 +12,7 @@ from calibration_routines.sweep_plan import Position, Sweep, axis_point, depths_
 from instrument.bench import Bench
 
 _MOST_BOOST = 10.0  # exposure off the axis over that on it: beyond, a wrong guess would cost too much time
+_CAUTION = 0.7  # of the logarithm: farther out than was asked, a brighter spot may lie on the sensor
 _BESIDE = 2 / 3  # of the field's radius: where the exposure off the axis is asked
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
@@ -72,7 +73,7 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
         axis = axis_point(sweep, point[2])
         on_axis = np.interp(np.log(point[2]), np.log(asked), np.log([one.exposure_ms for _, one in found]))
         slope = float(np.interp(np.log(point[2]), np.log(asked), slopes))
-        boost = min(slope * _tangent_squared(point, axis), np.log(_MOST_BOOST))
+        boost = min(_CAUTION * slope * _tangent_squared(point, axis), np.log(_MOST_BOOST))
         exposures.append(min(float(np.exp(on_axis + boost)), longest))
     return SweepExposures(tuple(exposures), tuple(found))
 

@@ -142,6 +142,17 @@ def fit_stage(
     return residuals, error, float(1e3 * rotation), float((gain[1, 1] - gain[0, 0]) / mean)
 
 
+def _fit_line(
+    places_um: Floats, shifts_px: Floats, nominal_px_per_um: float | None
+) -> tuple[Floats, float | None, float]:
+    """Fit one turn and one scale robustly: the median over the points; returned as by :func:`fit_stage`."""
+    place, shift = (v[:, 1] + 1j * v[:, 0] for v in (places_um, shifts_px))
+    ratios = -shift / place
+    gain = complex(np.median(ratios.real), np.median(ratios.imag))
+    error = None if nominal_px_per_um is None else abs(gain) / nominal_px_per_um - 1
+    return np.abs(shift + gain * place), error, float(1e3 * np.angle(gain))
+
+
 def _judge_depth(
     judged: list[PsfQuality],
     psfs: npt.NDArray[np.float32],
@@ -183,9 +194,13 @@ def _held_against_stage(
     nominal: float | None,
 ) -> StageFit:
     spans = len(seen) >= 2 and np.linalg.matrix_rank(places, tol=1e-6 * np.abs(places).max()) == 2
-    if not spans:
-        return StageFit(z_um, len(seen), None, 0.0, 0.0, 0.0, 0.0)
-    residuals, gain_error, rotation_mrad, anisotropy = fit_stage(places, shifts, nominal)
+    if spans:
+        residuals, gain_error, rotation_mrad, anisotropy = fit_stage(places, shifts, nominal)
+    elif seen:  # points on one line through the centre: a turn and a scale, no more, can be told
+        residuals, gain_error, rotation_mrad = _fit_line(places, shifts, nominal)
+        anisotropy = 0.0
+    else:
+        return StageFit(z_um, 0, None, 0.0, 0.0, 0.0, 0.0)
     for index, residual in zip(seen, residuals, strict=True):
         judged[index] = replace(judged[index], step_px=float(residual))
         if residual > MAX_STEP_PX:

@@ -252,6 +252,23 @@ def test_the_stage_fit_ignores_a_slip_and_finds_scale_and_rotation() -> None:
     assert np.delete(residuals, 7).max() < 0.2
 
 
+def test_points_on_a_line_are_held_against_the_stage_too(bench: Bench, tmp_path: Path) -> None:
+    line = tuple((x, 0.0, Z_UM) for x in (-12e3, -6e3, 0.0, 6e3, 12e3))
+    world = world_of(bench)
+    carrier = world._carrier
+
+    def slip(status: RunStatus) -> None:
+        step = status.step
+        here = step is not None and step.label == "psf" and step.source_um == line[3]
+        world.carry_source((lambda: (8e3, 0.0, Z_UM)) if here else carrier)
+
+    sweep = replace(SWEEP, points_um=line, retakes=0)
+    done = calibrate_sweep(bench, sweep, tmp_path, on_progress=slip)
+    (stage,) = done.stages
+    assert stage.gain_error == pytest.approx(0, abs=5e-3)
+    assert [q.source_um for q in done.quality if q.retake] == [line[3]]
+
+
 @pytest.mark.parametrize(("width", "binning"), [(2.2, 1), (4.6, 2), (9.0, 3)])
 def test_binning_stops_at_the_finest_structure(width: float, binning: int) -> None:
     from scipy.ndimage import gaussian_filter
