@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
-HEADER_BYTES = 48
 _SIGNATURE = b"Spld"
 _UNCOMPRESSED, _RLE, _ENHANCED_RLE = 0, 1, 2
 _MAX_RLE_RUN = 255

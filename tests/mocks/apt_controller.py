@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,6 +31,8 @@ class AptAxis:
     motion: MovingAxis
     enabled: bool = False
     acceleration: int = 4506
+    fastest: float = math.inf
+    """Counts a second that the controller does not let the speed exceed."""
     faults: int = 0
     was_moving: bool = False
     extra: dict[str, int] = field(default_factory=dict)
@@ -144,7 +147,7 @@ class AptController:
                 return self._short(0x0212, first, 1 if axis.enabled else 2, to)
             case 0x0413:
                 _, _, axis.acceleration, fastest = struct.unpack("<Hlll", data)
-                motion.speed_per_s = fastest / self._scale
+                motion.speed_per_s = min(fastest / self._scale, axis.fastest)
             case 0x0414:
                 values = (first, 0, axis.acceleration, round(motion.speed_per_s * self._scale))
                 return self._long(0x0415, to, struct.pack("<Hlll", *values))
