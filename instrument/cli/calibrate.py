@@ -19,7 +19,7 @@ from instrument.errors import BenchError
 from instrument.plan import Span
 from recon.optics.fall_off import FallOff, gaussian_fall_off
 
-app = command_app("Measure point spread functions (PSFs), or how an SLM answers.")
+app = command_app("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
 _MAX_PLANES = 256
 
 ZMin = Annotated[float, typer.Option("--z-min", metavar="MM", help="Nearest plane, from the diffuser.")]

@@ -31,7 +31,9 @@ COMMANDS: Mapping[str, Command] = {
     "devices": Command(
         BENCH, "list what is connected: USB, HID, serial, video, GenICam, displays", "instrument.cli.devices"
     ),
-    "calibrate": Command(BENCH, "measure point spread functions, or an SLM", "instrument.cli.calibrate"),
+    "calibrate": Command(
+        BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "instrument.cli.calibrate"
+    ),
     "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
     "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.run_plan"),
