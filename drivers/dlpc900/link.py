@@ -105,8 +105,7 @@ class HidLink:
             if self._hid is None:
                 raise DeviceNotOpenError(self._device)
             self._sequence = (self._sequence + 1) % 256
-            for report in reports(command, data, self._sequence, read=read):
-                self._send(report)
+            self._send_whole(list(reports(command, data, self._sequence, read=read)))
             reply = self._receive(self._sequence, command)
             if reply.refused:
                 raise DeviceError(
@@ -118,6 +117,18 @@ class HidLink:
         if refused is Command.ERROR_CODE:
             return "it does not say why"
         return error_words(self.read(Command.ERROR_CODE, 1)[0])
+
+    def _send_whole(self, message: list[bytes]) -> None:
+        """Send a message to its end even on Ctrl-C: the next one would be taken for the rest of it."""
+        for number, report in enumerate(message, 1):
+            try:
+                self._send(report)
+            except DeviceError:
+                raise
+            except BaseException:  # raised behind the call that it interrupted: that report is sent
+                for rest in message[number:]:
+                    self._send(rest)
+                raise
 
     def _send(self, report: bytes) -> None:
         try:

@@ -449,6 +449,28 @@ def test_an_upload_that_begins_while_blanking_is_under_way_ends_too(
         np.testing.assert_array_equal(board.shown, pattern())
 
 
+def test_ctrl_c_within_a_message_does_not_swallow_the_next_one(
+    board: Dlpc900Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with slm(compression="none") as device:
+        device.display(pattern())
+        write = device._link._hid.write
+        left = [9]  # reports: within a message of image data
+
+        def interrupted(report: bytes) -> int:
+            written: int = write(report)
+            left[0] -= 1
+            if left[0] == 0:  # where Python raises what came during a call
+                raise KeyboardInterrupt
+            return written
+
+        monkeypatch.setattr(device._link._hid, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            device.display(pattern(1))
+        device.display(pattern(2))
+        np.testing.assert_array_equal(board.shown, pattern(2))
+
+
 def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
