@@ -17,6 +17,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.registration import displacement
 from recon.types import Calibration
+from recon.volume.model import members_of_depths
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -169,13 +170,13 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
     Where the calibration has the depth (to :data:`SAME_DEPTH` of the pattern's scale), its PSFs are returned
     as they are. Raises as :func:`refocus`.
     """
-    z = calibration.source_positions_um[:, 2]
     distance_um = _distance_um(calibration)
+    z, _ = central_psfs(calibration)
     same = np.array([abs(paraxial_scale(v, z_um, distance_um) - 1) < SAME_DEPTH for v in z])
     if same.any():
         return calibration, None
     made = refocus(calibration, z_um)
-    nearest = int(np.argmin(np.abs(1 / z - 1 / z_um)))
+    nearest = int(np.argmin(np.abs(1 / calibration.source_positions_um[:, 2] - 1 / z_um)))
     x, y, _ = calibration.source_positions_um[nearest]
     provenance = {**calibration.provenance, "refocused_to_um": z_um, "refocused_from_um": made.from_z_um}
     return (
@@ -203,12 +204,10 @@ def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Flo
     if not np.isfinite(positions[:, 2]).all() or (positions[:, 2] <= 0).any():
         raise InputError("The depths of the calibration's PSFs are not known, so none can be refocused.")
     off_axis = np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))
-    depths = np.unique(positions[:, 2])
-    chosen = []
-    for depth in depths:
-        members = np.flatnonzero(positions[:, 2] == depth)
-        chosen.append(members[int(np.argmin(off_axis[members]))])
-    return depths, calibration.psfs[chosen]
+    # PSFs of one depth may differ a little in z: the stage says where it truly stopped.
+    chosen = [members[int(np.argmin(off_axis[members]))] for members in members_of_depths(positions)]
+    chosen.sort(key=lambda k: float(positions[k, 2]))
+    return positions[chosen, 2], calibration.psfs[chosen]
 
 
 def _mixed(

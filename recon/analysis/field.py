@@ -11,6 +11,7 @@ import numpy.typing as npt
 from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate
 from recon.errors import InputError
 from recon.types import Calibration
+from recon.volume.model import members_of_depths
 
 Array = npt.NDArray[Any]
 
@@ -109,9 +110,11 @@ def across_field(calibration: Calibration, z_um: float | None = None) -> tuple[F
     positions = calibration.source_positions_um
     if not np.isfinite(positions).all():
         return ()
-    depths, counts = np.unique(positions[:, 2], return_counts=True)
-    depth = depths[np.argmax(counts)] if z_um is None else depths[np.argmin(np.abs(1 / depths - 1 / z_um))]
-    members = np.flatnonzero(positions[:, 2] == depth)
+    groups = members_of_depths(positions)
+    if z_um is None:
+        members = max(groups, key=len)
+    else:
+        members = min(groups, key=lambda g: abs(1 / float(positions[g, 2].mean()) - 1 / z_um))
     centre = members[int(np.argmin(np.hypot(positions[members, 0], positions[members, 1])))]
     reference = calibration.psfs[centre].mean(axis=0)
     width = _spot_px(autocorrelate(reference))

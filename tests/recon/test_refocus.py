@@ -8,8 +8,9 @@ import pytest
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import similarity
+from recon.analysis.field import across_field
 from recon.errors import InputError
-from recon.refocus import at_depth, paraxial_scale, refocus, refocus_psf, rescaled
+from recon.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf, rescaled
 from recon.registration import register
 from recon.types import Calibration, Geometry
 
@@ -92,6 +93,20 @@ def test_the_displacement_error_grows_with_distance_and_deflection() -> None:
     assert refocus(calibration, 120e3, deflection_deg=0.5).displacement_error_um == pytest.approx(2 * far)
     s = paraxial_scale(60e3, 120e3, WORLD.distance_um)
     assert far == pytest.approx(np.deg2rad(0.25) * WORLD.distance_um * abs(1 - 1 / s))
+
+
+def test_a_grid_whose_depths_the_stage_missed_a_little_is_one_depth() -> None:
+    places = [(0.0, 0.0, 60e3), (4000.0, 0.0, 60.01e3), (0.0, 0.0, 100e3), (4000.0, 0.0, 99.99e3)]
+    psfs = np.stack([WORLD.psf(p, GREEN) for p in places])[:, None]
+    grid = Calibration(psfs, np.array(places), geometry=WORLD.geometry)
+    depths, central = central_psfs(grid)
+    assert list(depths) == [60e3, 100e3]
+    np.testing.assert_array_equal(central, psfs[[0, 2]])
+    assert refocus(grid, 75e3).from_z_um == (60e3, 100e3)
+    points = across_field(grid)
+    assert len(points) == 2
+    assert points[1].angle_deg == pytest.approx(np.rad2deg(np.arctan(4 / 60)), abs=0.05)
+    assert points[1].similarity > 0.95
 
 
 def test_rescaling_keeps_the_centre_and_moves() -> None:
