@@ -4,7 +4,8 @@ The dissertation solves ``min_{y, g} 1/2 ||b - (A y + g)||^2 + prior(y)`` for ``
 only. Given ``y``, the best ``g`` is the projection of ``b - A y`` onto those frequencies; put back, what is
 left is ``min_y 1/2 ||P (b - A y)||^2 + prior(y)`` with ``P`` the projection onto the rest. So the joint
 problem needs no further unknowns, no step of its own and no start for ``g``: ``P`` is one more factor of the
-operator. (The dissertation also asks for ``g >= 0``; that is reported here, not enforced.)
+operator. The dissertation also asks for ``g >= 0``: :meth:`BackgroundRemoval.non_negative` is the projection
+onto backgrounds that obey it (see :mod:`recon.volume.positive_background`).
 
 A prior that does not mind a smooth object (total variation) leaves object and background to be exchanged for
 one another; l1, as in Eq. 6.2, does not.
@@ -16,6 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.operators.base import Array, LinearOperator
+
+_SAMPLES = 6
+"""Points at which non-negativity is asked for, for each frequency along an axis."""
 
 
 class BackgroundRemoval(LinearOperator):
@@ -68,6 +72,34 @@ class BackgroundRemoval(LinearOperator):
             coefficients = self._rows @ masked.astype(np.float64) @ self._columns.T
             best = (self._inverse[channel] @ coefficients.ravel()).reshape(coefficients.shape)
             fitted[channel] = self._rows.T @ best @ self._columns
+        return fitted
+
+    def non_negative(self, y: Array) -> Array:
+        """Return the smooth image nearest to ``y`` on the valid pixels that is nowhere negative.
+
+        A quadratic problem in a few coefficients, solved exactly through its dual by non-negative least
+        squares, with ``g >= 0`` on a grid several times finer than the highest frequency; what is left
+        between the grid's points is lifted off.
+        """
+        from scipy.optimize import nnls
+
+        rows, columns = (
+            basis[:, np.unique(np.linspace(0, basis.shape[1] - 1, _SAMPLES * len(basis)).astype(int))]
+            for basis in (self._rows, self._columns)
+        )
+        samples = np.einsum("ay,bx->yxab", rows, columns).reshape(-1, len(rows) * len(columns))
+        fitted = np.empty(self.range_shape, self.dtype)
+        for channel, image in enumerate(y):
+            masked = image if self._valid is None else image * self._valid[channel]
+            wanted = (self._rows @ masked.astype(np.float64) @ self._columns.T).ravel()
+            values, vectors = np.linalg.eigh(self._inverse[channel])
+            root = (vectors * np.sqrt(np.maximum(values, 0))).T
+            scale = max(float(np.abs(root @ wanted).max()), 1e-30)
+            push, _ = nnls(root @ samples.T, -(root @ wanted) / scale)
+            best = self._inverse[channel] @ (wanted + scale * (samples.T @ push))
+            best = best.reshape(len(self._rows), len(self._columns))
+            smooth = self._rows.T @ best @ self._columns
+            fitted[channel] = smooth - min(float(smooth.min()), 0.0)
         return fitted
 
     def forward(self, x: Array, out: Array | None = None) -> Array:

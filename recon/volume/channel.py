@@ -100,7 +100,9 @@ class ChannelProblem:
             raise InputError(
                 f"The {model} model runs on the cpu only. Choose the model convolution for the {device}."
             )
-        self.data = scaled.data[channel : channel + 1]
+        self.data = self._measured = scaled.data[channel : channel + 1]
+        self._weight = 0.0
+        self._removed: BackgroundRemoval | None = None
         self.valid = scaled.valid[channel]
         self.prior = prior
         self.weights = weights
@@ -195,6 +197,20 @@ class ChannelProblem:
         rest: Array = self._removal.background(self.data - self.camera.forward(solution))
         return np.asarray(rest[0])
 
+    def positive_background(self, solution: Array) -> Array:
+        """Return the smooth background >= 0 nearest to what a solution leaves of the data."""
+        removal = self._removal or self._removed
+        if removal is None:
+            raise ValueError("No background was asked for.")
+        rest: Array = removal.non_negative(self._measured - self.camera.forward(solution))
+        return np.asarray(rest[0])
+
+    def with_background(self, background: Array, start: Array) -> Solver:
+        """Take a background for given, and return a solver for what is left, with the same weight."""
+        self._removed, self._removal = self._removal or self._removed, None
+        self.data = np.where(self.valid, self._measured - background, 0)
+        return self._solver(start)
+
     def solver(self, tau: float | None, start: Array | None) -> tuple[Solver, float]:
         """Return a solver, and the prior's weight relative to ``max |A^H b|``."""
         data = self.data if self._removal is None else self._removal.forward(self.data)
@@ -204,40 +220,38 @@ class ChannelProblem:
             tau = max(NOISE_WEIGHT[kind] / peak if peak > 0 else 0.0, LEAST_TAU[kind])
         if not 0 <= tau < np.inf:
             raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
-        weight = 0.0 if self.prior == "nonnegative" else tau * peak
+        self._weight = 0.0 if self.prior == "nonnegative" else tau * peak
+        return self._solver(start), tau
+
+    def _solver(self, start: Array | None) -> Solver:
+        weight = self._weight
         if isinstance(self.camera, SpatiallyVarying):
-            return self._general(self.camera, weight, start), tau
+            return self._general(self.camera, weight, start)
         if self._namespace is not np:
-            return self._plain(self.camera, weight, start), tau
-        if kind == "l1":
-            return (
-                DouglasRachford(
-                    self.camera,
-                    self.data,
-                    weight,
-                    valid=self.valid,
-                    background=self._removal,
-                    initial=start,
-                    drop_empty=self.drop_empty,
-                    keep_state=False,
-                    storage=self._storage,
-                ),
-                tau,
-            )
-        return (
-            LeanTotalVariation(
+            return self._plain(self.camera, weight, start)
+        if not self.prior.startswith("tv"):
+            return DouglasRachford(
                 self.camera,
                 self.data,
                 weight,
-                axis_weights=self.weights,
-                isotropic=self.prior == "tv-isotropic",
                 valid=self.valid,
                 background=self._removal,
                 initial=start,
+                drop_empty=self.drop_empty,
                 keep_state=False,
                 storage=self._storage,
-            ),
-            tau,
+            )
+        return LeanTotalVariation(
+            self.camera,
+            self.data,
+            weight,
+            axis_weights=self.weights,
+            isotropic=self.prior == "tv-isotropic",
+            valid=self.valid,
+            background=self._removal,
+            initial=start,
+            keep_state=False,
+            storage=self._storage,
         )
 
     def _plain(self, camera: Convolution3D, weight: float, start: Array | None) -> Solver:

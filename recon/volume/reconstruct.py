@@ -23,6 +23,7 @@ from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
 from recon.volume.model import Depths, ModelName, choose_model, sort_by_depth
+from recon.volume.positive_background import in_turns, is_negative
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 Array = npt.NDArray[Any]
@@ -144,8 +145,13 @@ def reconstruct_volume(
                 callback(record, lambda: solver.solution[0][:, window[0], window[1]] * np.float32(scale))
 
         outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
+        smooth_part = run.background(outcome.solution) if smooth else None
+        if smooth_part is not None and is_negative(smooth_part):
+            outcome, smooth_part, solver = in_turns(
+                run, outcome, rules, tell if callback is not None else None, cancel
+            )
         volumes.append(outcome.solution[0][:, window[0], window[1]] * np.float32(scale))
-        backgrounds.append(run.background(outcome.solution) * scaled.noise[channel] if smooth else None)
+        backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
         empty.append(solver.empty if isinstance(solver, DouglasRachford) else EmptyPlanes())

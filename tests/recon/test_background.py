@@ -60,3 +60,25 @@ def test_background_is_recovered():
     assert error(blind) > 2 * error(found)
     estimate = removal.background(data - camera.forward(found))
     assert np.linalg.norm(estimate - background) < 0.01 * np.linalg.norm(background)
+
+
+def test_non_negative_background_is_the_nearest():
+    """Against a slow projected search over the coefficients."""
+    rng = np.random.default_rng(7)
+    valid = rng.random((24, 20)) > 0.3
+    removal = BackgroundRemoval((1, 24, 20), (3, 3), valid, np.float64)
+    y = rng.standard_normal((1, 24, 20)) + np.linspace(-2, 3, 20)
+    found = removal.non_negative(y)
+    assert found.min() >= -1e-12
+    assert removal.background(y).min() < -1
+    np.testing.assert_allclose(removal.background(np.where(valid, found, 0)), found, atol=1e-8)
+
+    def miss(g):
+        return float(np.sum(np.where(valid, g - y, 0) ** 2))
+
+    for _ in range(300):
+        other = removal.background(rng.standard_normal((1, 24, 20))) * rng.choice([0.1, 1.0]) + found
+        if other.min() >= 0:
+            assert miss(other) >= 0.999 * miss(found)
+    positive = np.full((1, 24, 20), 5.0)
+    np.testing.assert_allclose(removal.non_negative(positive), positive)

@@ -386,3 +386,19 @@ def test_a_picture_of_colour_and_its_refusals():
         reconstruct(b, c.psfs[0, 0], model="lowrank")
     with pytest.raises(InputError, match="Did you mean 'local'"):
         reconstruct(b, c, model="locl")
+
+
+@pytest.mark.parametrize("prior", ["l1", "tv"])
+def test_a_background_is_not_negative(prior):
+    """A dark level taken off too high asks for a negative background: Eq. 6.2 does not allow one."""
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    b = measurement() - 400 * (1 + np.cos(np.pi * x) * np.cos(np.pi * y))
+    seen = []
+    result = reconstruct_volume(
+        b, calibration(), prior=prior, iterations=60, callback=lambda r, v: seen.append(v().shape)
+    )
+    assert result.background.min() >= 0
+    iterations = [r.iteration for r in result.histories[0]]
+    assert iterations == list(range(1, len(iterations) + 1))
+    assert len(seen) == len(iterations) > 60
+    assert abs(where(result.volume, BEADS[0])[0] - BEADS[0][2]) <= 1.5
