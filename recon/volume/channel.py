@@ -101,7 +101,7 @@ class ChannelProblem:
                 f"The {model} model runs on the cpu only. Choose the model convolution for the {device}."
             )
         self.data = self._measured = scaled.data[channel : channel + 1]
-        self._weight = 0.0
+        self.weight = 0.0
         self._removed: BackgroundRemoval | None = None
         self.valid = scaled.valid[channel]
         self.prior = prior
@@ -220,11 +220,11 @@ class ChannelProblem:
             tau = max(NOISE_WEIGHT[kind] / peak if peak > 0 else 0.0, LEAST_TAU[kind])
         if not 0 <= tau < np.inf:
             raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
-        self._weight = 0.0 if self.prior == "nonnegative" else tau * peak
+        self.weight = 0.0 if self.prior == "nonnegative" else tau * peak
         return self._solver(start), tau
 
     def _solver(self, start: Array | None) -> Solver:
-        weight = self._weight
+        weight = self.weight
         if isinstance(self.camera, SpatiallyVarying):
             return self._general(self.camera, weight, start)
         if self._namespace is not np:
