@@ -197,6 +197,11 @@ class ChannelProblem:
         rest: Array = self._removal.background(self.data - self.camera.forward(solution))
         return np.asarray(rest[0])
 
+    @property
+    def has_room_for_turns(self) -> bool:
+        """Whether memory holds a volume more, for one that another run starts from."""
+        return 4 * int(np.prod(self.camera.domain_shape)) + self.plan.total <= self.plan.work + self.plan.room
+
     def positive_background(self, solution: Array) -> Array:
         """Return the smooth background >= 0 nearest to what a solution leaves of the data."""
         removal = self._removal or self._removed

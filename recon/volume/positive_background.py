@@ -20,8 +20,10 @@ from recon.volume.channel import ChannelProblem
 
 TURNS = 4
 """At most so many turns, each with a warm start."""
-SLIGHT = 0.1
-"""What a background may miss zero by, or change in a turn that counts as the last, in noise deviations."""
+SLIGHT = 1.0
+"""What a background may miss zero by, in noise deviations of a pixel: less is no reason for turns."""
+SETTLED = 0.1
+"""Change of the background in a turn that counts as the last, in noise deviations."""
 
 
 def is_negative(background: Array) -> bool:
@@ -35,8 +37,8 @@ def in_turns(
     rules: StoppingRules,
     callback: Callback | None,
     cancel: threading.Event | None,
-) -> tuple[Outcome, Array, Solver]:
-    """Improve background and volume in turn.
+) -> tuple[Outcome, Array, Solver | None]:
+    """Improve background and volume in turn; without turns where the run was ended early or memory is short.
 
     Parameters
     ----------
@@ -53,12 +55,15 @@ def in_turns(
         The last volume, with the history of everything.
     ndarray, (height, width)
         The background, in noise deviations.
-    Solver
-        The last turn's.
+    Solver or None
+        The last turn's; None where there was none.
     """
     history, seconds = list(outcome.history), outcome.seconds
     background = run.positive_background(outcome.solution)
-    for _ in range(TURNS):
+    solver: Solver | None = None
+    for _ in range(TURNS if run.has_room_for_turns else 0):
+        if outcome.stop_reason not in (StopReason.CONVERGED, StopReason.ITERATIONS):
+            break
         left = None if rules.time_s is None else max(rules.time_s - seconds, 1e-3)
         solver = run.with_background(background, outcome.solution)
         outcome = solver.run(replace(rules, time_s=left), callback=callback, cancel=cancel)
@@ -66,7 +71,6 @@ def in_turns(
             history.append(replace(record, iteration=len(history) + 1, seconds=seconds + record.seconds))
         seconds += outcome.seconds
         before, background = background, run.positive_background(outcome.solution)
-        settled = float(np.abs(background - before).max()) <= SLIGHT
-        if settled or outcome.stop_reason not in (StopReason.CONVERGED, StopReason.ITERATIONS):
+        if float(np.abs(background - before).max()) <= SETTLED:
             break
     return Outcome(outcome.solution, tuple(history), outcome.stop_reason, seconds), background, solver

@@ -147,9 +147,10 @@ def reconstruct_volume(
         outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
         smooth_part = run.background(outcome.solution) if smooth else None
         if smooth_part is not None and is_negative(smooth_part):
-            outcome, smooth_part, solver = in_turns(
+            outcome, smooth_part, last = in_turns(
                 run, outcome, rules, tell if callback is not None else None, cancel
             )
+            solver = last or solver
         volumes.append(outcome.solution[0][:, window[0], window[1]] * np.float32(scale))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
