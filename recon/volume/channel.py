@@ -157,7 +157,7 @@ class ChannelProblem:
 
     def memory_used(self) -> str:
         """Say what was planned, and what had to go to disk."""
-        on_disk = self._storage.on_disk
+        on_disk = min(self._storage.on_disk, self.plan.state)  # turns of a run put theirs there anew
         if not on_disk:
             return str(self.plan)
         share = on_disk / max(self.plan.state, 1)
@@ -197,11 +197,6 @@ class ChannelProblem:
         rest: Array = self._removal.background(self.data - self.camera.forward(solution))
         return np.asarray(rest[0])
 
-    @property
-    def has_room_for_turns(self) -> bool:
-        """Whether memory holds a volume more, for one that another run starts from."""
-        return 4 * int(np.prod(self.camera.domain_shape)) + self.plan.total <= self.plan.work + self.plan.room
-
     def positive_background(self, solution: Array) -> Array:
         """Return the smooth background >= 0 nearest to what a solution leaves of the data."""
         removal = self._removal or self._removed
@@ -210,11 +205,11 @@ class ChannelProblem:
         rest: Array = removal.non_negative(self._measured - self.camera.forward(solution))
         return np.asarray(rest[0])
 
-    def with_background(self, background: Array, start: Array) -> Solver:
+    def with_background(self, background: Array) -> Solver:
         """Take a background for given, and return a solver for what is left, with the same weight."""
         self._removed, self._removal = self._removal or self._removed, None
         self.data = np.where(self.valid, self._measured - background, 0)
-        return self._solver(start)
+        return self._solver(None)
 
     def solver(self, tau: float | None, start: Array | None) -> tuple[Solver, float]:
         """Return a solver, and the prior's weight relative to ``max |A^H b|``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
 from recon.volume.model import Depths, ModelName, choose_model, sort_by_depth
-from recon.volume.positive_background import in_turns, is_negative
+from recon.volume.positive_background import in_turns, is_negative, may_go_on
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 Array = npt.NDArray[Any]
@@ -147,10 +148,19 @@ def reconstruct_volume(
         outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
         smooth_part = run.background(outcome.solution) if smooth else None
         if smooth_part is not None and is_negative(smooth_part):
-            outcome, smooth_part, last = in_turns(
-                run, outcome, rules, tell if callback is not None else None, cancel
-            )
-            solver = last or solver
+            smooth_part = run.positive_background(outcome.solution)
+            if may_go_on(outcome):
+                first = replace(outcome, solution=np.empty(0))
+                del solver, outcome
+                outcome, smooth_part, solver = in_turns(
+                    smooth_part,
+                    first,
+                    run.with_background,
+                    run.positive_background,
+                    rules,
+                    tell if callback is not None else None,
+                    cancel,
+                )
         volumes.append(outcome.solution[0][:, window[0], window[1]] * np.float32(scale))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
