@@ -115,13 +115,14 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
         if tests.sixteen_factor is not None:
             lines.append(("16 points need", f"{tests.sixteen_factor:.2g} times these separations"))
     holds = "not known" if a.convolution_holds_deg is None else f"to {a.convolution_holds_deg:.3g}°"
+    planes = f"{len(a.grid.z_um)} plane{'s' if len(a.grid.z_um) > 1 else ''} even in 1/z"
     lines += [
         ("convolution model holds", holds),
         ("model recommended", f"{a.model}"),
         ("", a.model_reason),
         (
             "voxels recommended",
-            f"binning {a.grid.binning}, {len(a.grid.z_um)} planes even in 1/z, "
+            f"binning {a.grid.binning}, {planes}, "
             f"{a.grid.lateral_um[0]:.3g} to {a.grid.lateral_um[-1]:.3g} µm across",
         ),
     ]
@@ -317,7 +318,7 @@ def _voxels(axes: Axes, a: Analysis) -> None:
         axes.plot(
             [share * tangent * z[0], share * tangent * z[-1]], [z[0], z[-1]], color=_COLORS[0], linewidth=0.5
         )
-    _style(axes, f"Voxel grid to scale: {len(z)} planes", "x, mm", "z, mm")
+    _style(axes, f"Voxel grid to scale: {len(z)} plane{'s' if len(z) > 1 else ''}", "x, mm", "z, mm")
     axes.grid(False)
     if len(z) > 1:
         axes.set_aspect("equal", adjustable="datalim")

@@ -132,9 +132,9 @@ def analyze(
     with saying_what_is_left(out, record):
         with one_task("analyze") as advance:
             analysis = analyse(measured, settings, progress=lambda _what, share: advance(share * 100, 100))
-        figure = draw_analysis(
-            analysis, f"What the camera can do: {folder.resolve().name}", simulated=simulated
-        )
+        place = folder.resolve()
+        name = place.parent.name if place.name == "calibration" else place.name
+        figure = draw_analysis(analysis, f"What the camera can do: {name}", simulated=simulated)
         with whole_file(out) as file:
             save_figure(figure, file)
         described = {

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate
 from recon.errors import InputError
+from recon.registration import register
 from recon.types import Calibration
 from recon.volume.model import members_of_depths
 
@@ -84,7 +85,7 @@ class FieldPoint:
     angle_deg : float
         Between the directions of both sources.
     similarity : float
-        Inner product after registration to the nearest pixel.
+        Inner product after registration between pixels, over those that both show.
     spot : float
         Width of the cross-correlation over that of the central PSF's autocorrelation: the size of the spot
         that the convolution model makes of a point there.
@@ -120,15 +121,17 @@ def across_field(calibration: Calibration, z_um: float | None = None) -> tuple[F
     width = _spot_px(autocorrelate(reference))
     points = []
     for k in members:
-        correlation = correlate(reference, calibration.psfs[k].mean(axis=0))
+        psf = calibration.psfs[k].mean(axis=0)
+        # Off the axis the sensor's edge cuts the pattern: only pixels that both show are compared.
+        likeness = 1.0 if k == centre else register(psf, reference).similarity
         points.append(
             FieldPoint(
                 x_um=float(positions[k, 0]),
                 y_um=float(positions[k, 1]),
                 z_um=float(positions[k, 2]),
                 angle_deg=_angle_between_deg(positions[k], positions[centre]),
-                similarity=correlation.maximum,
-                spot=_spot_px(correlation) / width,
+                similarity=likeness,
+                spot=_spot_px(correlate(reference, psf)) / width,
             )
         )
     return tuple(sorted(points, key=lambda p: p.angle_deg))
@@ -141,12 +144,9 @@ def convolution_holds_deg(points: tuple[FieldPoint, ...]) -> float | None:
     """
     if len(points) < 2:
         return None
-    held = 0.0
-    for point in points:
-        if point.spot > HOLDS:
-            break
-        held = point.angle_deg
-    return held
+    first = min((p.angle_deg for p in points if p.spot > HOLDS), default=np.inf)
+    # Points of a ring are at one angle but for the stage's error.
+    return max((p.angle_deg for p in points if p.angle_deg < first - 0.1), default=0.0)
 
 
 def _spot_px(correlation: Any) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.analysis.correlation import autocorrelate, correlate, critical_scale, similarity
-from recon.analysis.field import field_of_view
+from recon.analysis.field import FieldPoint, convolution_holds_deg, field_of_view
 from recon.analysis.resolution import AxialResolution, axial_resolution, lateral_resolution
 from recon.analysis.sampling import axial_spacing_per_um, gaussian_response, lateral_spacing_um, voxel_grid
 from recon.errors import InputError
@@ -122,3 +122,13 @@ def test_the_voxel_grid_is_even_in_inverse_depth_and_nyquist() -> None:
         resolution_px=1.0, step_per_um=1e-9, z_range_um=(5e3, 50e3), pitch_um=1.0, distance_um=1e3
     )
     assert not huge.complete
+
+
+def test_the_convolution_model_holds_up_to_the_last_angle_before_a_wide_spot() -> None:
+    def point(angle: float, spot: float) -> FieldPoint:
+        return FieldPoint(0.0, 0.0, 1e4, angle, 0.9, spot)
+
+    ring = (point(0.0, 1.0), point(10.0, 1.02), point(16.0, 1.0), point(16.01, 1.3), point(20.0, 1.05))
+    assert convolution_holds_deg(ring) == 10.0
+    assert convolution_holds_deg(ring[:3]) == 16.0
+    assert convolution_holds_deg(ring[:1]) is None
