@@ -40,6 +40,7 @@ def reconstruct_volume(
     axis_weights: npt.ArrayLike | None = None,
     model: ModelName = "auto",
     estimate_background: bool | None = None,
+    positive_background: bool = False,
     background: npt.ArrayLike | None = None,
     erasures: npt.ArrayLike | None = None,
     noise: NoiseModel | float | None = None,
@@ -76,6 +77,9 @@ def reconstruct_volume(
     estimate_background : bool, optional
         Estimate a smooth background as well (Eq. 6.2). Default: unless ``background`` is given. Stray light
         that the model cannot explain otherwise ends up as haze in the outermost planes.
+    positive_background : bool
+        Where the estimated background comes out negative, improve volume and a background ``>= 0`` in turn:
+        up to three runs more, each with ``iterations`` of its own.
     background, erasures, noise
         As :func:`recon.reconstruct`.
     iterations, time_s, tolerance : optional
@@ -147,7 +151,7 @@ def reconstruct_volume(
 
         outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
         smooth_part = run.background(outcome.solution) if smooth else None
-        if smooth_part is not None and is_negative(smooth_part):
+        if positive_background and smooth_part is not None and is_negative(smooth_part):
             smooth_part = run.positive_background(outcome.solution)
             if may_go_on(outcome):
                 first = replace(outcome, solution=np.empty(0))

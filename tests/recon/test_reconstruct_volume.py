@@ -394,8 +394,16 @@ def test_a_background_is_not_negative(prior):
     b = measurement() - 400 * (1 + np.cos(np.pi * x) * np.cos(np.pi * y))
     seen = []
     result = reconstruct_volume(
-        b, calibration(), prior=prior, iterations=60, callback=lambda r, v: seen.append(v().shape)
+        b,
+        calibration(),
+        prior=prior,
+        positive_background=True,
+        iterations=60,
+        callback=lambda r, v: seen.append(v().shape),
     )
+    free = reconstruct_volume(b, calibration(), prior=prior, iterations=60)
+    assert free.background.min() < -50
+    assert len(free.histories[0]) <= 60
     assert result.background.min() >= 0
     iterations = [r.iteration for r in result.histories[0]]
     assert iterations == list(range(1, len(iterations) + 1))
