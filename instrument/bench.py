@@ -8,6 +8,7 @@ import logging
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self, cast
@@ -52,6 +53,8 @@ class Bench:
     def __init__(self, config: BenchConfig, ask: Ask | None = None) -> None:
         self.config = config
         self._claims: list[Claim] = []
+        self._opened: set[Device] = set()
+        """Devices that were opened and not closed again: one that is not open any more was lost."""
         self.shared: Mapping[str, SharedPart] = {
             name: shared.part(shared.options) for name, shared in config.shared.items()
         }
@@ -109,6 +112,7 @@ class Bench:
         self._claim(kind)
         device = self.devices[kind]
         device.open()
+        self._opened.add(device)
         if kind == "camera":
             try:
                 apply_table(cast(CameraTable, self.config.devices[kind].settings), self.camera)
@@ -287,7 +291,10 @@ class Bench:
             After everything was tried, naming what failed.
         """
         steps = self._safe_steps()
-        steps += [(f"close {device.name}", device.close) for device in reversed(list(self.devices.values()))]
+        steps += [
+            (f"close {device.name}", partial(self._close_device, device))
+            for device in reversed(list(self.devices.values()))
+        ]
         steps += [(f"release {claim.resource}", claim.release) for claim in self._claims]
         self._claims = []
         try:
@@ -295,10 +302,19 @@ class Bench:
         finally:
             _open_benches.discard(self)
 
+    def _close_device(self, device: Device) -> None:
+        self._opened.discard(device)
+        device.close()
+
     def _safe_steps(self) -> list[Step]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe
         return safe_steps(
-            self.led_array, self._lights.scene_switch, self.stage, self.camera, self.slm if blanks else None
+            self.led_array,
+            self._lights.scene_switch,
+            self.stage,
+            self.camera,
+            self.slm if blanks else None,
+            self._opened,
         )
 
     def _close_after(self, error: BaseException) -> None:

@@ -21,6 +21,7 @@ from drivers.led_array import OFF, LedArray, LedPattern, Rgb
 _log = logging.getLogger(__name__)
 _OVERTAKE_S = 0.2
 """What is still busy so long after ``off`` began to send after it was cancelled, and is cancelled again."""
+_MAY_BE_ON = "The light may be on: look, and pull its supply if so; then check its cable and reconnect."
 
 
 class IlluminateOptions(DriverOptions):
@@ -250,10 +251,18 @@ class IlluminateLedArray(LedArray):
         Raises
         ------
         DeviceError
-            When it does not confirm: the light may be on.
+            When it does not confirm, or was lost: the light may be on.
         """
         if self._geometry is None:
             raise DeviceNotOpenError(self.name)
+        try:
+            self._darken()
+        except (DeviceNotOpenError, StoppedError):  # closed meanwhile, and darkened by that
+            raise
+        except DeviceError as error:
+            raise DeviceError(self.name, error.problem, _MAY_BE_ON) from error
+
+    def _darken(self) -> None:
         self._darkenings += 1
         self.link.darken_at_once()
         while not self.commanding.acquire(timeout=_OVERTAKE_S):
@@ -277,11 +286,7 @@ class IlluminateLedArray(LedArray):
                     raise
                 continue  # another thread turned it off meanwhile, and overtook this question
             except DeviceTimeoutError as error:
-                raise DeviceError(
-                    self.name,
-                    f"does not confirm that it is off ({error.problem})",
-                    "The light may be on: check it, and its cable.",
-                ) from error
+                raise DeviceError(self.name, f"does not confirm that it is off ({error.problem})") from error
             return
 
     # More than the interface ------------------------------------------------------------------------
@@ -357,7 +362,7 @@ class IlluminateLedArray(LedArray):
         try:
             self.off()
         except DeviceError as another:
-            error.add_note(f"The light may be on: {another}")
+            error.add_note(f"Nor could the light be turned off: {another}")
 
     def remember(self, setting: str, restore: Callable[[], object]) -> None:
         """Keep how to bring a setting back when a lost array is opened again."""

@@ -242,9 +242,20 @@ def test_off_says_when_the_light_may_be_on(
     with driver_of(array) as leds:
         leds.set_pattern(leds.single(0))
         array.silent = True
-        with pytest.raises(DeviceError, match="does not confirm that it is off"):
+        with pytest.raises(DeviceError, match=r"does not confirm that it is off.*The light may be on"):
             leds.off()
         array.silent = False
+
+
+def test_off_of_a_lost_array_says_that_the_light_may_be_on(
+    array: IlluminateEmulator, leds: IlluminateLedArray
+) -> None:
+    leds.set_pattern(leds.single(0))
+    array.unplug()
+    wait_until(lambda: not leds.is_open)
+    with pytest.raises(DeviceError, match=r"was lost on .*The light may be on: look, and pull its supply"):
+        leds.off()
+    array.plug_in()
 
 
 def test_off_overtakes_a_sequence_that_begins_meanwhile(

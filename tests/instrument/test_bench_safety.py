@@ -13,7 +13,7 @@ from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
 from instrument.errors import BenchError, OperatorNeededError
 from instrument.safety import StepsFailedError
-from tests.mocks.devices import MockWorld
+from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
 
@@ -91,6 +91,43 @@ def test_an_error_inside_the_context_stays_the_error_and_carries_what_could_not_
         raise ZeroDivisionError
     assert calls(bench)[len(KINDS) :] == SAFE_STEPS + CLOSING
     assert "light off, led_array (mock)" in "".join(caught.value.__notes__)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("led_array", "The light may be on"), ("stage", "The stage may be moving")]
+)
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_device_that_was_lost_never_counts_as_safe(kind: str, words: str, fails: bool) -> None:
+    step = {"led_array": "off", "stage": "stop"}[kind]
+    bench = bench_with({kind: [step]} if fails else None).open()
+    device = bench.devices[kind]  # type: ignore[index]
+    assert isinstance(device, MockDevice)
+    device._open = False
+    for leave in (bench.safe_state, bench.close):
+        with pytest.raises(
+            StepsFailedError, match=rf"may not be safe[^$]*{kind} \(mock\).*{words}: look"
+        ) as caught:
+            leave()
+        assert caught.value.exit_code == 1
+        assert len(caught.value.failures) == 1
+    assert calls(bench)[-4:] == CLOSING
+    bench.close()  # closed: nothing left to doubt
+
+
+def test_the_error_that_a_lost_array_ends_with_carries_that_the_light_may_be_on() -> None:
+    bench = bench_with().open()
+    assert isinstance(bench.led_array, MockDevice)
+    bench.led_array._open = False
+    with pytest.raises(ZeroDivisionError) as caught, bench:
+        raise ZeroDivisionError
+    assert "led_array (mock): was lost. The light may be on" in "".join(caught.value.__notes__)
+
+
+def test_a_device_that_was_never_opened_is_safe() -> None:
+    bench = bench_with({"led_array": ["off"], "stage": ["stop"]})
+    bench.open_device("camera")
+    bench.close()
+    assert "led_array.off" not in calls(bench)
 
 
 def test_the_slm_keeps_its_image_when_so_configured() -> None:
