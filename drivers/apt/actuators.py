@@ -32,12 +32,14 @@ Family = Literal["servo", "stepper", "inertia"]
 
 @dataclass(frozen=True, slots=True)
 class Actuator:
-    """``counts`` and ``travel`` are in millimetres, or in degrees where it turns."""
+    """``counts``, ``travel`` and ``fastest`` are in millimetres, or in degrees where it turns."""
 
     family: Family
     counts: float
     travel: float
     turns: bool = False
+    fastest: float | None = None
+    """Units a second that its motor can do; None where only the controller sets a limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +53,16 @@ class Controller:
     """The first two digits of the serial numbers of this type."""
 
 
+Z8_MM_PER_S = 3.0
+"""The product pages say 2.4 to 2.6 mm/s; motors differ a little, and a speed that works is not refused."""
+
 ACTUATORS: Mapping[ActuatorName, Actuator] = {
-    "MTS25-Z8": Actuator("servo", 34_304, 25),
-    "MTS50-Z8": Actuator("servo", 34_304, 50),
-    "Z806": Actuator("servo", 34_304, 6),
-    "Z812": Actuator("servo", 34_304, 12),
-    "Z825": Actuator("servo", 34_304, 25),
-    "PRM1-Z8": Actuator("servo", 1919.64186, 360, turns=True),
+    "MTS25-Z8": Actuator("servo", 34_304, 25, fastest=Z8_MM_PER_S),
+    "MTS50-Z8": Actuator("servo", 34_304, 50, fastest=Z8_MM_PER_S),
+    "Z806": Actuator("servo", 34_304, 6, fastest=Z8_MM_PER_S),
+    "Z812": Actuator("servo", 34_304, 12, fastest=Z8_MM_PER_S),
+    "Z825": Actuator("servo", 34_304, 25, fastest=Z8_MM_PER_S),
+    "PRM1-Z8": Actuator("servo", 1919.64186, 360, turns=True, fastest=25.0),
     "DRV001": Actuator("stepper", 819_200, 8),
     "DRV225": Actuator("stepper", 409_600, 25),
     "DRV250": Actuator("stepper", 409_600, 50),
@@ -80,6 +85,18 @@ SPEED_SCALE: Mapping[Family, float] = {
     "inertia": 1.0,
 }
 """What the controllers call a velocity, over counts a second."""
+
+_LONG = 2**31 - 1
+
+FASTEST_COUNTS_PER_S: Mapping[Family, float] = {
+    "servo": _LONG / SPEED_SCALE["servo"],
+    "stepper": 50 * 409_600,  # 3000 turns a minute, of 200 steps with 2048 microsteps each
+    "inertia": 2000,
+}
+"""The fastest a controller takes: what its message can hold, or its manual's limit where that is less."""
+
+SLOWEST_COUNTS_PER_S: Mapping[Family, float] = {family: 1 / scale for family, scale in SPEED_SCALE.items()}
+"""The slowest speed that is not sent as zero: velocities are whole numbers."""
 
 SETTLING_COUNTS: Mapping[Family, int] = {"servo": 50, "stepper": 1, "inertia": 1}
 """How far from its target a move may end; a servo holds its place within some of its counts (1.5 um)."""

@@ -6,7 +6,14 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.apt.actuators import ACTUATORS, CONTROLLERS, ActuatorName, ControllerName
+from drivers.apt.actuators import (
+    ACTUATORS,
+    CONTROLLERS,
+    FASTEST_COUNTS_PER_S,
+    SLOWEST_COUNTS_PER_S,
+    ActuatorName,
+    ControllerName,
+)
 from drivers.device import DriverOptions
 from drivers.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
 
@@ -73,7 +80,24 @@ class AptAxis(AxisOptions):
             return "needs lower_limit and upper_limit: neither controller nor driver knows the travel"
         if self.channel > controller.channels:
             return f"a {self.controller} has {controller.channels} channel{'s' * (controller.channels > 1)}"
-        return ""
+        return self._speed_mistake(name)
+
+    def _speed_mistake(self, name: str) -> str:
+        """Return why the speed cannot be sent, empty if it can: the message holds a whole number."""
+        if self.speed_per_s is None:
+            return ""
+        family, size = CONTROLLERS[self.controller].family, abs(self.axis_map(name).scale)
+        slowest, fastest = SLOWEST_COUNTS_PER_S[family] * size, FASTEST_COUNTS_PER_S[family] * size
+        whose: str = self.controller
+        motor = ACTUATORS[self.actuator].fastest if self.actuator else None
+        if motor is not None and motor * self.counts * size < fastest:
+            fastest, whose = motor * self.counts * size, f"{self.actuator} on a {self.controller}"
+        if slowest <= self.speed_per_s <= fastest:
+            return ""
+        return (
+            f"speed_per_s = {self.speed_per_s:g}: a {whose} moves at {slowest:.3g} to {fastest:.4g} "
+            f"{name.rpartition('_')[2]} a second"
+        )
 
 
 class AptOptions(DriverOptions):

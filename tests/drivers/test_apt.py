@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.apt import stage as apt_stage
+from drivers.apt.actuators import CONTROLLERS, SPEED_SCALE
 from drivers.apt.options import AptOptions
 from drivers.apt.protocol import (
     HW_GET_INFO,
@@ -393,6 +395,7 @@ def test_the_step_rate_of_an_inertia_drive(inertia: AptController) -> None:
 # Options and discovery ----------------------------------------------------------------------------------
 KDC = {"port": "/dev/ttyUSB0", "controller": "KDC101"}
 KIM = {"port": "/dev/ttyUSB0", "controller": "KIM101", "counts_per_mm": 5e4}
+ENDS = {"lower_limit": 0.0, "upper_limit": 1.0}
 
 
 @pytest.mark.parametrize(
@@ -405,6 +408,16 @@ KIM = {"port": "/dev/ttyUSB0", "controller": "KIM101", "counts_per_mm": 5e4}
         ({"yaw_mrad": KDC | {"actuator": "Z825"}}, "an actuator that shifts cannot be yaw_mrad"),
         ({"x_um": KIM}, "needs lower_limit and upper_limit"),
         ({"x_um": KDC | {"actuator": "Z825", "channel": 2}}, "a KDC101 has 1 channel"),
+        (
+            {"x_um": KDC | {"actuator": "Z825", "speed_per_s": 1e9}},
+            r"axes.x_um: speed_per_s = 1e\+09: a Z825 on a KDC101 moves at 0.0013 to 3000 um a second",
+        ),
+        ({"x_um": KDC | {"actuator": "Z825", "speed_per_s": 3e4}}, "to 3000 um a second"),
+        ({"x_um": KDC | {"actuator": "Z825", "speed_per_s": 1e-9}}, "speed_per_s = 1e-09: a Z825"),
+        ({"x_um": KDC | {"counts_per_mm": 34304.0, "speed_per_s": math.inf} | ENDS}, "a KDC101 moves at"),
+        ({"x_um": KIM | ENDS | {"speed_per_s": 41.0}}, "a KIM101 moves at 0.02 to 40 um a second"),
+        ({"x_um": KIM | ENDS | {"speed_per_s": 0.01}}, "a KIM101 moves at 0.02 to 40 um a second"),
+        ({"yaw_mrad": KDC | {"actuator": "PRM1-Z8", "speed_per_s": 437.0}}, "to 436.3 mrad a second"),
         ({"x_um": KDC | {"actuator": "Z9"}}, "Input should be 'MTS25-Z8'"),
         (
             {"x_um": KDC | {"actuator": "Z825"}, "y_um": KDC | {"actuator": "Z825"}},
@@ -422,6 +435,26 @@ KIM = {"port": "/dev/ttyUSB0", "controller": "KIM101", "counts_per_mm": 5e4}
 def test_options_that_make_no_sense(axes: object, words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         AptOptions.model_validate({"axes": axes})
+
+
+@pytest.mark.parametrize(
+    ("family", "actuator"),
+    [("KDC101", "Z825"), ("KDC101", "PRM1-Z8"), ("BSC203", "DRV001"), ("KIM101", None)],
+)
+@given(share=st.floats(0, 1), reverse=st.booleans())
+def test_every_speed_that_is_allowed_is_sent_as_it_is(
+    family: str, actuator: str | None, share: float, reverse: bool
+) -> None:
+    scale = SPEED_SCALE[CONTROLLERS[family].family]  # type: ignore[index]
+    name = "yaw_mrad" if actuator == "PRM1-Z8" else "x_um"
+    keys: dict[str, object] = {"port": "/dev/ttyUSB0", "controller": family, "reverse": reverse}
+    keys |= {"actuator": actuator} if actuator else {"counts_per_mm": 5e4} | ENDS
+    speed = 10 ** (-9 + share * 18)
+    try:
+        axis = AptOptions.model_validate({"axes": {name: keys | {"speed_per_s": speed}}}).axes[name]
+    except ValidationError:
+        return
+    assert 1 <= round(speed / abs(axis.axis_map(name).scale) * scale) < 2**31
 
 
 def test_controllers_are_discovered_by_vendor_and_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
