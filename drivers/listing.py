@@ -10,7 +10,7 @@ from drivers.claim import Claim
 from drivers.device import Device, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
-from drivers.registry import KINDS, driver_names, load_driver
+from drivers.registry import KINDS, driver_names, load_driver, registration_mistakes
 
 _BUS_PARTS: Mapping[str, Callable[[], tuple[FoundDevice, ...]]] = {
     "USB": usb_devices,
@@ -66,6 +66,7 @@ def list_devices(*, probe: bool = False, say: Callable[[str], None] | None = Non
 
 def _drivers(unavailable: list[str]) -> Iterator[type[Device]]:
     """Load every driver for hardware; those that cannot be imported are named in ``unavailable``."""
+    unavailable += registration_mistakes()
     for kind in KINDS:
         for name in driver_names(kind):
             if name.startswith("simulated"):

@@ -7,6 +7,9 @@ the package that brings them. A driver is imported only when it is asked for.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Mapping
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 
 from drivers.device import Device
@@ -15,13 +18,41 @@ from drivers.errors import DeviceError
 GROUP = "diffuserbench.drivers"
 KINDS = ("camera", "stage", "led_array", "slm")
 
+_INTERFACES: Mapping[str, str] = {
+    "camera": "drivers.camera:Camera",
+    "stage": "drivers.stage:Stage",
+    "led_array": "drivers.led_array:LedArray",
+    "slm": "drivers.slm:Slm",
+}
+"""What a driver of each kind is; imported with the driver, as it does anyway."""
+_PACKAGES: Mapping[str, str] = {"serial": "pyserial", "usb": "pyusb", "hidraw": "hidapi", "hid": "hidapi"}
+"""Modules that are not called as the package that brings them."""
+
 
 def driver_names(kind: str) -> tuple[str, ...]:
     """Names of the drivers registered for a kind of device, sorted."""
     suffix = f".{kind}"
-    return tuple(
-        sorted({point.name.removesuffix(suffix) for point in _points() if point.name.endswith(suffix)})
-    )
+    names = {point.name.removesuffix(suffix) for point in _points() if point.name.endswith(suffix)}
+    return tuple(sorted(names - {""}))
+
+
+def registration_mistakes() -> tuple[str, ...]:
+    """Return a sentence for each entry point that names no driver, and each name that is taken twice."""
+    mistakes = []
+    taken: dict[str, list[EntryPoint]] = defaultdict(list)
+    for point in _points():
+        name, _, kind = point.name.rpartition(".")
+        if name and kind in KINDS:
+            taken[point.name].append(point)
+        else:
+            mistakes.append(
+                f"Entry point {_words(point)} is no driver's: it must be called NAME.KIND, "
+                f"KIND one of {', '.join(KINDS)}."
+            )
+    for name, points in sorted(taken.items()):
+        if len(points) > 1:
+            mistakes.append(f"Driver {name} is registered by {_all(points)}: {_ONE_OF_THEM}")
+    return tuple(mistakes)
 
 
 def load_driver(kind: str, name: str) -> type[Device]:
@@ -30,25 +61,82 @@ def load_driver(kind: str, name: str) -> type[Device]:
     Raises
     ------
     DeviceError
-        When no such driver is registered or its module cannot be imported (the text says what is missing).
+        When no such driver is registered or several are, when it cannot be imported (the text says what is
+        missing), and when it is no driver of that kind.
     """
-    for point in _points():
-        if point.name == f"{name}.{kind}":
-            try:
-                driver = point.load()
-            except ImportError as error:
-                raise DeviceError(
-                    f"{kind} ({name})", f"its driver cannot be imported: {error}.", "Install what it names."
-                ) from error
-            if not (isinstance(driver, type) and issubclass(driver, Device)):
-                raise DeviceError(f"{kind} ({name})", f"entry point {point.value!r} is no device driver.")
-            return driver
-    raise DeviceError(
-        f"{kind} ({name})",
-        "no such driver is registered.",
-        f"Available: {', '.join(driver_names(kind)) or 'none'}.",
-    )
+    device = f"{kind} ({name})"
+    points = [point for point in _points() if point.name == f"{name}.{kind}"]
+    if not points:
+        raise DeviceError(
+            device,
+            "no such driver is registered.",
+            " ".join([f"Available: {', '.join(driver_names(kind)) or 'none'}.", *registration_mistakes()]),
+        )
+    if len(points) > 1:
+        raise DeviceError(device, f"it is registered by {_all(points)}.", f"Of these packages {_ONE_OF_THEM}")
+    (point,) = points
+    driver = _imported(device, point)
+    interface = _INTERFACES[kind]
+    module, _, wanted = interface.partition(":")
+    if not (isinstance(driver, type) and issubclass(driver, getattr(import_module(module), wanted))):
+        raise DeviceError(
+            device,
+            f"{_words(point)} is no driver of this kind: a {kind} is a class made from {interface}.",
+            "Correct the entry point, or register it under the kind it is.",
+        )
+    assert issubclass(driver, Device)
+    return driver
+
+
+def how_to_install(module: str) -> str:
+    """Return the sentence that tells how to get a module."""
+    name = module.partition(".")[0]
+    return f"Install {_PACKAGES.get(name, name)} (pip install {_PACKAGES.get(name, name)})."
+
+
+def _imported(device: str, point: EntryPoint) -> object:
+    """Return what an entry point names; its mistakes, and its module's, in words."""
+    try:
+        found: object = import_module(point.module)
+    except ModuleNotFoundError as error:
+        missing = error.name or ""
+        own = missing.partition(".")[0] == point.module.partition(".")[0]
+        remedy = (
+            f"Correct {_words(point)}, or install its package again."
+            if own or not missing
+            else how_to_install(missing)
+        )
+        raise DeviceError(device, f"its driver cannot be imported: {error}.", remedy) from error
+    except Exception as error:  # a plug-in may fail in any way, and that must not end `check` or `devices`
+        problem = f"its driver cannot be imported: {type(error).__name__}: {error}."
+        raise DeviceError(
+            device, problem, f"This is a mistake in {_words(point)}, or in what it imports."
+        ) from error
+    for part in point.attr.split(".") if point.attr else ():
+        if not hasattr(found, part):
+            problem = f"there is no {point.attr} in module {point.module}."
+            raise DeviceError(device, problem, f"Correct the entry point {_words(point)}.")
+        found = getattr(found, part)
+    return found
+
+
+_ONE_OF_THEM = "uninstall all but one, or let them use different names."
+
+
+def _words(point: EntryPoint) -> str:
+    package = f" of {point.dist.name}" if point.dist is not None else ""
+    return f'"{point.name}" = "{point.value}"{package}'
+
+
+def _all(points: list[EntryPoint]) -> str:
+    return " and by ".join(map(_words, points))
 
 
 def _points() -> tuple[EntryPoint, ...]:
-    return tuple(entry_points(group=GROUP))
+    """Return the entry points, those that a package lists twice once."""
+    return tuple(
+        {
+            (point.name, point.value, point.dist and point.dist.name): point
+            for point in entry_points(group=GROUP)
+        }.values()
+    )

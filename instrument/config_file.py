@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceError
-from drivers.registry import driver_names, load_driver
+from drivers.registry import driver_names, load_driver, registration_mistakes
 from instrument.config import (
     DEVICE_TABLES,
     PLAIN_TABLES,
@@ -153,7 +153,10 @@ class _Reader:
         meant = name
         if name not in names:
             hint = nearest(name, names)
-            self.mistakes.add((kind, "driver"), where, f"no driver is called {name!r}.{hint} {available}")
+            lost = "".join(f" {sentence}" for sentence in registration_mistakes())
+            self.mistakes.add(
+                (kind, "driver"), where, f"no driver is called {name!r}.{hint} {available}{lost}"
+            )
             close = nearest_name(name, names)
             if close is None:
                 return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from drivers.registry import KINDS, driver_names
+from drivers.registry import KINDS, driver_names, registration_mistakes
 from instrument.cli.app import command_app, examples
 
 app = command_app()
@@ -20,3 +20,5 @@ def drivers() -> None:
     width = max(map(len, KINDS)) + 2
     for kind in KINDS:
         typer.echo(f"{kind:<{width}}{', '.join(driver_names(kind)) or 'none'}")
+    for sentence in registration_mistakes():
+        typer.echo(sentence, err=True)
