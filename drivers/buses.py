@@ -20,8 +20,10 @@ def usb_devices() -> tuple[FoundDevice, ...]:
 
     Names come from the kernel, which read them when the device was plugged in: no permission is needed.
     """
-    import usb.core
-
+    try:
+        import usb.core
+    except ImportError as error:
+        raise _missing("USB", "pyusb", error) from error
     try:
         devices = list(usb.core.find(find_all=True))
     except usb.core.NoBackendError:
@@ -56,9 +58,7 @@ def hid_devices() -> tuple[FoundDevice, ...]:
     try:
         import hidraw  # the kernel's driver stays in place; "import hid" would be hidapi's libusb build
     except ImportError as error:
-        raise DeviceError(
-            "HID", f"hidapi cannot be loaded: {error}.", "Install it again (pip install hidapi)."
-        ) from error
+        raise _missing("HID", "hidapi", error) from error
     return tuple(
         FoundDevice(
             bus="HID",
@@ -75,8 +75,10 @@ def hid_devices() -> tuple[FoundDevice, ...]:
 
 def serial_ports() -> tuple[FoundDevice, ...]:
     """Return all serial ports, those of USB adapters with vendor, product and serial number."""
-    from serial.tools import list_ports
-
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        raise _missing("serial", "pyserial", error) from error
     return tuple(
         FoundDevice(
             bus="serial",
@@ -109,6 +111,11 @@ def video_devices() -> tuple[FoundDevice, ...]:
             )
         )
     return tuple(found)
+
+
+def _missing(bus: str, package: str, error: ImportError) -> DeviceError:
+    """Return the error for a package that is needed to look at a bus; its modules have other names."""
+    return DeviceError(bus, f"{package} cannot be loaded: {error}.", f"Install it (pip install {package}).")
 
 
 def _line(path: Path) -> str:

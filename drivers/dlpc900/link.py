@@ -56,7 +56,13 @@ class HidLink:
         DeviceError
             When it is missing, there are several, or it may not be opened.
         """
-        found = self._find()
+        try:
+            found = self._find()
+        except DeviceError as error:
+            if error.device == self._device:
+                raise
+            # The bus could not be looked at; who checks a bench looks for the device.
+            raise DeviceError(self._device, error.problem, error.remedy) from error
         import hidraw
 
         hid = hidraw.device()

@@ -18,6 +18,7 @@ from drivers import buses, listing
 from drivers.claim import Claim
 from drivers.device import Device, port_claim
 from drivers.discovery import FoundDevice
+from drivers.dlpc900.link import HidLink
 from drivers.errors import DeviceError
 from drivers.listing import Listing, list_devices
 from instrument.cli.devices import _words
@@ -127,6 +128,32 @@ def test_a_bus_that_cannot_be_looked_at_says_so_and_the_others_are_listed(
         "USB: libusb is not installed. Install it (Debian: sudo apt install libusb-1.0-0).",
     )
     assert {device.bus for device in listed.found} == {"HID", "serial", "video"}
+
+
+@pytest.mark.usefixtures("computer", "drivers")
+@pytest.mark.parametrize(
+    ("module", "bus", "package"),
+    [
+        ("usb.core", "USB", "pyusb"),
+        ("hidraw", "HID", "hidapi"),
+        ("serial.tools", "serial", "pyserial"),
+    ],
+)
+def test_a_missing_module_ends_the_look_at_its_bus_only(
+    monkeypatch: pytest.MonkeyPatch, module: str, bus: str, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    listed = list_devices()
+    (said,) = listed.unavailable
+    assert said.startswith(f"{bus}: {package} cannot be loaded: ")
+    assert said.endswith(f" Install it (pip install {package}).")
+    assert {device.bus for device in listed.found} == {"USB", "HID", "serial", "video"} - {bus}
+
+
+def test_an_slm_that_cannot_be_looked_for_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "hidraw", None)
+    with pytest.raises(DeviceError, match=r"slm \(dlpc900\): hidapi cannot be loaded.*pip install hidapi"):
+        HidLink("slm (dlpc900)", None).open()
 
 
 class Finds(Device):
