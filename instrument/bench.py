@@ -16,7 +16,7 @@ from typing import Self, cast
 from drivers.camera import Camera
 from drivers.claim import Claim
 from drivers.device import Device, SharedPart
-from drivers.errors import LimitError
+from drivers.errors import DeviceLostError, LimitError
 from drivers.frame import FrameMetadata
 from drivers.led_array import LedArray
 from drivers.slm import Slm
@@ -176,10 +176,32 @@ class Bench:
         Raises
         ------
         DeviceError
-            When the camera fails.
+            When the camera fails, or the LED array was lost meanwhile.
         """
-        taken = photograph(self.camera, average, on_frame=on_frame)
+
+        def noticed(taken: int) -> None:
+            self.require_light()
+            if on_frame is not None:
+                on_frame(taken)
+
+        taken = photograph(self.camera, average, on_frame=noticed)
         return replace(taken, metadata=self.with_surroundings(taken.metadata))
+
+    def require_light(self) -> None:
+        """Refuse frames taken since the LED array was lost: nobody knows what lit them.
+
+        Raises
+        ------
+        DeviceLostError
+            When it was opened and is not open any more.
+        """
+        leds = self.led_array
+        if leds is not None and leds in self._opened and not leds.is_open:
+            raise DeviceLostError(
+                leds.name,
+                "was lost while frames were taken; those since are not kept.",
+                "Check its cable and power, then take them again.",
+            )
 
     def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
         """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""

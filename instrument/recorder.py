@@ -167,6 +167,7 @@ class Recorder:
                     frame = reader.next_frame(0.0)
                 except DeviceError as error:  # the frames that came before it are stored first
                     failure, frame = error, None
+            self._bench.require_light()  # else nobody knows what lit these frames
             self._store(batch, gaps, reader)
             if failure is not None:
                 raise failure

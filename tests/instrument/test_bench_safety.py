@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from drivers.errors import DeviceError, LimitError, StoppedError
+from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
 from instrument.bench import Bench, open_bench
 from instrument.config_file import parse_config
 from instrument.errors import BenchError, OperatorNeededError
@@ -167,6 +167,22 @@ def test_snap_averages_and_completes_the_metadata() -> None:
     assert len(mean.metadata.slm_image_hash) == 64
     with pytest.raises(BenchError, match="not 0"):
         bench.snap(average=0)
+
+
+def test_a_photograph_ends_at_once_when_the_led_array_is_lost() -> None:
+    bench = bench_with().open()
+    leds = bench.led_array
+    assert isinstance(leds, MockDevice)
+    taken: list[int] = []
+
+    def lose(count: int) -> None:
+        taken.append(count)
+        leds._open = count < 2
+
+    with pytest.raises(DeviceLostError, match=r"led_array \(mock\): was lost") as caught, bench:
+        bench.snap(average=80, on_frame=lose)
+    assert taken == [1, 2]
+    assert "The light may be on" in "".join(caught.value.__notes__)
 
 
 def test_the_source_is_placed_through_the_configured_offset() -> None:

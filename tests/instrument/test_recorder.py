@@ -12,14 +12,14 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceLostError
 from instrument.bench import Bench
 from instrument.config_file import parse_config
 from instrument.errors import BenchError
 from instrument.recorder import Recorder, RecordingStatus
 from instrument.recording import prepare_recording, record
 from instrument.store import FinishReason, FrameToStore, Run, RunCondition, RunError, RunWriter
-from tests.mocks.devices import MockWorld
+from tests.mocks.devices import MockDevice, MockWorld
 from tests.mocks.free_running import FreeRunningCamera
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")
@@ -48,6 +48,23 @@ def assert_every_frame_is_at_its_number(run: Run) -> None:
     lost = [index for gap in run.gaps for index in range(gap.first, gap.first + gap.count)]
     assert sorted([*lost, *run.records]) == list(range(run.n_frames))
     assert run.missing() == lost
+
+
+def test_a_recording_whose_led_array_is_lost_fails_and_keeps_no_frame_of_after(tmp_path: Path) -> None:
+    bench = bench_with(camera_of(1000))
+    leds = bench.led_array
+    assert isinstance(leds, MockDevice)
+
+    def lose(_: RecordingStatus) -> None:
+        leds._open = False
+
+    with pytest.raises(DeviceLostError, match=r"led_array \(mock\): was lost") as caught, bench:
+        record(bench, tmp_path, n_frames=400, on_progress=lose)
+    assert "The light may be on" in "".join(caught.value.__notes__)
+    (path,) = tmp_path.iterdir()
+    run = Run.open(path)
+    assert run.condition is RunCondition.FAILED
+    assert 0 < len(run.records) < 400
 
 
 def test_frames_dropped_by_the_device_are_gaps(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceLostError
 from instrument.acquire import acquire, prepare
 from instrument.bench import Bench
 from instrument.config_file import parse_config
@@ -125,6 +125,27 @@ def test_whatever_fails_the_bench_is_safe_and_the_run_says_so(
     assert str(path) in str(caught.value.__notes__)
     interrupted = isinstance(error, KeyboardInterrupt)
     assert runner.status.reason is (FinishReason.ABORTED if interrupted else FinishReason.FAILED)
+
+
+def test_a_run_whose_led_array_is_lost_fails_and_keeps_only_the_frames_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = open_mock_bench()
+    leds = bench.led_array
+    assert isinstance(leds, MockDevice)
+
+    def lose(name: str, count: int) -> None:
+        if name == "camera.snap" and count == 4:  # two dark frames, then the second of the PSF
+            leds._open = False
+
+    on_call(monkeypatch, lose)
+    runner = prepare(bench, plan(), tmp_path)
+    with pytest.raises(DeviceLostError, match=r"led_array \(mock\): was lost") as caught, bench:
+        runner.execute()
+    assert "The light may be on" in "".join(caught.value.__notes__)
+    run = Run.open(runner.path)
+    assert run.condition is RunCondition.FAILED
+    assert sorted(run.records) == [0, 1]
 
 
 def test_a_second_ctrl_c_before_the_ending_begins_skips_nothing_of_it(
