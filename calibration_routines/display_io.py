@@ -11,6 +11,7 @@ import numpy.typing as npt
 from drivers.stage import Stage
 from instrument.bench import Bench
 from instrument.errors import BenchError
+from instrument.preparation import darkest_block
 from instrument.slm_correction import SlmCorrection
 from instrument.slm_image import phase_levels
 
@@ -28,17 +29,28 @@ class DisplayBench:
         SLM pixels used as one.
     correction : SlmCorrection
         Look-up table and flatness, applied here and nowhere else.
+    estimate_background : bool
+        For a laser that nobody can switch off: the background is not measured but estimated, the mean of the
+        first photograph's darkest 10 x 10 pixels.
     """
 
-    def __init__(self, bench: Bench, binning: int, correction: SlmCorrection | None = None) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        binning: int,
+        correction: SlmCorrection | None = None,
+        *,
+        estimate_background: bool = False,
+    ) -> None:
         if bench.slm is None:
             raise BenchError(f"{bench.label} has no [slm].")
         self.bench = bench
         self.slm = bench.slm
         self.binning = binning
         self.correction = correction or SlmCorrection.ideal()
+        self.estimates_background = estimate_background
         self.frames = 0
-        self._dark: tuple[tuple[float, ...], Array] | None = None
+        self._dark: tuple[tuple[float, ...], Array | float] | None = None
 
     def show(self, field: Array) -> None:
         """Show the phase of an SLM field, complex (height, width) in binned pixels."""
@@ -51,13 +63,19 @@ class DisplayBench:
     def photograph(self, exposure_ms: float) -> Array:
         """Return counts a millisecond, background subtracted, float64: one frame, and a dark one at first.
 
-        The dark level is measured once with the laser off, at the first exposure asked for; its part that
-        grows with time is small against it.
+        The dark level is measured once with the laser off (or estimated with it on), at the first exposure
+        asked for; its part that grows with time is small against it.
         """
         camera = self.bench.camera
         low, high = camera.exposure_limits_ms
         exposure = camera.set_exposure_ms(float(np.clip(exposure_ms, low, high)))
         key = (camera.gain, float(camera.binning), *map(float, camera.roi.as_tuple()))
+        if self.estimates_background:
+            self.bench.scene_on()
+            frame = self._snap()
+            if self._dark is None or self._dark[0] != key:
+                self._dark = key, darkest_block(frame)
+            return (frame - self._dark[1]) / exposure
         if self._dark is None or self._dark[0] != key:
             self.bench.scene_off()
             self._dark = key, self._snap()

@@ -95,7 +95,7 @@ class Lights:
         request = f"Please {'light' if lit else 'darken'} {what}."
         if self._ask is None:
             raise OperatorNeededError(
-                f"{request} Nobody can be asked here: run it in a terminal or pass ask=."
+                f"{request} Nobody can be asked here: use a terminal (in Python: open_bench(..., ask=))."
             )
         self._ask(request)
         self._asked[what] = lit

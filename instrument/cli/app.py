@@ -56,11 +56,14 @@ def load_and_say(bench: Path | None) -> BenchConfig:
     return config
 
 
-def open_and_say(bench: Path | None) -> Bench:
-    """Open the bench, ready to ask the operator in a terminal; say on stderr what it is."""
+def open_and_say(bench: Path | None, *, as_is: bool = False) -> Bench:
+    """Open the bench, ready to ask the operator in a terminal; say on stderr what it is.
+
+    With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
+    """
     from instrument.bench import open_bench
 
-    opened = open_bench(load_and_say(bench), ask=operator())
+    opened = open_bench(load_and_say(bench), ask=_taken_for_done if as_is else operator())
     typer.echo(f"Bench: {opened.label}", err=True)
     return opened
 
@@ -76,6 +79,23 @@ def operator() -> Callable[[str], None] | None:
             raise KeyboardInterrupt  # end of input: nobody is there any more
 
     return ask
+
+
+def _taken_for_done(request: str) -> None:
+    typer.echo(f"Not asked (--as-is), taken for done: {request}", err=True)
+
+
+@contextmanager
+def naming_as_is() -> Iterator[None]:
+    """Let the error of a bench that needs an operator, where none is, name the option that does without."""
+    from instrument.errors import OperatorNeededError
+
+    try:
+        yield
+    except OperatorNeededError as error:
+        raise OperatorNeededError(
+            f"{error} Or, where the light already is as it must be, add --as-is."
+        ) from None
 
 
 @contextmanager

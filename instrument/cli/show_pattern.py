@@ -15,7 +15,7 @@ from calibration_routines.display_io import DisplayBench, bring_mask
 from calibration_routines.hologram_capture import Capture, capture_hologram, find_camera
 from instrument.alignment_file import Alignment, load_alignment
 from instrument.bench import Bench
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
 from instrument.display_setup import bench_display
 from instrument.errors import BenchError, FileError
 from instrument.hologram_job import prepare_target
@@ -96,11 +96,18 @@ def show(
             help="With --capture: N rounds with the camera in the loop; writes PATTERN-refined.png.",
         ),
     ] = 0,
+    as_is: Annotated[
+        bool,
+        typer.Option(
+            "--as-is",
+            help="With --capture: ask nobody; the laser stays on, and the background is estimated.",
+        ),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
 ) -> None:
     """Say how a run ended and what it holds, with a picture; or show a hologram on the SLM.
 
-    A hologram's look-up table and flatness are applied here, once.
+    A hologram's look-up table and flatness are applied here, once. Without --capture the light is yours.
 
     With --capture the camera is registered by the mask's own speckle, the hologram photographed, brought to
     the field of view, low-passed as an eye would, and compared with --target: PSNR and SSIM.
@@ -117,12 +124,14 @@ def show(
         raise FileError(capture, "exists already.", "Choose another name, or overwrite with --force.")
     if capture is not None and capture.suffix.lower() != ".png":
         raise FileError(capture, "a capture is written as .png.")
+    if as_is and capture is None:
+        raise BenchError("--as-is goes with --capture: without it no light is switched and nobody asked.")
     if refine and (capture is None or len(pattern) > 1):
         raise BenchError("--refine needs --capture, and one pattern.")
     correction = load_slm_correction(slm_calibration) if slm_calibration else None
     place = load_alignment(alignment) if alignment else None
     read = [read_slm_image(path) for path in pattern]
-    with open_and_say(bench) as opened:
+    with naming_as_is(), open_and_say(bench, as_is=as_is) as opened:
         if opened.slm is None:
             raise BenchError(f"{opened.label} has no [slm].")
         for path, (levels, _) in zip(pattern, read, strict=True):
@@ -130,7 +139,7 @@ def show(
                 raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
         bring_mask(opened, place.stage_position if place else {})
         binning = opened.config.display.slm_binning
-        io = DisplayBench(opened, binning, correction)
+        io = DisplayBench(opened, binning, correction, estimate_background=as_is)
         fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
         if capture is None or target is None:
             _hold(io, fields, seconds)
@@ -140,7 +149,6 @@ def show(
 
 
 def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
-    io.bench.scene_on()
     io.show(fields[0])
     typer.echo(f"Shown on {io.slm.name}: {io.bench.label}", err=True)
     if seconds is None and len(fields) == 1:
@@ -184,13 +192,16 @@ class _CaptureJob:
         simulated = bool(opened.simulated_kinds)
         mark = " (SIMULATED)" if simulated else ""
         typer.echo(f"camera registered to {camera.residual_px:.2f} px{mark}")
+        if self.io.estimates_background:
+            typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
         if refine:
             found = self._refine(fields[0], display, wanted, camera, mean_per_ms, refine, pattern)
         else:
             found = capture_hologram(
                 self.io, fields, display, wanted, camera, mean_per_ms=mean_per_ms, average=self.average
             )
-        _write(found, self.out, camera.residual_px, simulated=simulated)
+        background = "estimated" if self.io.estimates_background else "measured"
+        _write(found, self.out, camera.residual_px, {"simulated": simulated, "background": background})
         score = found.scores
         typer.echo(
             f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
@@ -233,7 +244,7 @@ class _CaptureJob:
         return found.best
 
 
-def _write(found: Capture, out: Path, residual_px: float, *, simulated: bool) -> None:
+def _write(found: Capture, out: Path, residual_px: float, origin: dict[str, Any]) -> None:
     pixels = np.clip(np.rint(found.seen * 255), 0, 255).astype(np.uint8)
-    facts = {"simulated": simulated, "metrics": asdict(found.scores), "camera_residual_px": residual_px}
+    facts = {**origin, "metrics": asdict(found.scores), "camera_residual_px": residual_px}
     write_image(out, pixels, {**facts, "low_passed": True, "white": 255})

@@ -13,7 +13,14 @@ import typer
 
 from instrument.atomic import check_writable
 from instrument.bench import Bench
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say, saying_what_is_left
+from instrument.cli.app import (
+    BenchOption,
+    command_app,
+    examples,
+    naming_as_is,
+    open_and_say,
+    saying_what_is_left,
+)
 from instrument.cli.progress import progress_bar
 from instrument.errors import FileError
 from instrument.images import check_suffix, side_car, write_image
@@ -40,6 +47,7 @@ class Light(enum.StrEnum):
         "diffuserbench snap --exposure-ms 50 --average 10 --out photo.npy",
         "diffuserbench snap --dark --average 20 --out dark.tif",
         "diffuserbench snap --source --out psf.tif",
+        "diffuserbench snap --source --as-is --out psf.tif",
     )
 )
 def snap(
@@ -74,7 +82,9 @@ def snap(
     as_is: Annotated[
         bool,
         typer.Option(
-            "--as-is", help="Switch nothing and ask nobody: for scripts on a bench with an operator."
+            "--as-is",
+            help="Ask nobody: for scripts. Alone nothing is switched; with --scene, --source or --dark "
+            "devices are, and what an operator would switch stays as it is.",
         ),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
@@ -83,25 +93,27 @@ def snap(
 
     The bench is opened for it and made safe again: light off, motion stopped.
     """
-    light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark, Light.AS_IS: as_is})
+    light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark}, as_is=as_is)
     target = out or Path(f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif")
     _check_target(target, average, force=force)
-    with saying_what_is_left(target), open_and_say(bench) as opened:
+    with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=as_is) as opened:
         if exposure_ms is not None:
             opened.camera.set_exposure_ms(exposure_ms)
         if gain is not None:
             opened.camera.set_gain(gain)
         _light(opened, light)
         taken = _photograph(opened, average)
-        write_image(target, taken.image, _metadata(opened, taken, light))
+        write_image(target, taken.image, {**_metadata(opened, taken, light), "operator_asked": not as_is})
     _report(target, taken, light)
 
 
-def _one_light(flags: dict[Light, bool]) -> Light:
+def _one_light(flags: dict[Light, bool], *, as_is: bool) -> Light:
     chosen = [name for name, is_set in flags.items() if is_set]
     if len(chosen) > 1:
         raise typer.BadParameter(f"choose one of --{', --'.join(chosen)}.")
-    return chosen[0] if chosen else Light.SCENE
+    if chosen:
+        return chosen[0]
+    return Light.AS_IS if as_is else Light.SCENE
 
 
 def _check_target(target: Path, average: int, *, force: bool) -> None:

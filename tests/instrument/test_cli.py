@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 
+from instrument.bench import open_bench
 from instrument.cli import COMMANDS, main
+from instrument.slm_image import write_slm_image
 
 MOCK_BENCH = """\
 [camera]
@@ -293,3 +295,34 @@ def test_the_program_itself_ends_with_the_status_and_without_a_traceback(tmp_pat
     assert ended.returncode == 2
     assert ended.stderr.count("\n") == 1
     assert "Traceback" in program("--debug", "check", "--bench", "absent.toml", cwd=tmp_path).stderr
+
+
+# Without an operator -----------------------------------------------------------------------------------
+@pytest.mark.usefixtures("mock_drivers")
+def test_a_psf_without_a_terminal_needs_as_is_and_the_error_says_so(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH.replace('"simulated"', '"operator"'))
+    assert main(["snap", "--source", "--out", "psf.tif"]) == 2
+    told = capsys.readouterr().err
+    assert "Please darken the scene." in told
+    assert "--as-is" in told
+    assert main(["snap", "--source", "--as-is", "--out", "psf.tif"]) == 0
+    assert "taken for done: Please darken the scene." in capsys.readouterr().err
+    with tifffile.TiffFile(here / "psf.tif") as file:
+        metadata = json.loads(file.pages[0].description)  # type: ignore[union-attr]
+    assert metadata["light"] == "source"
+    assert metadata["operator_asked"] is False
+
+
+@pytest.mark.usefixtures("mock_drivers")
+def test_a_pattern_is_shown_without_anybody_asked_for_light(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "bench.toml").write_text(MOCK_BENCH.replace('"simulated"', '"operator"'))
+    with open_bench(here / "bench.toml") as bench:
+        assert bench.slm is not None
+        levels = np.zeros(bench.slm.shape, np.uint8)
+    write_slm_image(here / "slm.png", levels, {})
+    assert main(["show", "slm.png", "--seconds", "0"]) == 0
+    assert "Please" not in capsys.readouterr().err
