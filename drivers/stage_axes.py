@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from drivers.errors import LimitError
 from drivers.stage import StageAxis
@@ -46,6 +46,14 @@ class AxisOptions(BaseModel):
     upper_limit: float | None = Field(
         None, description="Upper soft limit, within the controller's own; left out: the controller's."
     )
+
+    @field_validator("upper_limit")
+    @classmethod
+    def _above_the_lower(cls, upper: float | None, info: ValidationInfo) -> float | None:
+        lower = info.data.get("lower_limit")
+        if upper is not None and lower is not None and not lower < upper:
+            raise ValueError(f"must be above lower_limit = {lower:g}")
+        return upper
 
 
 @dataclass(frozen=True, slots=True)

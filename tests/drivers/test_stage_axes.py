@@ -38,8 +38,7 @@ def test_a_reversed_axis_swaps_its_ends() -> None:
     [
         (AxisOptions(upper_limit=2001.5), "reach beyond the controller's own, 0 to 2000"),
         (AxisOptions(lower_limit=-2.0), "reach beyond"),
-        (AxisOptions(lower_limit=500.0, upper_limit=500.0), "no range is left between 500 and 500"),
-        (AxisOptions(lower_limit=900.0, upper_limit=100.0), "no range is left"),
+        (AxisOptions(lower_limit=2000.5), "no range is left between 2000.5 and 2000"),
     ],
 )
 def test_soft_limits_that_are_none_are_refused(options: AxisOptions, words: str) -> None:
@@ -47,6 +46,13 @@ def test_soft_limits_that_are_none_are_refused(options: AxisOptions, words: str)
     with pytest.raises(LimitError, match=words) as caught:
         axis.stage_axis("stage (test)", options, ends=(0, 4000), speed_per_s=1, resolution=1)
     assert "x_um (device 3 axis 1)" in str(caught.value)
+
+
+@pytest.mark.parametrize("upper", [500.0, 100.0, math.nan])
+def test_an_upper_limit_not_above_the_lower_is_a_mistake_of_the_configuration(upper: float) -> None:
+    with pytest.raises(ValidationError, match="must be above lower_limit = 500") as caught:
+        AxisOptions(lower_limit=500.0, upper_limit=upper)
+    assert caught.value.errors()[0]["loc"] == ("upper_limit",)  # the line that is named
 
 
 @pytest.mark.parametrize("scale", [0.0, math.nan, math.inf])
