@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 
 from drivers.camera import Roi, TriggerMode
@@ -21,6 +22,8 @@ from drivers.v4l2.geometry import (
 from drivers.v4l2.settings import V4l2Settings
 
 _log = logging.getLogger(__name__)
+_RATE_TOLERANCE = 0.01
+"""A difference below it is the rounding of intervals: 29.97 for 30."""
 
 
 class V4l2ImageSettings(V4l2Settings):
@@ -134,14 +137,6 @@ class V4l2ImageSettings(V4l2Settings):
         if region is not None and self.options.size is None:
             shape = region.height, region.width
         made = set_format(self._device, wanted, shape)
-        if self.options.size is not None and (made.height, made.width) != self.options.size:
-            _log.warning(
-                "%s: images are %d x %d, asked for %d x %d",
-                self.name,
-                made.height,
-                made.width,
-                *self.options.size,
-            )
         self._format, self._made = wanted, made
         prepare(wanted.pixels.packing)
         self._can_crop = region is not None and (region.height, region.width) == (made.height, made.width)
@@ -149,8 +144,23 @@ class V4l2ImageSettings(V4l2Settings):
         self._roi = self._whole = Roi(0, 0, made.height, made.width)
         self._cropped = False
         self._period = frame_period_s(self._device, self.options.frames_per_s)
+        self._say_what_differs(made.height, made.width)
         if self._exposure_control is None:
             self._exposure_ms = self._read_exposure()
+
+    def _say_what_differs(self, height: int, width: int) -> None:
+        """Log where the driver made something else of size and frame rate than was asked for."""
+        asked = self.options
+        if asked.size is not None and (height, width) != asked.size:
+            _log.warning("%s: images are %d x %d, asked for %d x %d", self.name, height, width, *asked.size)
+        if asked.frames_per_s is None:
+            return
+        if self._period is None:
+            _log.warning("%s: knows no frame rate, asked for %g frames/s", self.name, asked.frames_per_s)
+        elif not math.isclose(1 / self._period, asked.frames_per_s, rel_tol=_RATE_TOLERANCE):
+            _log.warning(
+                "%s: takes %g frames/s, asked for %g", self.name, 1 / self._period, asked.frames_per_s
+            )
 
     @property
     def roi(self) -> Roi:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import ClassVar, cast
 
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from drivers.buffered_camera import BufferedCamera
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
@@ -38,7 +38,7 @@ class V4l2Options(DriverOptions):
         gt=0, description="Pitch of the pixels as they are sent, micrometres: no V4L2 driver knows it."
     )
     input: int | None = Field(None, ge=0, description="Number of the input, of a device with several.")
-    size: tuple[int, int] | None = Field(
+    size: tuple[PositiveInt, PositiveInt] | None = Field(
         None,
         description="Size of the images before a region is chosen: [height, width]; the largest if left out.",
     )

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from drivers.camera import Roi
 from drivers.claim import DeviceBusyError
@@ -26,6 +27,7 @@ from drivers.testing.camera import CameraContract
 from drivers.v4l2 import api
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.formats import FORMATS, decode
+from drivers.v4l2.settings import V4l2Options
 from tests.mocks import v4l2_kernel as fake
 from tests.mocks.v4l2_kernel import FakeKernel
 
@@ -263,6 +265,13 @@ def test_size_and_frame_rate_are_set_and_read_back(caplog: pytest.LogCaptureFixt
     with camera_on(kernel, size=(17, 32)) as camera:
         assert camera.sensor_shape == (16, 32)
     assert "images are 16 x 32, asked for 17 x 32" in caplog.text
+    assert "takes 500 frames/s, asked for 1000" in caplog.text
+
+
+@pytest.mark.parametrize("size", [(0, 32), (16, -5)])
+def test_a_size_that_is_none_is_a_mistake_of_the_configuration(size: tuple[int, int]) -> None:
+    with pytest.raises(ValidationError, match="greater than 0"):
+        V4l2Options(pixel_pitch_um=3.0, size=size)
 
 
 def test_gain_is_a_factor_by_the_configured_unit() -> None:
