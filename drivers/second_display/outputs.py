@@ -66,11 +66,15 @@ def choose(outputs: Sequence[Output], options: SecondDisplayOptions, device: str
             "Make another output the primary one, or set allow_primary = true.",
         )
     if options.shape is not None and (output.height, output.width) != options.shape:
+        height, width = options.shape
+        swapped = (output.width, output.height) == (height, width)
         raise DeviceError(
             device,
-            f"{output.name} is in mode {output.width} x {output.height}, "
-            f"not {options.shape[1]} x {options.shape[0]} as expected.",
-            "Choose the SLM's own resolution, without scaling, in the desktop's display settings.",
+            f"{output.name} is in mode {output.width} x {output.height} (width x height), "
+            f"not {width} x {height} as shape = [{height}, {width}] says ([height, width]).",
+            f"Write shape = [{output.height}, {output.width}], or turn the output back if it was rotated."
+            if swapped
+            else "Choose the SLM's own resolution, without scaling, in the desktop's display settings.",
         )
     if output.depth not in _EXACT_DEPTHS:
         raise DeviceError(
