@@ -3,5 +3,6 @@
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.lean_tv import LeanTotalVariation
 from recon.volume.literal import LiteralAdmm
+from recon.volume.operator_admm import OperatorAdmm
 
-__all__ = ["DouglasRachford", "LeanTotalVariation", "LiteralAdmm"]
+__all__ = ["DouglasRachford", "LeanTotalVariation", "LiteralAdmm", "OperatorAdmm"]
