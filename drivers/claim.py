@@ -71,7 +71,7 @@ class Claim:
 
 
 def holder_of(resource: str) -> str | None:
-    """Return who has a claim, in words; None when nobody has."""
+    """Return which other program has a claim, in words; None when none has, or this one."""
     path = _path(resource)
     try:
         handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -80,7 +80,7 @@ def holder_of(resource: str) -> str | None:
     try:
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return _holder(path)
+        return None if _is_mine(path) else _holder(path)
     finally:
         os.close(handle)
     return None
@@ -107,6 +107,13 @@ def _open(path: Path) -> int:
     with contextlib.suppress(PermissionError):
         os.fchmod(handle, 0o666)  # whatever the umask says: other users must be able to claim it too
     return handle
+
+
+def _is_mine(path: Path) -> bool:
+    try:
+        return bool(json.loads(path.read_text())["pid"] == os.getpid())
+    except (OSError, ValueError, KeyError):
+        return False
 
 
 def _holder(path: Path) -> str:

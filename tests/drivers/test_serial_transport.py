@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import errno
+import fcntl
+import os
+import subprocess
+import sys
 import termios
 import threading
 import time
@@ -10,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from drivers.claim import Claim
 from drivers.device import port_claim
@@ -240,21 +245,63 @@ def test_a_cable_pulled_while_a_reply_is_awaited_ends_the_wait(
     timer.join()
 
 
+HOLDER = """
+import sys
+from drivers.claim import Claim
+claim = Claim(sys.argv[1], "stage")
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
 def test_a_port_has_one_owner_and_the_second_is_told_whose_it_is(
     device: PtyDevice, port: SerialTransport
 ) -> None:
     second = SerialTransport(str(device.link), "led_array (test)")
     with pytest.raises(DeviceError, match="another program"):
         second.open()
-    claim = Claim(port_claim(str(device.link)), "stage")
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, port_claim(str(device.link))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
     try:
-        with pytest.raises(DeviceError, match=r"in use by .*process \d+"):
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(DeviceError, match=rf"in use by .*process {holder.pid}"):
             second.open()
     finally:
-        claim.release()
+        holder.kill()
+        holder.communicate()
     port.close()
     second.open()
     second.close()
+
+
+@pytest.mark.parametrize("how", ["lock", "TIOCEXCL"])
+def test_a_port_that_this_program_has_claimed_but_another_holds_is_not_blamed_on_this_one(
+    device: PtyDevice, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    mine = SerialTransport(str(device.link), "stage (test)")
+    claim = Claim(port_claim(str(device.link)), "stage")
+    other = os.open(device.link, os.O_RDWR | os.O_NOCTTY)
+    try:
+        if how == "lock":
+            fcntl.flock(other, fcntl.LOCK_EX)
+        else:  # which does not keep root out: so what the kernel tells everybody else
+
+            def busy(*_: object, **__: object) -> None:
+                raise serial.SerialException(errno.EBUSY, "could not open port: Device or resource busy")
+
+            monkeypatch.setattr(serial, "Serial", busy)
+        with pytest.raises(DeviceError, match=r"in use by another program.*fuser") as caught:
+            mine.open()
+        assert "this program" not in str(caught.value)
+    finally:
+        os.close(other)
+        claim.release()
 
 
 def test_a_port_that_is_not_there(tmp_path: Path) -> None:
