@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from typing import Any, ClassVar, Self, cast
+from contextlib import contextmanager
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -18,6 +19,7 @@ from drivers.registry import driver_names, load_driver
 from drivers.stage import Stage, StageAxis
 from drivers.stage_axes import check_target
 
+_Answer = TypeVar("_Answer")
 _NAME = "composite"
 _STOP_AGAIN_S = 0.1
 _ENDED_S = 2.0
@@ -129,22 +131,25 @@ class CompositeStage(Stage):
         return f"stage ({_NAME} of {', '.join(self.options.parts)})"
 
     def open(self) -> None:
-        """Open every part, those that were lost too; when one fails, all are closed again."""
+        """Open every part, those that were lost too; when one fails, the others stay as they were.
+
+        A part that is connected thus keeps its reference while another has yet to be plugged in again.
+        """
         try:
             for name, part in self._parts.items():
-                try:
+                with _naming(name):
                     part.open()
-                except DeviceError as error:
-                    error.add_note(f"It is [stage.parts.{name}] of bench.toml.")
-                    raise
-            self._refuse_double_axes()
-            self._opened = True
         except BaseException as error:
-            try:
-                self._close_parts()
-            except DeviceError as another:
-                error.add_note(f"Nor could all parts be closed: {another}")
+            if not self._opened:
+                self._close_after(error)
             raise
+        try:
+            self._refuse_double_axes()
+        except DeviceError as error:
+            self._opened = False
+            self._close_after(error)
+            raise
+        self._opened = True
 
     def _refuse_double_axes(self) -> None:
         owners: dict[str, str] = {}
@@ -166,6 +171,13 @@ class CompositeStage(Stage):
     def _close_parts(self) -> None:
         self._all_at_once({name: part.close for name, part in self._parts.items()})
 
+    def _close_after(self, error: BaseException) -> None:
+        """Close all parts because the stage cannot be opened; that this fails too becomes a note."""
+        try:
+            self._close_parts()
+        except DeviceError as another:
+            error.add_note(f"Nor could all parts be closed: {another}")
+
     @property
     def is_open(self) -> bool:
         """Whether any part is connected, so that the others are stopped when one was lost."""
@@ -175,7 +187,7 @@ class CompositeStage(Stage):
     def identity(self) -> DeviceIdentity:
         """Who the parts say they are, joined."""
         self._require()
-        found = [part.identity for part in self._parts.values()]
+        found = [identity for _, identity in self._asked(lambda part: part.identity)]
         return DeviceIdentity(
             kind="stage",
             driver=_NAME,
@@ -191,8 +203,8 @@ class CompositeStage(Stage):
         self._require()
         return {
             f"{name}.{key}": value
-            for name, part in self._parts.items()
-            for key, value in part.settings().items()
+            for name, settings in self._asked(lambda part: part.settings())
+            for key, value in settings.items()
         }
 
     # Stage -----------------------------------------------------------------------------------------
@@ -204,25 +216,26 @@ class CompositeStage(Stage):
     def position(self) -> dict[str, float]:
         """Ask every part where it is."""
         self._require()
-        return {axis: place for part in self._parts.values() for axis, place in part.position().items()}
+        places = self._asked(lambda part: part.position())
+        return {axis: place for _, part in places for axis, place in part.items()}
 
     def commanded_position(self) -> dict[str, float]:
         """Return the last target asked for."""
         self._require()
-        parts = self._parts.values()
-        return {axis: place for part in parts for axis, place in part.commanded_position().items()}
+        places = self._asked(lambda part: part.commanded_position())
+        return {axis: place for _, part in places for axis, place in part.items()}
 
     @property
     def is_homed(self) -> bool:
         """Whether every part is homed."""
         self._require()
-        return all(part.is_homed for part in self._parts.values())
+        return all(homed for _, homed in self._asked(lambda part: part.is_homed))
 
     @property
     def is_moving(self) -> bool:
         """Whether any part moves."""
         self._require()
-        return any(part.is_moving for part in self._parts.values())
+        return any(moving for _, moving in self._asked(lambda part: part.is_moving))
 
     def home(self) -> None:
         """Home part after part, in the order of ``bench.toml``; blocks until done."""
@@ -231,10 +244,11 @@ class CompositeStage(Stage):
         self._home_over.clear()
         self._homing_in = threading.get_ident()
         try:
-            for part in self._parts.values():
+            for name, part in self._parts.items():
                 if self._stops != stops:
                     raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
-                part.home()
+                with _naming(name):
+                    part.home()
         finally:
             self._homing_in = None
             self._home_over.set()
@@ -250,12 +264,13 @@ class CompositeStage(Stage):
                 for name, part in self._parts.items()
             }
             moved = [name for name, share in shares.items() if share]
-            before = [name for name in self._moving if name not in moved and self._parts[name].is_moving]
+            before = [name for name in self._moving if name not in moved and self._moves(name)]
             self._moving = (*before, *moved)
             try:
                 for name in moved:
                     if self._stops == stops:
-                        self._parts[name].move_to(shares[name], wait=False)
+                        with _naming(name):
+                            self._parts[name].move_to(shares[name], wait=False)
             except DeviceError as error:
                 self._stop_after(error, self._moving)
                 raise
@@ -280,18 +295,17 @@ class CompositeStage(Stage):
         late: DeviceTimeoutError | None = None
         with ThreadPoolExecutor(len(moving)) as pool:
             waits: dict[Future[None], str] = {
-                pool.submit(self._parts[name].wait, timeout_s): name for name in moving
+                pool.submit(self._wait_for, name, timeout_s): name for name in moving
             }
             try:
                 for done in as_completed(waits):
                     error = done.exception()
                     over = timeout_s is not None and time.monotonic() - began_s >= timeout_s
                     if isinstance(error, DeviceTimeoutError) and over:  # the caller waits no longer
-                        part = self._parts[waits[done]]
-                        if part.is_moving:
+                        if self._moves(waits[done]):
                             late = error
                         else:  # it has ended meanwhile: where it should, or it says so
-                            part.wait(_ENDED_S)
+                            self._wait_for(waits[done], _ENDED_S)
                     elif error is not None:
                         raise error
             except BaseException as error:  # Ctrl-C too: the threads end when their parts have stopped
@@ -324,6 +338,21 @@ class CompositeStage(Stage):
         if not self._opened:
             raise DeviceNotOpenError(self.name)
 
+    def _asked(self, ask: Callable[[Stage], _Answer]) -> Iterator[tuple[str, _Answer]]:
+        """Ask part after part, each when its answer is wanted."""
+        for name, part in self._parts.items():
+            with _naming(name):
+                answer = ask(part)
+            yield name, answer
+
+    def _moves(self, name: str) -> bool:
+        with _naming(name):
+            return self._parts[name].is_moving
+
+    def _wait_for(self, name: str, timeout_s: float | None) -> None:
+        with _naming(name):
+            self._parts[name].wait(timeout_s)
+
     def _stop_parts(self, names: Iterable[str]) -> None:
         self._all_at_once({name: self._parts[name].stop for name in names})
 
@@ -338,13 +367,28 @@ class CompositeStage(Stage):
         """Do something to several parts, none waiting for another; raise the first error with all others."""
         if not steps:
             return
+
+        def take(name: str) -> None:
+            with _naming(name):
+                steps[name]()
+
         with ThreadPoolExecutor(len(steps)) as pool:
-            futures = [pool.submit(step) for step in steps.values()]
+            futures = [pool.submit(take, name) for name in steps]
         errors = [error for future in futures if (error := future.exception()) is not None]
         if errors:
             for another in errors[1:]:
                 errors[0].add_note(f"And: {another}")
             raise errors[0]
+
+
+@contextmanager
+def _naming(part: str) -> Iterator[None]:
+    """Let an error of a part say which part of the stage it is of."""
+    try:
+        yield
+    except DeviceError as error:
+        error.name_part(part)
+        raise
 
 
 def _stage_driver(name: str) -> type[Stage]:

@@ -20,7 +20,14 @@ class DeviceError(Exception):
         self.device = device
         self.problem = problem
         self.remedy = remedy
-        super().__init__(f"{device}: {problem}" + (f" {remedy}" if remedy else ""))
+        super().__init__(_sentence(device, problem, remedy))
+
+    def name_part(self, part: str) -> None:
+        """Say that the device is a part of another, in the message too; saying it twice does nothing."""
+        addition = f", part {part}"
+        if not self.device.endswith(addition):
+            self.device += addition
+            self.args = (_sentence(self.device, self.problem, self.remedy),)
 
 
 class DeviceNotOpenError(DeviceError):
@@ -44,3 +51,7 @@ class LimitError(DeviceError):
 
 class StoppedError(DeviceError):
     """A blocking call (a move, an exposure) ended early because ``stop`` was called."""
+
+
+def _sentence(device: str, problem: str, remedy: str) -> str:
+    return f"{device}: {problem}" + (f" {remedy}" if remedy else "")
