@@ -80,7 +80,7 @@ class AxisMap:
 
     def to_bench(self, value: float) -> float:
         """Return a position of the controller's in the bench's unit."""
-        return value * self.scale
+        return value * self.scale + 0.0  # no -0.0 of a reversed axis, which reads as if it meant something
 
     def to_controller(self, value: float) -> float:
         """Return a position of the bench in the controller's unit; whoever counts in steps rounds it."""

@@ -31,6 +31,7 @@ def test_a_reversed_axis_swaps_its_ends() -> None:
         "stage (test)", AxisOptions(upper_limit=150_000.0), ends=(-200.0, 0.0), speed_per_s=5, resolution=0.01
     )
     assert axis == StageAxis("z_um", 0.0, 150_000.0, 5000.0, 10.0)
+    assert str(axis.lower_limit) == "0.0"  # not -0.0
 
 
 @pytest.mark.parametrize(
