@@ -175,7 +175,9 @@ class Features:
         """
         node = self._device.get_feature(name)
         if node is None:
-            raise LimitError(self._name, f"has no feature {name!r}.", "arv-tool-0.8 --name DEVICE_ID features lists them.")
+            raise LimitError(
+                self._name, f"has no feature {name!r}.", "arv-tool-0.8 --name DEVICE_ID features lists them."
+            )
         aravis = self._aravis
         if isinstance(node, aravis.GcEnumeration):
             self.choose(name, str(value))
