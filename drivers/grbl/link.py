@@ -42,6 +42,7 @@ class GrblLink:
 
     def __init__(self, port: str, device: str, baud_rate: int, timeout_s: float) -> None:
         self.device = device
+        self._place = f"{port} at {baud_rate} baud"
         self._transport = SerialTransport(
             port,
             device,
@@ -142,7 +143,10 @@ class GrblLink:
             self._transport.overtake(SOFT_RESET)
             if not self._heard.wait_for(lambda: self._banners > before, _RESET_S):
                 raise DeviceTimeoutError(
-                    self.device, "does not answer a reset.", "Switch it off and on, then open it again."
+                    self.device,
+                    f"no GRBL controller answers on {self._place}: it does not answer a reset.",
+                    "Check that port and baud_rate are this controller's (115200 unless changed), its cable "
+                    "and its power. Switch it off and on, then open it again.",
                 )
 
     # What it says unasked --------------------------------------------------------------------------

@@ -441,7 +441,10 @@ def test_a_late_ok_is_not_taken_for_the_next_moves(plain: GrblController, plain_
 def test_silence_is_an_error_in_words(plain: GrblController, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GrblStage, "reply_s", 0.1)
     plain.silent = True
-    with pytest.raises(DeviceTimeoutError, match=r"stage \(grbl, .*does not answer a reset.*Switch it off"):
+    with pytest.raises(
+        DeviceTimeoutError,
+        match=r"stage \(grbl, .*answers on .* at 115200 baud.*Check that port and baud_rate.*Switch it off",
+    ):
         stage_on(plain).open()
 
 
