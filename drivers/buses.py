@@ -10,6 +10,7 @@ from pathlib import Path
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
 
+_SERIAL_LINKS = Path("/dev/serial/by-id")
 _USB_FOLDER = Path("/sys/bus/usb/devices")
 _VIDEO_FOLDER = Path("/sys/class/video4linux")
 _HUB_CLASS = 9
@@ -91,6 +92,14 @@ def serial_ports() -> tuple[FoundDevice, ...]:
         )
         for port in sorted(list_ports.comports(), key=lambda port: port.device)
     )
+
+
+def lasting_name(port: str) -> str:
+    """Return the link to a serial port that stays the same when devices are plugged anew, or the port."""
+    for link in sorted(_SERIAL_LINKS.glob("*")):
+        if link.resolve() == Path(port).resolve():
+            return str(link)
+    return port
 
 
 def video_devices() -> tuple[FoundDevice, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.buses import hid_devices, serial_ports, usb_devices, video_devices
 from drivers.claim import Claim
@@ -49,36 +49,44 @@ def list_devices(*, probe: bool = False, say: Callable[[str], None] | None = Non
             unavailable.append(str(error))
     claimed: list[FoundDevice] = []
     drivers = list(_drivers(unavailable))
-    for driver in drivers:
+    for _, driver in drivers:
         try:
             claimed += driver.discover()
         except DeviceError as error:
             unavailable.append(str(error))
     if probe:
         known = {device.address for device in claimed}
-        for bus, address in list(found):
+        for (bus, address), port in list(found.items()):
             if bus == "serial" and address not in known:
-                claimed += _probed(address, drivers, unavailable, say)
+                claimed += [
+                    replace(
+                        device, usb_id=port.usb_id, serial_number=device.serial_number or port.serial_number
+                    )
+                    for device in _probed(address, drivers, unavailable, say)
+                ]
     for device in claimed:
         found.pop((device.bus, device.address), None)
     return Listing((*found.values(), *claimed), tuple(dict.fromkeys(unavailable)))
 
 
-def _drivers(unavailable: list[str]) -> Iterator[type[Device]]:
-    """Load every driver for hardware; those that cannot be imported are named in ``unavailable``."""
+def _drivers(unavailable: list[str]) -> Iterator[tuple[str, type[Device]]]:
+    """Load every driver for hardware, with its name; what is wrong with others goes to ``unavailable``."""
     unavailable += registration_mistakes()
     for kind in KINDS:
         for name in driver_names(kind):
             if name.startswith("simulated"):
                 continue  # nothing to find, and the slowest to import
             try:
-                yield load_driver(kind, name)
+                yield name, load_driver(kind, name)
             except DeviceError as error:
                 unavailable.append(str(error))
 
 
 def _probed(
-    port: str, drivers: list[type[Device]], unavailable: list[str], say: Callable[[str], None] | None
+    port: str,
+    drivers: list[tuple[str, type[Device]]],
+    unavailable: list[str],
+    say: Callable[[str], None] | None,
 ) -> list[FoundDevice]:
     """Return what the first driver to recognise a port says of it; none when nobody does."""
     try:
@@ -87,11 +95,11 @@ def _probed(
         unavailable.append(str(error))
         return []
     try:
-        for driver in drivers:
+        for name, driver in drivers:
             if driver.probe.__func__ is Device.probe.__func__:  # type: ignore[attr-defined]
                 continue
             if say is not None:
-                say(f"Asking at {port} as {driver.__name__} would.")
+                say(f"Asking at {port} as driver {name} would.")
             try:
                 device = driver.probe(port)
             except DeviceError as error:

@@ -10,7 +10,7 @@ from drivers.apt.actuators import CONTROLLERS, SETTLING_COUNTS
 from drivers.apt.drives import Drive, InertiaChannel, InertiaUnit, Motor
 from drivers.apt.link import Link
 from drivers.apt.options import AptAxis, AptOptions
-from drivers.buses import serial_ports
+from drivers.buses import lasting_name, serial_ports
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
@@ -65,7 +65,7 @@ class AptStage(PolledStage):
             if port.usb_id != _THORLABS_USB or name is None:
                 continue
             # No controller knows its actuator: checking bench.toml will ask for it.
-            axes = {"x_um": {"port": port.address, "controller": name, "actuator": "WHICH?"}}
+            axes = {"x_um": {"port": lasting_name(port.address), "controller": name, "actuator": "WHICH?"}}
             found.append(
                 FoundDevice(
                     bus="serial",
@@ -78,6 +78,7 @@ class AptStage(PolledStage):
                     driver="apt",
                     kind="stage",
                     options={"axes": axes},
+                    note="fill in actuator: the type on its label, such as Z825",
                 )
             )
         return tuple(found)

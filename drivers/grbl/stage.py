@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Mapping
 
+from drivers.buses import lasting_name
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
@@ -84,7 +85,9 @@ class GrblStage(PolledStage):
             return None
         finally:
             link.close()
-        firmware = f"{'grblHAL' if settings.is_hal else 'GRBL'} {settings.info.get('VER', '')}".strip()
+        firmware = (
+            f"{'grblHAL' if settings.is_hal else 'GRBL'} {settings.info.get('VER', '').rstrip(':')}".strip()
+        )
         return FoundDevice(
             "serial",
             port,
@@ -92,7 +95,7 @@ class GrblStage(PolledStage):
             product=settings.info.get("BOARD", ""),
             driver="grbl",
             kind="stage",
-            options={"port": port},
+            options={"port": lasting_name(port)},
         )
 
     @property

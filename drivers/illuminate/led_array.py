@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from drivers.buses import lasting_name
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
@@ -96,7 +97,7 @@ class IlluminateLedArray(LedArray):
             serial_number=found.serial_number,
             driver="illuminate",
             kind="led_array",
-            options={"port": port},
+            options={"port": lasting_name(port)},
         )
 
     # Device ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.buses import serial_ports
+from drivers.buses import lasting_name, serial_ports
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
 from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
@@ -247,5 +247,6 @@ def _found(port: str, description: str, serial_number: str = "", usb_id: str = "
         usb_id=usb_id,
         driver="zaber",
         kind="stage",
-        options={"port": port, "axes": axes},
+        options={"port": lasting_name(port), "axes": axes},
+        note="fill in microstep_um (the stage's product page says it), and add the other axes like this one",
     )

@@ -474,6 +474,7 @@ def test_controllers_are_discovered_by_vendor_and_serial_number(monkeypatch: pyt
         ("/dev/ttyUSB3", "KIM101"),
     ]
     assert 'driver = "apt"' in found[0].bench_lines()
+    assert "# fill in actuator" in found[0].bench_lines()
 
 
 # The emulator under other people's client ---------------------------------------------------------------

@@ -85,7 +85,14 @@ def computer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         sys.modules, "hidraw", SimpleNamespace(enumerate=lambda: [hid_device(b"/dev/hidraw3")])
     )
     ports = [
-        port("/dev/ttyUSB1", description="FT232R", manufacturer="FTDI", vid=0x403, pid=0x6001),
+        port(
+            "/dev/ttyUSB1",
+            description="FT232R",
+            manufacturer="FTDI",
+            vid=0x403,
+            pid=0x6001,
+            serial_number="A5",
+        ),
         port("/dev/ttyS0"),
     ]
     monkeypatch.setattr(list_ports, "comports", lambda: ports)
@@ -96,7 +103,9 @@ def computer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def drivers(monkeypatch: pytest.MonkeyPatch) -> list[type[Any]]:
     """The drivers that are asked, none at first."""
     asked: list[type[Any]] = []
-    monkeypatch.setattr(listing, "_drivers", lambda unavailable: iter(asked))
+    monkeypatch.setattr(
+        listing, "_drivers", lambda unavailable: ((driver.__name__.lower(), driver) for driver in asked)
+    )
     return asked
 
 
@@ -109,7 +118,7 @@ def test_every_bus_is_listed_with_names_and_ids() -> None:
         ("USB", "bus 1 device 4"): ("Thorlabs APT DC Motor Controller", "0403:faf0", "27000001"),
         ("HID", "/dev/hidraw3"): ("Texas Instruments DLPC900", "0451:c900", "LCR3"),
         ("serial", "/dev/ttyS0"): ("serial port", "", ""),
-        ("serial", "/dev/ttyUSB1"): ("FT232R", "0403:6001", ""),
+        ("serial", "/dev/ttyUSB1"): ("FT232R", "0403:6001", "A5"),
         ("video", "/dev/video2"): ("video device", "", ""),
         ("video", "/dev/video10"): ("Lensless", "1234:00ab", ""),
     }
@@ -196,7 +205,11 @@ def test_ports_are_asked_only_on_request_and_never_those_in_use(drivers: list[ty
     said: list[str] = []
     listed = list_devices(probe=True, say=said.append)
     assert sorted(Finds.asked) == ["/dev/ttyS0", "/dev/ttyUSB1"]
-    assert len(said) == 2
+    assert sorted(said) == [
+        f"Asking at {port} as driver finds would." for port in ("/dev/ttyS0", "/dev/ttyUSB1")
+    ]
+    probed = next(d for d in listed.found if d.address == "/dev/ttyUSB1")
+    assert (probed.usb_id, probed.serial_number) == ("0403:6001", "A5")
     lines = next(d for d in listed.found if d.address == "/dev/ttyUSB1").bench_lines()
     assert lines == '[stage]\ndriver = "grbl"\nport = "/dev/ttyUSB1"'
     Finds.asked.clear()
