@@ -47,6 +47,8 @@ class HologramRequest:
         For the loss "spatial".
     frames : int
     complex_slm : bool
+    phase_levels : int or None
+        Of the SLM; None: continuous.
     envelope : "shade", "correct" or "ignore"
         What becomes of the mask pixels' envelope: the target gets it too (a picture darker at the border),
         the hologram works against it, or it is left out of the model.
@@ -60,6 +62,7 @@ class HologramRequest:
     grid: Grid = "alias_free"
     frames: int = 1
     complex_slm: bool = False
+    phase_levels: int | None = None
     envelope: Envelope = "shade"
     budget: Budget = field(default_factory=lambda: Budget(iterations=100))
     seed: int = 0
@@ -94,7 +97,7 @@ class HologramResult:
                 "grid": "alias_free",
                 "envelope": request.envelope,
                 "frames": request.frames,
-                "phase_levels": "continuous",
+                "phase_levels": request.phase_levels or "continuous",
             },
             "optimised_on_grid": request.grid,
             "method": request.method,
@@ -124,6 +127,7 @@ def run_request(
         method=request.method,
         budget=request.budget,
         complex_slm=request.complex_slm,
+        phase_levels=request.phase_levels,
         initial=initial,
         seed=request.seed,
         callback=callback,

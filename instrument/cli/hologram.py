@@ -133,6 +133,15 @@ def hologram(
     complex_slm: Annotated[
         bool, typer.Option("--complex", help="For an SLM that sets amplitude and phase; out is a .npy file.")
     ] = False,
+    levels: Annotated[
+        int | None,
+        typer.Option(
+            "--levels",
+            metavar="N",
+            help="The SLM shows N phases only (2, 4, 8 ... 256). Default: continuous, written in 256.",
+            show_default=False,
+        ),
+    ] = None,
     video: Annotated[
         bool, typer.Option("--video", help="TARGET is a folder or stack; each frame starts from the last.")
     ] = False,
@@ -171,6 +180,8 @@ def hologram(
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
+    if levels is not None and levels not in (2, 4, 8, 16, 32, 64, 128, 256):
+        raise BenchError(f"--levels {levels}: the SLM's phases are 2, 4, 8, 16, 32, 64, 128 or 256.")
     config = load_and_say(bench)
     size = slm_size(config)
     request = HologramRequest(
@@ -180,6 +191,7 @@ def hologram(
         grid="alias_free" if grid is GridName.ALIAS_FREE else "dissertation",
         frames=frames,
         complex_slm=complex_slm,
+        phase_levels=levels,
         envelope=envelope.value,
         budget=Budget(iterations, time_s, psnr_db),
         seed=seed,

@@ -12,7 +12,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -107,6 +107,7 @@ def compute_hologram(
     method: Method = "lbfgs",
     budget: Budget | None = None,
     complex_slm: bool = False,
+    phase_levels: int | None = None,
     initial: Array | None = None,
     seed: int = 0,
     callback: Callback | None = None,
@@ -121,6 +122,9 @@ def compute_hologram(
     budget : Budget, optional
     complex_slm : bool
         The SLM sets the amplitude too.
+    phase_levels : int, optional
+        The SLM shows so many equidistant phases only (L-BFGS): the last iterations round more and more
+        pixels and let the others make up for it.
     initial : ndarray, complex, (n_frames, height, width), optional
         Warm start, e.g. the last video frame's ``slm``; by default a random phase.
     seed : int
@@ -133,11 +137,18 @@ def compute_hologram(
     shape = (model.frames, *model.display.slm_shape)
     if initial is not None and initial.shape != shape:
         raise InputError(f"The start must be {shape}, not {initial.shape}.")
+    if phase_levels is not None and (phase_levels < 2 or complex_slm or method != "lbfgs"):
+        raise InputError("Phase levels are 2 or more, of a phase SLM, and need the method 'lbfgs'.")
     if method == "one_step":
         if complex_slm or initial is not None:
             raise InputError("The one-step method takes no start and has no form for a complex SLM.")
         return one_step(model, seed=seed)
     search: _Search
+    budget = budget or Budget()
+    if phase_levels is not None:
+        phase = _Phase(model)
+        start = phase.pack(_start(initial, shape, seed, complex_slm))
+        return _on_levels(phase, start, phase_levels, budget, callback, cancel)
     if method == "lbfgs":
         variable = _Complex(model) if complex_slm else _Phase(model)
         search = _Lbfgs(variable, variable.pack(_start(initial, shape, seed, complex_slm)))
@@ -145,7 +156,7 @@ def compute_hologram(
         search = _Nesterov(model, _start(initial, shape, seed, complex_slm), complex_slm)
     else:
         raise InputError(f"The method is 'lbfgs', 'nesterov' or 'one_step', not {method!r}.")
-    history, reason = _run(search, budget or Budget(), callback, cancel)
+    history, reason = _run(search, budget, callback, cancel)
     slm = search.slm / max(float(np.abs(search.slm).max()), 1.0) if complex_slm else search.slm
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
 
@@ -194,7 +205,9 @@ class _Point(NamedTuple):
 
 # Variables: what the quasi-Newton method moves -----------------------------------------------------
 class _Phase:
-    """The SLM's phases as a flat real vector."""
+    """The SLM's phases as a flat real vector; where ``held`` is true they stay as they are."""
+
+    held: npt.NDArray[np.bool_] | None = None
 
     def __init__(self, model: HologramModel) -> None:
         self.model = model
@@ -217,8 +230,10 @@ class _Phase:
         found.gradient.imag *= slm.real
         found.gradient.real *= slm.imag
         found.gradient.imag -= found.gradient.real
-        gradient: Array = 2 * found.gradient.imag
-        return _Point(found.loss, found.seen_psnr_db), gradient.ravel()
+        gradient: Array = np.multiply(found.gradient.imag, 2).ravel()
+        if self.held is not None:
+            gradient[self.held] = 0
+        return _Point(found.loss, found.seen_psnr_db), gradient
 
 
 class _Complex:
@@ -365,11 +380,59 @@ class _Nesterov(_Search):
         return None
 
 
+# Phase levels -------------------------------------------------------------------------------------
+HELD = (0.0, 0.5, 0.8, 0.95, 0.99)
+"""Part of the pixels that are rounded in each stage, those closest to a level first."""
+STAGES = (0.6, 0.1, 0.1, 0.1, 0.1)
+"""Part of the iterations in each stage."""
+FINE = 32
+"""So many levels or more are rounded to at the end only: stages would cost more than they make up for."""
+
+
+def _on_levels(
+    variable: _Phase,
+    x: Array,
+    levels: int,
+    budget: Budget,
+    callback: Callback | None,
+    cancel: threading.Event | None,
+) -> Hologram:
+    """Find phases on levels; the last record is theirs, all others are of phases that are partly rounded."""
+    step = x.dtype.type(2 * np.pi / levels)
+    history: tuple[HologramRecord, ...] = ()
+    reason = HologramStop.ITERATIONS
+    stages = zip(HELD, np.cumsum(STAGES), strict=True) if levels < FINE else [(0.0, 1.0)]
+    for held, part in stages:
+        if held:
+            away = np.abs(x / step - np.rint(x / step))
+            if variable.held is not None:
+                away[variable.held] = -1
+            variable.held = away <= np.quantile(away, held)
+            x[variable.held] = np.rint(x[variable.held] / step) * step
+        if reason is HologramStop.CANCELLED or reason is HologramStop.TIME:
+            continue
+        search = _Lbfgs(variable, x)
+        limit = replace(budget, iterations=round(budget.iterations * float(part)), psnr_db=None)
+        history, reason = _run(search, limit, callback, cancel, history)
+        x = search.x
+    variable.held = None
+    point, _ = variable.evaluate(np.rint(x / step) * step)
+    last = history[-1]
+    rounded = HologramRecord(last.iteration, last.seconds, *point)
+    slm = variable.field(np.rint(x / step) * step)
+    return Hologram(slm.astype(np.complex64), (*history[:-1], rounded), reason, last.seconds)
+
+
 def _run(
-    search: _Search, budget: Budget, callback: Callback | None, cancel: threading.Event | None
+    search: _Search,
+    budget: Budget,
+    callback: Callback | None,
+    cancel: threading.Event | None,
+    before: tuple[HologramRecord, ...] = (),
 ) -> tuple[tuple[HologramRecord, ...], HologramStop]:
-    history = [HologramRecord(0, 0.0, *search.point)]
-    seconds, calm = 0.0, 0
+    """Step until the budget is spent; ``before`` is the history so far."""
+    history = [*before] or [HologramRecord(0, 0.0, *search.point)]
+    seconds, calm = history[-1].seconds, 0
     while True:
         last = history[-1]
         if cancel is not None and cancel.is_set():

@@ -222,10 +222,10 @@ class SpotMaker:
     def ideal(self, count: int) -> float:
         """Return the intensity of each of ``count`` spots where their pose is right.
 
-        ``pi / 4`` of the light is left by the phase-only sum over the mask pixels of an SLM pixel (without a
-        finer mask nothing is lost there) and again by superposing several spots.
+        ``pi / 4`` of the light is left by keeping only the phase of a sum of random terms: mask pixels of an
+        SLM pixel, several spots, or both, as it is one sum. A single spot without a finer mask loses nothing.
         """
-        kept = (1.0 if self.display.factor == 1 else np.pi / 4) * (1.0 if count == 1 else np.pi / 4)
+        kept = 1.0 if self.display.factor == 1 and count == 1 else np.pi / 4
         return kept * self.display.slm_shape[0] * self.display.slm_shape[1] / count
 
 

@@ -91,6 +91,58 @@ def test_frames_colours_planes_and_video_have_files_of_their_own(capsys):
     assert second > first + 1  # six iterations in all, the second frame started warm
 
 
+def seen_db(slm, display, picture):
+    """PSNR of SLM fields as another run of the model sees them."""
+    target = prepare_target(picture, display)
+    model = HologramModel(display, [target])
+    return compare(model.seen(slm), model.wanted(), model.peaks[0]).psnr_db
+
+
+@pytest.mark.usefixtures("here")
+def test_a_complex_pattern_shows_more_than_its_phase_alone():
+    assert main(["hologram", "picture.png", "--complex", "--out", "slm.npy", "--iterations", "40"]) == 0
+    field = np.load("slm.npy")
+    assert np.iscomplexobj(field)
+    assert 0.999 < np.abs(field).max() <= 1.0 + 1e-6
+    facts = json.loads(Path("slm.json").read_text())
+    assert facts["complex_slm"] is True
+    grey = read_image("picture.png").pixels
+    found = seen_db(field[None], bench(), grey)
+    assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.2)
+    assert found > seen_db(np.exp(1j * np.angle(field))[None], bench(), grey) + 2
+
+
+@pytest.mark.usefixtures("here")
+def test_each_colour_is_computed_for_its_own_wavelength():
+    grey = read_image("picture.png").pixels
+    colour = np.stack([grey, np.roll(grey, 20, axis=1), 255 - grey], axis=-1)
+    write_image("colour.png", colour)
+    lasers = ["--wavelengths", "660", "532", "473"]
+    assert main(["hologram", "colour.png", "--color", *lasers, "--out", "c.png", "--iterations", "30"]) == 0
+    config = parse_config(Path("bench.toml").read_text(), Path("bench.toml"))
+    for channel, (name, nm) in enumerate((("red", 660.0), ("green", 532.0), ("blue", 473.0))):
+        levels, facts = read_slm_image(f"c-{name}.png")
+        slm = np.exp(1j * levels_phase(levels, facts["binning"]))[None]
+        own = bench_display(config, ((96, 128), 8.0), wavelength_nm=nm)
+        found = seen_db(slm, own, colour[..., channel])
+        assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.3)
+        other = bench_display(config, ((96, 128), 8.0), wavelength_nm=nm - 80)
+        assert seen_db(slm, other, colour[..., channel]) < found - 3
+
+
+@pytest.mark.usefixtures("here")
+def test_an_slm_of_few_levels_gets_a_pattern_on_them(capsys):
+    assert main(["hologram", "picture.png", "--levels", "4", "--iterations", "40"]) == 0
+    levels, facts = read_slm_image("slm.png")
+    assert set(np.unique(levels)) == {0, 64, 128, 192}
+    assert facts["metrics_computed_for"]["phase_levels"] == 4
+    slm = np.exp(1j * levels_phase(levels, facts["binning"]))[None]
+    found = seen_db(slm, bench(), read_image("picture.png").pixels)
+    assert found == pytest.approx(facts["metrics"][0]["psnr_db"], abs=0.05)
+    assert main(["hologram", "picture.png", "--levels", "5", "--out", "five.png"]) == 2
+    assert "--levels 5" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("here")
 def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
     assert main(["hologram", "picture.png", "--psnr", "15"]) == 0

@@ -172,3 +172,31 @@ def test_bad_requests_are_refused_in_words():
         compute_hologram(model, method="adam")
     with pytest.raises(InputError, match="takes no start"):
         compute_hologram(model, method="one_step", complex_slm=True)
+
+
+@pytest.mark.parametrize("levels", [2, 4, 64])
+def test_phases_on_levels_do_better_than_rounded_ones(levels):
+    model = make_model()
+    free = compute_hologram(model, budget=Budget(60, tolerance=0))
+    step = 2 * np.pi / levels
+    rounded = np.exp(1j * np.rint(np.angle(free.slm) / step) * step)
+    found = compute_hologram(model, budget=Budget(60, tolerance=0), phase_levels=levels)
+    phase = np.angle(found.slm) / step
+    np.testing.assert_allclose(phase, np.rint(phase), atol=1e-4)
+    assert found.history[-1].iteration == 60
+    reached = model.evaluate(found.slm).seen_psnr_db
+    assert found.history[-1].psnr_db == pytest.approx(reached, abs=1e-3)
+    gain = reached - model.evaluate(rounded).seen_psnr_db
+    assert gain > (0.4 if levels < 32 else -0.01)
+
+
+def test_levels_need_the_phase_and_lbfgs():
+    for options in ({"complex_slm": True}, {"method": "nesterov"}, {"phase_levels": 1}):
+        with pytest.raises(InputError, match="Phase levels are 2 or more"):
+            compute_hologram(make_model(), **{"phase_levels": 4, **options})  # type: ignore[arg-type]
+
+
+def test_what_a_callback_keeps_stays_as_it_was():
+    kept = []
+    compute_hologram(make_model(), budget=Budget(3), complex_slm=True, callback=lambda _, s: kept.append(s))
+    assert np.abs(kept[0] - kept[1]).max() > 1e-3
