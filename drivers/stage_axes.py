@@ -26,7 +26,7 @@ MRAD_PER_DEG = 1e3 * math.pi / 180
 
 def _axis_name(name: str) -> str:
     if name not in AXIS_NAMES:
-        raise ValueError(f"no axis is called {name!r}; choose from {', '.join(AXIS_NAMES)}")
+        raise ValueError(f"must be an axis of the bench ({', '.join(AXIS_NAMES)})")
     return name
 
 

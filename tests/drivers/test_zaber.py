@@ -308,7 +308,7 @@ def test_a_port_of_nobody_is_an_error(tmp_path: Path) -> None:
         ({"yaw_mrad": {"microstep_um": 1.0}}, "axes.yaw_mrad needs microstep_deg .* and not microstep_um"),
         ({"x_um": {"microstep_um": 1.0}, "y_um": {"microstep_um": 1.0}}, "are both device 1 axis 1"),
         ({}, "at least 1 item"),
-        ({"q_um": {"microstep_um": 1.0}}, "no axis is called 'q_um'"),
+        ({"q_um": {"microstep_um": 1.0}}, "must be an axis of the bench"),
     ],
 )
 def test_options_that_make_no_sense(axes: object, words: str) -> None:
