@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
 from instrument.cli.words import duration, size
@@ -50,6 +50,13 @@ def record(
     ] = None,
     source: Annotated[bool, typer.Option("--source", help="Light the point source, not the scene.")] = False,
     dark: Annotated[bool, typer.Option("--dark", help="Light nothing.")] = False,
+    as_is: Annotated[
+        bool,
+        typer.Option(
+            "--as-is",
+            help="Ask nobody: for scripts. Alone nothing is switched; with --source or --dark devices are.",
+        ),
+    ] = False,
     label: Annotated[str, typer.Option("--label", help="Becomes part of the folder's name.")] = "recording",
     out: Annotated[
         Path | None,
@@ -79,13 +86,14 @@ def record(
     """
     if source and dark:
         raise typer.BadParameter("choose one of --source, --dark.")
-    with open_and_say(bench) as opened:
+    with naming_as_is(), open_and_say(bench, as_is=as_is) as opened:
         if exposure_ms is not None:
             opened.camera.set_exposure_ms(exposure_ms)
         if gain is not None:
             opened.camera.set_gain(gain)
-        opened.source_on() if source else opened.source_off()
-        opened.scene_off() if source or dark else opened.scene_on()
+        if source or dark or not as_is:
+            opened.source_on() if source else opened.source_off()
+            opened.scene_off() if source or dark else opened.scene_on()
         recorder = prepare_recording(
             opened, out, label=label, n_frames=frames, seconds=seconds, n_buffers=buffers
         )

@@ -313,6 +313,8 @@ def test_a_psf_without_a_terminal_needs_as_is_and_the_error_says_so(
         metadata = json.loads(file.pages[0].description)  # type: ignore[union-attr]
     assert metadata["light"] == "source"
     assert metadata["operator_asked"] is False
+    assert main(["record", "--source", "--frames", "1"]) == 2
+    assert "--as-is" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("mock_drivers")
