@@ -114,6 +114,8 @@ def analyze(
         raise BenchError("--response says what --cutoff-deg and --fall-off-deg would: give one of them.")
     measured_response = None if response is None else load_response(response)
     folder = find_calibration(calibration)
+    if folder != calibration:
+        typer.echo(f"{'Analyses':<28}{folder}")
     measured = load_calibration(folder)
     settings = AnalysisSettings(
         z_um=None if z_mm is None else 1e3 * z_mm,

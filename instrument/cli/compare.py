@@ -48,6 +48,14 @@ def compare(
         raise FileError(out, "exists already.", "Choose another name, or overwrite with --force.")
     folders = [find_calibration(folder) for folder in (old, new)]
     first, second = (load_calibration(folder) for folder in folders)
+    for name, folder, calibration in (("Old", folders[0], first), ("New", folders[1], second)):
+        typer.echo(f"{name:<5}{folder}")
+        if source := calibration.provenance.get("refocused_from"):
+            raise FileError(
+                folder,
+                f"was computed from {source}, not measured: it cannot tell what moved.",
+                "Compare the calibrations that were measured.",
+            )
     found = compare_calibrations(first, second)
     table = Table()
     for heading in ("z, mm", "shift, px (x, y)", "scale", "rotation", "alike", "aligned", "spot", "light"):

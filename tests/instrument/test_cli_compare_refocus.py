@@ -104,3 +104,17 @@ def test_comparing_tells_whether_a_calibration_is_due(
     assert len(record["changes"]) == 2
     assert main(["compare", same, same, "--out", str(out)]) == 2
     assert main(["compare", same, str(tmp_path / "nothing")]) == 2
+
+
+def test_what_was_compared_is_named_and_computed_psfs_are_no_measurement(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "calibration").symlink_to(folder / "calibration")
+    assert main(["compare", str(folder / "calibration"), str(run)]) == 0
+    assert str(run / "calibration") in "".join(capsys.readouterr().out.split("\n"))
+    computed = tmp_path / "at75"
+    assert main(["refocus", str(folder / "calibration"), "--z-mm", "75", "--out", str(computed)]) == 0
+    assert main(["compare", str(folder / "calibration"), str(computed)]) == 2
+    assert "was computed from" in " ".join(capsys.readouterr().err.split())
