@@ -253,11 +253,12 @@ def _compare(
     """Return ``(angle, response, seen)`` of one place, or None when too little of its pattern is seen."""
     here, there = (expected_shift(p, distance_um, pitch_um) for p in (point, origin))
     near = here[0] - there[0], here[1] - there[1]
+    if _part_seen(axis_bare, near) < LEAST_SEEN:
+        return None  # nothing but noise may be left, in which a pattern would be found by chance
     found = register(image, axis_image, near=near, within_px=_NEAR_PX)
     if not found.reliable:  # too little is seen to tell; the stage knows well enough for a sum over pixels
         found = _by_stage(found, near)
-    # The axis' pattern where this one is: aligned() takes a displacement back, so give it the opposite.
-    expected = aligned(axis_bare.astype(np.float32), _by_stage(found, (-found.rows, -found.columns)))
+    expected = _displaced(axis_bare, (found.rows, found.columns))
     seen = float(expected.sum(dtype=np.float64) / axis_bare.sum())
     if seen < LEAST_SEEN:
         return None
@@ -296,6 +297,16 @@ def _tangents(
 
 def _by_stage(found: Registration, shift: tuple[float, float]) -> Registration:
     return replace(found, rows=shift[0], columns=shift[1])
+
+
+def _displaced(image: Floats, shift: tuple[float, float]) -> npt.NDArray[np.float32]:
+    """Move an image by ``(rows, columns)``; aligned() takes a displacement back, so it gets the opposite."""
+    return aligned(image.astype(np.float32), Registration(-shift[0], -shift[1], 1.0, 1.0, 1.0))
+
+
+def _part_seen(image: Floats, shift: tuple[float, float]) -> float:
+    """Return the part of an image's light that is left when it is displaced."""
+    return float(_displaced(image, shift).sum(dtype=np.float64) / image.sum())
 
 
 # Frames to light ---------------------------------------------------------------------------------------

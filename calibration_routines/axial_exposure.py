@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
-from calibration_routines.errors import CalibrationError
+from calibration_routines.errors import CalibrationError, TooDarkError
 from calibration_routines.sweep_plan import Position, Sweep, axis_point, depths_um
 from instrument.bench import Bench
 
 _MOST_BOOST = 10.0  # exposure off the axis over that on it: beyond, a wrong guess would cost too much time
 _CAUTION = 0.7  # of the logarithm: farther out than was asked, a brighter spot may lie on the sensor
-_BESIDE = 2 / 3  # of the field's radius: where the exposure off the axis is asked
+_BESIDE = (2 / 3, 1 / 3, 1 / 6)
+"""Of the field's radius: where the exposure off the axis is asked; farther in while the pattern misses the
+sensor."""
 _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 
@@ -58,13 +60,7 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
             if not sweep.by_hand:
                 bench.place_source(*axis)
             found.append((z_um, expose_source(bench, target=sweep.target)))
-            beside = _beside(sweep, axis)
-            slopes.append(0.0)
-            if beside is not None:
-                bench.place_source(*beside)
-                dimmer = expose_source(bench, target=sweep.target)
-                more = np.log(dimmer.exposure_ms / found[-1][1].exposure_ms)
-                slopes[-1] = max(0.0, float(more)) / _tangent_squared(beside, axis)
+            slopes.append(_slope(bench, sweep, axis, found[-1][1].exposure_ms))
     finally:
         bench.source_off()
     longest = bench.camera.exposure_limits_ms[1]
@@ -78,13 +74,28 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
     return SweepExposures(tuple(exposures), tuple(found))
 
 
-def _beside(sweep: Sweep, axis: Position) -> Position | None:
-    """Return the point of the axis point's depth about two thirds out; None where it is alone."""
+def _slope(bench: Bench, sweep: Sweep, axis: Position, on_axis_ms: float) -> float:
+    """Return how the logarithm of the exposure grows with the squared tangent; 0 where no place tells."""
+    for beside in _beside(sweep, axis):
+        bench.place_source(*beside)
+        try:
+            dimmer = expose_source(bench, target=sweep.target)
+        except TooDarkError:
+            continue  # lit on the axis, so the source works: from here its light misses the sensor
+        more = np.log(dimmer.exposure_ms / on_axis_ms)
+        return max(0.0, float(more)) / _tangent_squared(beside, axis)
+    return 0.0
+
+
+def _beside(sweep: Sweep, axis: Position) -> list[Position]:
+    """Return points of the axis point's depth, about two thirds out first; none where it is alone."""
     others = [p for p in sweep.points_um if p[2] == axis[2] and p != axis]
-    if not others:
-        return None
-    farthest = max(_tangent_squared(p, axis) for p in others)
-    return min(others, key=lambda p: abs(_tangent_squared(p, axis) - _BESIDE**2 * farthest))
+    farthest = max((_tangent_squared(p, axis) for p in others), default=0.0)
+
+    def nearest(part: float) -> Position:
+        return min(others, key=lambda p: abs(_tangent_squared(p, axis) - part**2 * farthest))
+
+    return list(dict.fromkeys(nearest(part) for part in _BESIDE)) if others else []
 
 
 def _tangent_squared(point: Position, axis: Position) -> float:
@@ -109,6 +120,8 @@ def expose_source(bench: Bench, *, target: float = 0.7) -> AutoExposure:
         if result.outcome is ExposureOutcome.REACHED or result.exposure_ms <= 2 * dark_exposure_ms:
             break  # else pixels may be hot that were not at the dark frame's shorter exposure: look again
     too_dark = result.outcome is ExposureOutcome.TOO_DARK and result.trace[-1].level < _DIMMEST_USABLE
-    if too_dark or result.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
+    if too_dark:
+        raise TooDarkError(result.message)
+    if result.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
         raise CalibrationError(result.message)
     return result

@@ -9,3 +9,7 @@ class CalibrationError(BenchError):
     """A calibration that cannot be taken, or was ended before its last frame."""
 
     exit_code = 1
+
+
+class TooDarkError(CalibrationError):
+    """Hardly any light reaches the camera, even at its longest exposure."""

@@ -125,7 +125,7 @@ class WavePropagator(Propagator):
             part = energy[_within(tile.rows, rows), _within(tile.columns, columns)]
             for wavelength_nm, weight in spectrum:
                 self._add_tile(part, tile, source_um, margin, rho, wavelength_nm, weight, emission)
-        if blur > 0.5:
+        if blur > 0.5 and energy.size:  # empty: the pattern lies wholly off the sensor
             energy = np.asarray(cv2.filter2D(energy, -1, disc_kernel(blur), borderType=cv2.BORDER_CONSTANT))
         y_edges = (np.arange(rows.start, rows.stop + 1) - n_rows / 2) * pitch * scale - magnification * y
         x_edges = (np.arange(columns.start, columns.stop + 1) - n_columns / 2) * pitch * scale

@@ -63,6 +63,17 @@ def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: P
     np.testing.assert_allclose(loaded.fall_off()(tan_y, tan_x), world.fall_off(tan_y, tan_x), atol=0.03)
 
 
+def test_angles_from_which_no_light_meets_the_sensor_are_left_out(bench: Bench, tmp_path: Path) -> None:
+    """The sweep as it is without options: far more angles than the sensor sees."""
+    sweep = AngularSweep(farthest_um(bench, 45.0), 45.0, 5.0, average=1, dark_frames=1)
+    response, _ = measure_angular_response(bench, sweep, tmp_path)
+    for curve in (response.along_x, response.along_y):
+        assert len(curve.angles_deg) >= 4
+        assert max(np.abs(curve.angles_deg)) < 30
+        truth = np.exp(-(np.square(curve.angles_deg)) / 2 / 6**2)
+        np.testing.assert_allclose(curve.response, truth, atol=0.05)
+
+
 def test_an_angle_out_of_reach_is_refused_before_anything_moves(bench: Bench) -> None:
     assert farthest_um(bench, 45.0) == pytest.approx(0.98 * 60e3)
     assert farthest_um(bench, 5.0) == pytest.approx(300e3)

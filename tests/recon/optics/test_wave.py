@@ -258,3 +258,12 @@ def test_dispersion_follows_the_abbe_number() -> None:
     glass = Glass(1.58, 30.0)
     assert (glass.at(589.3) - 1) / (glass.at(486.1) - glass.at(656.3)) == pytest.approx(30.0, rel=1e-6)
     assert AIR.at(400.0) == 1.0
+
+
+@pytest.mark.parametrize("diameter_um", [0.0, 500.0])
+def test_a_pattern_wholly_off_the_sensor_is_dark(propagator: WavePropagator, diameter_um: float) -> None:
+    source_um, small = (60e3, 0.0, 60e3), PixelGrid((24, 32), 13.0)
+    assert propagator.caustic(source_um, small, LIGHT, diameter_um=diameter_um).energy.size == 0
+    image = propagator.psf(source_um, small, LIGHT, diameter_um=diameter_um)
+    assert image.shape == small.shape
+    assert not image.any()
