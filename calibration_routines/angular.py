@@ -43,6 +43,8 @@ _POWER: dict[Emission, float] = {"pinhole": 4.0, "bead": 3.0}
 """Cosines in the light through the aperture: three of its solid angle, one of a flat source that faces it."""
 LEAST_SEEN = 0.08
 """Part of the pattern's light that must still fall onto the sensor for an angle to be measured."""
+MOST_STEPS = 300
+"""More angles to one side of an axis are a mistake."""
 RESPONSE_FILE = "angular_response.json"
 _REACH_MARGIN = 0.98  # of the stage's travel
 _SMOOTH_PX, _SUPPORT = 6.0, 0.05  # the pattern is where its smoothed light is above this part of its maximum
@@ -75,11 +77,18 @@ class AngularSweep:
 
     def __post_init__(self) -> None:
         problems = []
-        if not self.z_um > 0:
-            problems.append(f"the source stands in front of the diffuser, z > 0, not {self.z_um / 1e3:g} mm")
+        if not 0 < self.z_um < np.inf:
+            problems.append(
+                f"the source stands in front of the diffuser, at a finite z > 0, not {self.z_um / 1e3:g} mm"
+            )
         if not 0 < self.step_deg <= self.largest_deg < 80:
             problems.append(
                 f"0 < step <= largest angle < 80 degrees, not {self.step_deg:g} and {self.largest_deg:g}"
+            )
+        elif self.largest_deg / self.step_deg > MOST_STEPS:
+            problems.append(
+                f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than {MOST_STEPS}: "
+                "choose larger steps"
             )
         if self.emission not in _POWER:
             problems.append(f"emission is pinhole or bead, not {self.emission!r}")

@@ -93,8 +93,9 @@ class AutoExposure:
     def message(self) -> str:
         """What happened and what to do about it, one or two sentences."""
         last = self.trace[-1]
+        frames = "1 frame" if len(self.trace) == 1 else f"{len(self.trace)} frames"
         found = (
-            f"{self.exposure_ms:.4g} ms after {len(self.trace)} frames: "
+            f"{self.exposure_ms:.4g} ms after {frames}: "
             f"{self.percentile:g}th percentile at {last.level:.0%} of full scale (target {self.target:.0%}), "
             f"brightest pixel at {last.brightest:.0%}"
         )

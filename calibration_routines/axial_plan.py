@@ -65,13 +65,20 @@ class AxialSweep:
 
     def __post_init__(self) -> None:
         problems: list[str] = []
-        if not 0 < self.z_min_um <= self.z_max_um:
+        if not 0 < self.z_min_um <= self.z_max_um < np.inf:
             problems.append(
                 f"planes must lie in front of the diffuser, nearest first: 0 < z min <= z max, "
                 f"not {self.z_min_um / 1e3:g} and {self.z_max_um / 1e3:g} mm"
             )
-        if self.planes < 1 or (self.planes == 1) != (self.z_min_um == self.z_max_um):
-            problems.append(f"{self.planes} planes between z min and z max: one plane needs z min = z max")
+        elif self.planes < 1 or (self.planes == 1) != (self.z_min_um == self.z_max_um):
+            problems.append(
+                f"the number of planes is {self.planes}: one plane needs z min = z max, "
+                "more need z min < z max"
+            )
+        if not np.isfinite((self.x_um, self.y_um)).all():
+            problems.append(
+                f"x and y must be finite numbers, not {self.x_um / 1e3:g} and {self.y_um / 1e3:g} mm"
+            )
         if self.by_hand and self.planes > 1:
             problems.append(f"{self.planes} planes need a stage; by hand one PSF is taken at a time")
         problems += settings_problems(self)

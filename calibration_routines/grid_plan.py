@@ -66,8 +66,10 @@ def grid_sweep(
     Raises
     ------
     BenchError
-        When the geometry is not known, there is no stage, or the grid would be too large.
+        When a number makes no sense, the geometry is not known, there is no stage, or the grid would be too
+        large.
     """
+    _check_numbers(depths_um, half_field_um, spacing_um, (x_um, y_um))
     points: list[Position] = []
     reasons: list[str] = []
     shapes = []
@@ -81,14 +83,17 @@ def grid_sweep(
                 words.append(sampling.reason)
             else:
                 spacing = spacing_um
-            steps = int(np.ceil(half / spacing - 1e-9))
-            if 2 * steps + 1 > MOST_POINTS_A_SIDE:
+            needed = 2 * np.ceil(half / spacing - 1e-9) + 1  # a float: it may be too large for an integer
+            if needed > MOST_POINTS_A_SIDE:
                 raise BenchError(
                     f"A field of {2e-3 * half:.3g} mm along {along} at z = {z_um / 1e3:.4g} mm needs "
-                    f"{2 * steps + 1} points every {spacing / 1e3:.3g} mm, more than {MOST_POINTS_A_SIDE}. "
+                    f"{needed:.6g} points every {spacing / 1e3:.3g} mm, more than {MOST_POINTS_A_SIDE}. "
                     "Make the field smaller or the spacing larger."
                 )
-            axes.append(centre + np.linspace(-half, half, 2 * steps + 1) if steps else np.array([centre]))
+            points_along = int(needed)
+            axes.append(
+                centre + np.linspace(-half, half, points_along) if points_along > 1 else np.array([centre])
+            )
         shapes.append((len(axes[0]), len(axes[1])))
         if number in (0, len(depths_um) - 1):
             reasons += [f"Field: {field}", *(f"Spacing: {w}" for w in words)]
@@ -98,6 +103,25 @@ def grid_sweep(
     if spacing_um is not None:
         reasons.append(f"Spacing: {spacing_um / 1e3:.3g} mm at most, as asked")
     return GridSweep(tuple(points), tuple(dict.fromkeys(reasons)), tuple(shapes))
+
+
+def _check_numbers(
+    depths_um: tuple[float, ...],
+    half_field_um: tuple[float, float] | None,
+    spacing_um: float | None,
+    centre_um: tuple[float, float],
+) -> None:
+    problems = [
+        f"a depth must be a finite number above 0 mm, not {z_um / 1e3:g}"
+        for z_um in depths_um
+        if not 0 < z_um < np.inf
+    ]
+    if spacing_um is not None and not 0 < spacing_um < np.inf:
+        problems.append(f"the spacing must be a finite number above 0 mm, not {spacing_um / 1e3:g}")
+    if not np.isfinite((*centre_um, *(half_field_um or ()))).all():
+        problems.append("the field and its centre must be finite numbers")
+    if problems:
+        raise BenchError("; ".join(problems) + ".")
 
 
 def _half_field(

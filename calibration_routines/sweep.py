@@ -37,6 +37,7 @@ from calibration_routines.sweep_plan import (
     Position,
     Sweep,
     axis_point,
+    check_image_settings,
     check_sweep,
     depths_um,
     retake_plan,
@@ -54,6 +55,7 @@ from instrument.acquire import acquire, prepare
 from instrument.atomic import write_text
 from instrument.bench import Bench
 from instrument.calibration_file import save_calibration
+from instrument.errors import BenchError
 from instrument.runner import Progress
 from instrument.store import Run, RunCondition
 from recon.types import Calibration, Geometry
@@ -190,6 +192,13 @@ def _finished(
     dark = _dark_model(run)
     if sweep.binning == 0:
         sweep = _binned_to_resolution(run, sweep, dark)
+    try:
+        check_image_settings(sweep, dark.hot.shape)
+    except BenchError as error:
+        raise BenchError(
+            f"{run.path / SWEEP_FILE}: {error} All frames are kept: change binning or dct_order there, then: "
+            f"diffuserbench resume {run.path}"
+        ) from None
     runs = [run]
     takes = dict.fromkeys(sweep.points_um, run)
     analysis = _analysed(takes, sweep, dark, record.geometry, on_analysis)

@@ -20,6 +20,8 @@ DARK, PSF, REFERENCE = "dark", "psf", "reference"
 """Labels of a sweep's steps."""
 LEAST_POINTS_WITH_REFERENCE = 4
 """A shorter sweep is over before a source drifts: no reference visits."""
+LEAST_SIDE_PX = 16
+"""A PSF image with a shorter side shows no pattern that could be judged or reconstructed with."""
 
 
 class Sweep(Protocol):
@@ -87,6 +89,8 @@ class PointSweep:
             problems.append("a sweep needs at least one point")
         if len(set(self.points_um)) != len(self.points_um):
             problems.append("a point is listed twice")
+        if not np.isfinite(self.points_um).all():
+            problems.append("every coordinate of a point must be a finite number")
         if any(z <= 0 for _, _, z in self.points_um):
             problems.append("every point must lie in front of the diffuser, z > 0")
         if problems:
@@ -110,6 +114,33 @@ def settings_problems(sweep: Sweep) -> list[str]:
     if not 0.05 <= sweep.target <= 0.9:
         problems.append(f"target must lie between 0.05 and 0.9 of full scale, not {sweep.target:g}")
     return problems
+
+
+def check_image_settings(sweep: Sweep, frame_shape: Sequence[int]) -> None:
+    """Refuse a binning or a number of DCT coefficients that leaves nothing of frames of this shape.
+
+    Raises
+    ------
+    BenchError
+        Naming the largest values that fit.
+    """
+    height, width = frame_shape[:2]
+    binning = max(sweep.binning, 1)  # automatic: known only once there are frames
+    problems = []
+    if min(height, width) // binning < LEAST_SIDE_PX:
+        most = max(1, min(height, width) // LEAST_SIDE_PX)
+        problems.append(
+            f"binning {binning} leaves {height // binning} x {width // binning} pixels of the camera's "
+            f"{height} x {width}, fewer than {LEAST_SIDE_PX} on a side: choose {most} at most"
+        )
+    elif sweep.dct_order > min(height, width) // binning:
+        problems.append(
+            f"{sweep.dct_order} DCT coefficients along each axis (dct) are more than the image's "
+            f"{height // binning} x {width // binning} pixels have: choose "
+            f"{min(height, width) // binning} at most; Kuo 2020, Sec. 6.4 removes 10"
+        )
+    if problems:
+        raise BenchError("; ".join(problems) + ".")
 
 
 def depths_um(sweep: Sweep) -> tuple[float, ...]:
@@ -168,16 +199,25 @@ def retake_plan(sweep: Sweep, points: Sequence[tuple[Position, float]]) -> Plan:
 def check_sweep(bench: Bench, sweep: Sweep, folder: Path | None = None) -> Plan:
     """Refuse a sweep that leaves the bench's limits or the disk, before anything moves; returns a first plan.
 
-    The plan is made with the camera's present exposure; :func:`~calibration_routines.expose_sweep` finds the
-    right ones. The stage need not be homed yet: limits hold all the same, and the sweep itself is checked
+    The plan is made with the camera's present exposure, by a trifle another for the last of several points so
+    that there are dark frames at two exposures; :func:`~calibration_routines.expose_sweep` finds the right
+    ones. The stage need not be homed yet: limits hold all the same, and the sweep itself is checked
     again.
 
     Raises
     ------
     PlanError
         Naming every step that cannot be done.
+    BenchError
+        When binning or DCT order do not fit the camera's frames.
     """
-    plan = sweep_plan(sweep, [bench.camera.exposure_ms] * len(sweep.points_um))
+    check_image_settings(sweep, bench.camera.frame_shape)
+    present_ms, (shortest_ms, longest_ms) = bench.camera.exposure_ms, bench.camera.exposure_limits_ms
+    exposures_ms = [present_ms] * len(sweep.points_um)
+    if len(exposures_ms) > 1:
+        limit_ms = shortest_ms if present_ms > shortest_ms else longest_ms
+        exposures_ms[-1] = float(np.nextafter(present_ms, limit_ms))
+    plan = sweep_plan(sweep, exposures_ms)
     check(plan, replace(abilities_of(bench, folder), stage_homed=True))
     return plan
 

@@ -304,6 +304,11 @@ class Runner:
         finally:
             self._finished.set()
             interruption = self._last_report(state=RunState.FINISHED, reason=reason) or interruption
+        if error is not None:
+            error.add_note(
+                f"{len(run.records)} of {run.n_frames} frames are kept. For the others: "
+                f"diffuserbench resume {run.path}"
+            )
         if interruption is not None and error is None:
             raise interruption
         return run

@@ -14,6 +14,7 @@ from calibration_routines.angular_response import load_response
 from instrument.bench import Bench
 from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.numbers import finite, positive
 from instrument.cli.sweeping import take_sweep
 from instrument.errors import BenchError
 from instrument.plan import Span
@@ -22,16 +23,22 @@ from recon.optics.fall_off import FallOff, gaussian_fall_off
 app = command_app("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
 _MAX_PLANES = 256
 
-ZMin = Annotated[float, typer.Option("--z-min", metavar="MM", help="Nearest plane, from the diffuser.")]
+ZMin = Annotated[
+    float, typer.Option("--z-min", metavar="MM", callback=finite, help="Nearest plane, from the diffuser.")
+]
 Planes = Annotated[
     int | None,
     typer.Option(help="Number of planes, evenly spaced in 1/z; left out: as many as the optics need."),
 ]
 Average = Annotated[int, typer.Option(help="Frames a PSF.")]
 DarkFrames = Annotated[int, typer.Option(help="Dark frames at the shortest and longest exposure each.")]
-X = Annotated[float, typer.Option(metavar="MM", help="Lateral place of the source, or the grid's centre.")]
+X = Annotated[
+    float,
+    typer.Option(metavar="MM", callback=finite, help="Lateral place of the source, or the grid's centre."),
+]
 Target = Annotated[
-    float, typer.Option(help="Level of each PSF's 99.9th percentile, as a fraction of full scale.")
+    float,
+    typer.Option(callback=finite, help="Level of each PSF's 99.9th percentile, as a fraction of full scale."),
 ]
 Dct = Annotated[
     int,
@@ -53,10 +60,13 @@ Every = Annotated[
 ]
 Lenslet = Annotated[
     float | None,
-    typer.Option("--lenslet", metavar="UM", help="Lenslet diameter, for the number of planes."),
+    typer.Option(
+        "--lenslet", metavar="UM", callback=positive, help="Lenslet diameter, for the number of planes."
+    ),
 ]
 Wavelength = Annotated[
-    float | None, typer.Option("--wavelength", metavar="NM", help="For --lenslet; default: [geometry].")
+    float | None,
+    typer.Option("--wavelength", metavar="NM", callback=positive, help="For --lenslet; default: [geometry]."),
 ]
 Out = Annotated[
     Path | None,
@@ -67,15 +77,29 @@ DryRun = Annotated[
 ]
 HalfField = Annotated[
     float | None,
-    typer.Option(metavar="MM", help="Half the grid's width (height); left out: what a reconstruction shows."),
+    typer.Option(
+        metavar="MM",
+        callback=finite,
+        help="Half the grid's width (height); left out: what a reconstruction shows.",
+    ),
 ]
 Spacing = Annotated[
     float | None,
-    typer.Option("--spacing", metavar="MM", help="Of the points; left out: by Nyquist of the fall-off."),
+    typer.Option(
+        "--spacing",
+        metavar="MM",
+        callback=positive,
+        help="Of the points; left out: by Nyquist of the fall-off.",
+    ),
 ]
 FallOffDeg = Annotated[
     float | None,
-    typer.Option("--fall-off-deg", metavar="DEG", help="Standard deviation of a Gaussian angular response."),
+    typer.Option(
+        "--fall-off-deg",
+        metavar="DEG",
+        callback=positive,
+        help="Standard deviation of a Gaussian angular response.",
+    ),
 ]
 ResponseFile = Annotated[
     Path | None,
@@ -105,7 +129,9 @@ def axial(
     z_min: ZMin,
     z_max: Annotated[
         float | None,
-        typer.Option("--z-max", metavar="MM", help="Farthest plane; left out: one PSF at --z-min."),
+        typer.Option(
+            "--z-max", metavar="MM", callback=finite, help="Farthest plane; left out: one PSF at --z-min."
+        ),
     ] = None,
     planes: Planes = None,
     average: Average = 4,
@@ -161,7 +187,10 @@ def axial(
     )
 )
 def lateral(
-    z: Annotated[float, typer.Option("--z", metavar="MM", help="Depth of the grid, from the diffuser.")],
+    z: Annotated[
+        float,
+        typer.Option("--z", metavar="MM", callback=positive, help="Depth of the grid, from the diffuser."),
+    ],
     half_field_x: HalfField = None,
     half_field_y: HalfField = None,
     spacing: Spacing = None,
@@ -211,7 +240,7 @@ def lateral(
 )
 def volume(
     z_min: ZMin,
-    z_max: Annotated[float, typer.Option("--z-max", metavar="MM", help="Farthest plane.")],
+    z_max: Annotated[float, typer.Option("--z-max", metavar="MM", callback=finite, help="Farthest plane.")],
     planes: Planes = None,
     half_field_x: HalfField = None,
     half_field_y: HalfField = None,
@@ -319,8 +348,6 @@ def _half_field(x_mm: float | None, y_mm: float | None) -> tuple[float, float] |
 
 
 def _micrometres(spacing_mm: float | None) -> float | None:
-    if spacing_mm is not None and spacing_mm <= 0:
-        raise BenchError(f"--spacing must be above 0 mm, not {spacing_mm:g}.")
     return None if spacing_mm is None else 1e3 * spacing_mm
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,7 @@ from calibration_routines.calibration_figures import response_figure
 from calibration_routines.sweep_plan import check_sweep
 from instrument.acquire import abilities_of
 from instrument.cli.app import BenchOption, examples, open_and_say
+from instrument.cli.numbers import finite
 from instrument.cli.progress import one_task
 from instrument.cli.sweeping import describe_exposures
 from instrument.errors import BenchError
@@ -33,11 +35,18 @@ def angular(
     z: Annotated[
         float | None,
         typer.Option(
-            "--z", metavar="MM", help="Distance of the source; left out: the farthest that spans the angles."
+            "--z",
+            metavar="MM",
+            callback=finite,
+            help="Distance of the source; left out: the farthest that spans the angles.",
         ),
     ] = None,
-    largest: Annotated[float, typer.Option("--largest", metavar="DEG", help="Largest angle.")] = 45.0,
-    step: Annotated[float, typer.Option("--step", metavar="DEG", help="Between angles.")] = 3.0,
+    largest: Annotated[
+        float, typer.Option("--largest", metavar="DEG", callback=finite, help="Largest angle.")
+    ] = 45.0,
+    step: Annotated[
+        float, typer.Option("--step", metavar="DEG", callback=finite, help="Between angles.")
+    ] = 3.0,
     emission: Annotated[
         str,
         typer.Option(
@@ -63,9 +72,12 @@ def angular(
     kind: Emission = "bead" if emission == "bead" else "pinhole"
     if kind != emission:
         raise BenchError(f"--emission is pinhole or bead, not {emission!r}.")
+    # Mistakes show before the bench opens; the distance may follow from its stage.
+    blank = AngularSweep(1.0 if z is None else 1e3 * z, largest, step, kind, average, dark_frames)
+    blank.points()
     with open_and_say(bench) as opened:
         z_um = farthest_um(opened, largest) if z is None else 1e3 * z
-        sweep = AngularSweep(z_um, largest, step, kind, average, dark_frames)
+        sweep = replace(blank, z_um=z_um)
         points = sweep.points()
         cost = estimate(check_sweep(opened, points, out), abilities_of(opened, out))
         console.print(

@@ -21,6 +21,7 @@ from calibration_routines.sweep_plan import DARK, depths_um, reference_point
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
 from instrument.cli.progress import one_task, progress_bar
+from instrument.cli.words import count
 from instrument.plan import Plan, estimate
 
 _MOST_LINES = 12  # findings printed; all of them are in calibration.json
@@ -44,6 +45,11 @@ def take_sweep(
         console.print(
             f"Dry run: nothing moved. Seconds are for the camera's present {bench.camera.exposure_ms:g} ms; "
             "the exposures are found at the start."
+            + (
+                " Dark frames are for two exposures; one suffices if all points get the same."
+                if len(sweep.points_um) > 1
+                else ""
+            )
         )
         return
     if bench.stage is not None and not sweep.by_hand:
@@ -72,8 +78,9 @@ def describe_exposures(console: Console, exposures: SweepExposures) -> None:
     for z_um, found in exposures.found:
         last = found.trace[-1]
         console.print(
-            f"Exposure at {z_um / 1e3:.4g} mm: {found.exposure_ms:.4g} ms in {len(found.trace)} frames; "
-            f"99.9th percentile at {last.level:.0%}, brightest pixel at {last.brightest:.0%} of full scale, "
+            f"Exposure at {z_um / 1e3:.4g} mm: {found.exposure_ms:.4g} ms in "
+            f"{count(len(found.trace), 'frame')}; 99.9th percentile at {last.level:.0%}, "
+            f"brightest pixel at {last.brightest:.0%} of full scale, "
             f"{last.saturated_pixels} saturated ({found.hot_pixels} hot pixels excepted).",
             soft_wrap=True,
         )
@@ -87,20 +94,20 @@ def describe_plan(console: Console, bench: Bench, sweep: Sweep, plan: Plan, fold
     depths = depths_um(sweep)
     if sweep.kind == "axial":
         console.print(f"Planes (mm): {_numbers(depths)}", soft_wrap=True)
-        what = f"{len(depths)} planes"
+        what = count(len(depths), "plane")
     else:
         planes = f"at {len(depths)} depths (mm): {_numbers(depths)}" if len(depths) > 1 else "at one depth"
         console.print(f"Points: {len(sweep.points_um)} {planes}", soft_wrap=True)
-        what = f"{len(sweep.points_um)} points"
+        what = count(len(sweep.points_um), "point")
     lit = len(sweep.points_um) * sweep.average
     dark = sum(step.label == DARK for step in plan.steps())
     revisits = ""
     if reference_point(sweep) is not None:
         visits = (cost.frames - lit - dark) // sweep.average
-        revisits = f" + {visits} visits to a reference x {sweep.average}"
+        revisits = f" + {count(visits, 'visit')} to a reference x {sweep.average}"
     console.print(
-        f"Plan: {what} x {sweep.average} frames{revisits} + {dark} dark frames "
-        f"= {cost.frames} frames, {cost.total_bytes / 1e6:.0f} MB at most, "
+        f"Plan: {what} x {count(sweep.average, 'frame')}{revisits} + {count(dark, 'dark frame')} "
+        f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
         f"{cost.seconds:.0f} s of exposure and motion.",
         soft_wrap=True,
     )

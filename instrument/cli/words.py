@@ -12,6 +12,11 @@ def size(n_bytes: float) -> str:
     raise AssertionError
 
 
+def count(number: int, noun: str) -> str:
+    """Return how many of something there are: ``1 frame``, ``2 frames``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def duration(seconds: float) -> str:
     """Return a time for people."""
     if seconds < 120:

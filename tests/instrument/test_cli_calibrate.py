@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from instrument.calibration_file import load_calibration
 from instrument.cli import main
+from instrument.store import FrameToStore, RunWriter
 
 TINY = """
 [camera]
@@ -93,3 +96,152 @@ def test_a_source_too_weak_ends_with_1(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "bench.toml").write_text(TINY + "source_brightness = 1e-7\n")
     assert main(["calibrate", "axial", "--z-min", "100"]) == 1
     assert "too dark" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("dry_run", [["--dry-run"], []])
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (["--binning", "500"], "binning 500 leaves 0 x 0 pixels"),
+        (["--dct", "9999"], "9999 DCT coefficients"),
+        (["--dct", "100", "--binning", "4"], "100 DCT coefficients"),
+    ],
+)
+def test_binning_and_dct_that_do_not_fit_the_camera_are_found_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: list[str], message: str, dry_run: list[str]
+) -> None:
+    assert main(["calibrate", "axial", "--z-min", "100", *option, *dry_run]) == 2
+    out, err = capsys.readouterr()
+    assert message in err
+    assert "Exposure" not in out
+    assert not (tmp_path / "runs").exists()
+
+
+def test_resume_says_in_words_that_a_binning_does_not_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", "axial", "--z-min", "100", "--average", "1"]) == 0
+    (run,) = tmp_path.glob("runs/*")
+    shutil.rmtree(run / "calibration")
+    right = (run / "sweep.json").read_text()
+    (run / "sweep.json").write_text(right.replace('"binning": 1', '"binning": 500'))
+    assert main(["resume", str(run)]) == 2
+    err = capsys.readouterr().err
+    assert "binning 500 leaves" in err
+    assert "sweep.json" in err
+    (run / "sweep.json").write_text(right)
+    assert main(["resume", str(run)]) == 0
+    assert (run / "calibration").is_dir()
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("axial --z-min 100", "z-min z-max x y target lenslet wavelength"),
+        (
+            "lateral --z 100",
+            "z spacing x y target fall-off-deg half-field-x half-field-y",
+        ),
+        (
+            "volume --z-min 60 --z-max 100",
+            "z-min z-max spacing x y target fall-off-deg half-field-x half-field-y lenslet wavelength",
+        ),
+        ("angular", "z largest step"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_mistakes(
+    capsys: pytest.CaptureFixture[str], command: str, options: str, bad: str
+) -> None:
+    for option in options.split():
+        assert main(["calibrate", *command.split(), f"--{option}", bad, "--dry-run"]) == 2
+        err = capsys.readouterr().err
+        assert f"--{option}" in err
+        assert "finite number" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "lateral --z 0",
+        "lateral --z 100 --spacing 0",
+        "lateral --z 100 --spacing 1e-300",
+        "lateral --z 100 --fall-off-deg 0",
+        "lateral --z 100 --average 0",
+        "lateral --z 100 --dark-frames 0",
+        "lateral --z 100 --target 0",
+        "lateral --z 100 --binning 0",
+        "volume --z-min 0 --z-max 100",
+        "volume --z-min 60 --z-max 0",
+        "volume --z-min 60 --z-max 100 --planes 0",
+        "volume --z-min 60 --z-max 100 --lenslet 0",
+        "axial --z-min 60 --z-max 100 --wavelength 0",
+        "axial --z-min 60 --z-max 100 --planes 0",
+        "angular --z 0",
+        "angular --largest 0",
+        "angular --step 0",
+        "angular --step 1e-9",
+        "angular --average 0",
+        "angular --dark-frames 0",
+    ],
+)
+def test_zeros_are_mistakes(capsys: pytest.CaptureFixture[str], arguments: str) -> None:
+    assert main(["calibrate", *arguments.split(), "--dry-run"]) == 2
+    assert capsys.readouterr().err
+
+
+def test_planes_the_wrong_way_round_are_one_mistake(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "axial", "--z-min", "300", "--z-max", "100"]) == 2
+    err = capsys.readouterr().err
+    assert "nearest first" in err
+    assert "number of planes" not in err
+
+
+def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["calibrate", "axial", "--z-min", "100", "--average", "1", "--dark-frames", "1", "--dry-run"]
+    assert main(arguments) == 0
+    assert "Plan: 1 plane x 1 frame + 1 dark frame = 2 frames" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "axial --z-min 60 --z-max 150 --planes 2",
+        "axial --z-min 60",
+        "lateral --z 100 --half-field-x 10 --half-field-y 0 --spacing 10",
+    ],
+)
+def test_a_dry_run_plans_what_the_run_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    (tmp_path / "bench.toml").write_text(TINY + 'fall_off = "gaussian"\nfall_off_sigma_deg = 12\n')
+    plans = []
+    for dry_run in ("--dry-run", "--average=1"):
+        assert main(["calibrate", *command.split(), "--average", "1", dry_run]) == 0
+        (plan,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Plan: ")]
+        plans.append(plan.split(" frames, ")[0])
+    assert plans[0] == plans[1]
+
+
+def test_an_interrupted_sweep_says_what_is_kept_and_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, written = RunWriter.write, 0
+
+    def interrupted(self: RunWriter, frames: Sequence[FrameToStore]) -> None:
+        nonlocal written
+        if written == 5:
+            raise KeyboardInterrupt
+        written += 1
+        write(self, frames)
+
+    monkeypatch.setattr(RunWriter, "write", interrupted)
+    assert main(["calibrate", "axial", "--z-min", "100"]) == 130
+    (run,) = tmp_path.glob("runs/*")
+    err = capsys.readouterr().err
+    assert "5 of 8 frames are kept" in err
+    assert f"diffuserbench resume {run}" in err
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    assert main(["resume", str(run)]) == 0
+    assert (run / "calibration").is_dir()
