@@ -186,6 +186,23 @@ def _finished(
     on_progress: Progress | None,
     on_analysis: Analysed | None,
 ) -> SweepCalibration:
+    """Make the calibration of a complete run; an interruption says that all frames of it are kept."""
+    try:
+        return _judged(run, record, bench, on_progress, on_analysis)
+    except (KeyboardInterrupt, SystemExit) as interruption:
+        interruption.add_note(
+            f"All frames of the sweep are kept. For its calibration: diffuserbench resume {run.path}"
+        )
+        raise
+
+
+def _judged(
+    run: Run,
+    record: SweepRecord,
+    bench: Bench | None,
+    on_progress: Progress | None,
+    on_analysis: Analysed | None,
+) -> SweepCalibration:
     """Analyse, take again what needs it, judge the source, save."""
     sweep, exposures = record.sweep, record.exposures
     where = run.path.parent

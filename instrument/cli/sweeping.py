@@ -56,7 +56,11 @@ def take_sweep(
         with one_task("Homing the stage"):
             bench.stage.home()
     with one_task("Finding exposures"):
-        exposures = expose_sweep(bench, sweep)
+        try:
+            exposures = expose_sweep(bench, sweep)
+        except (KeyboardInterrupt, SystemExit) as interruption:
+            interruption.add_note("The sweep had not begun: no frame was kept, start it again.")
+            raise
     describe_exposures(console, exposures)
     describe_plan(console, bench, sweep, sweep_plan(sweep, exposures.exposures_ms), folder)
     with progress_bar() as bar:

@@ -245,3 +245,32 @@ def test_an_interrupted_sweep_says_what_is_kept_and_how_to_go_on(
     monkeypatch.chdir(tmp_path)
     assert main(["resume", str(run)]) == 0
     assert (run / "calibration").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        ("instrument.cli.sweeping.expose_sweep", "no frame was kept"),
+        (
+            "calibration_routines.sweep.analyse_sweep",
+            "All frames of the sweep are kept. For its calibration: ",
+        ),
+    ],
+)
+def test_an_interruption_before_or_after_the_frames_says_so(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    function: str,
+    says: str,
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(function, interrupted)
+        assert main(["calibrate", "axial", "--z-min", "100", "--average", "1"]) == 130
+    assert says in capsys.readouterr().err
+    for run in tmp_path.glob("runs/*"):
+        assert main(["resume", str(run)]) == 0
+        assert (run / "calibration").is_dir()
