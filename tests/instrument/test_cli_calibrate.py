@@ -194,7 +194,7 @@ def test_planes_the_wrong_way_round_are_one_mistake(capsys: pytest.CaptureFixtur
     assert main(["calibrate", "axial", "--z-min", "300", "--z-max", "100"]) == 2
     err = capsys.readouterr().err
     assert "nearest first" in err
-    assert "number of planes" not in err
+    assert "one plane" not in err
 
 
 def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
