@@ -76,8 +76,7 @@ class GrblLink:
     def report(self) -> Report:
         """Ask for a status report; positions are machine coordinates whatever ``$10`` says."""
         for _ in range(_OFFSET_REPORTS):
-            (line,) = self._transport.request(STATUS, report_matcher)
-            report = parse_report(line)
+            report = parse_report(self._report_line())
             assert report is not None, "the matcher lets nothing else through"
             if report.offset is not None:
                 self._offset = report.offset
@@ -91,6 +90,18 @@ class GrblLink:
             "reports work positions ($10) without their offset.",
             "Send $10=1 to the controller: machine positions.",
         )
+
+    def _report_line(self) -> bytes:
+        """Ask once more where nothing came: GRBL keeps one flag for any number of ``?``, read together.
+
+        So a question that meets another one, or the byte that stops a move, may share its answer.
+        """
+        try:
+            (line,) = self._transport.request(STATUS, report_matcher)
+        except DeviceTimeoutError as error:
+            _log.warning("%s Asked again.", error)
+            (line,) = self._transport.request(STATUS, report_matcher)
+        return line
 
     def command(self, line: bytes) -> list[bytes]:
         """Send a line and return what came before its ``ok``.
