@@ -149,7 +149,7 @@ def test_from_the_command_line_to_a_photographed_hologram(
     assert first["z_um"] == pytest.approx(150.0, abs=90.0)
     assert found.stage_position["x_um"] == pytest.approx(-31.0, abs=3.0)
     assert abs(found.pose.shift_x) < 0.6
-    # The ideal is a mean over random superpositions: on so small a display one may be a tenth brighter.
+    # 1.107 here, with a bound of 1.1 before: why more than the ideal is seen is not found out yet.
     assert 0.3 < found.efficiency < 1.3
     assert all(error > 0 for name, error in found.error.items() if name != "cubic")
     facts = json.loads(Path("alignment.json").read_text())
