@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import re
@@ -417,11 +416,13 @@ def test_spoilt_reports_are_never_a_position(plain: GrblController, plain_stage:
 
     plain.fault = fault
     with pytest.raises(DeviceTimeoutError):
-        plain_stage.position()  # asked twice
-    for _ in range(2):
-        # Asked again where nothing came; a report of two axes is refused.
-        with contextlib.suppress(DeviceError):
-            assert plain_stage.position()["x_um"] == -5000.0
+        plain_stage.position()  # asked twice, nothing whole came
+    assert plain_stage.position()["x_um"] == -5000.0  # asked again
+    assert next(spoilt, None) is None
+    plain.fault = lambda asked, reply: [b"<Idle|MPos:-9.000,-1.000>\r\n"] if asked == b"?" else [reply]
+    with pytest.raises(DeviceError, match="reports 2 axes, not 3"):
+        plain_stage.position()
+    plain.fault = None
     assert plain_stage.position()["x_um"] == -5000.0
 
 
