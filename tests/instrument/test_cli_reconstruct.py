@@ -21,7 +21,7 @@ from scipy.signal import convolve2d
 
 from instrument.calibration_file import save_calibration
 from instrument.cli import main
-from instrument.cli.reconstruct import Method, PriorName
+from instrument.cli.reconstruct_options import Method, PriorName
 from instrument.images import read_image, write_image
 from recon.methods import method_names
 from recon.picture import PRIORS

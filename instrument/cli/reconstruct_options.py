@@ -1,0 +1,332 @@
+"""The options of ``diffuserbench reconstruct``: their words, and what they mean."""
+
+from __future__ import annotations
+
+import enum
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from instrument.cli.noise_option import parse_noise
+from instrument.erasures import Choice
+from instrument.errors import BenchError
+from instrument.preparation import Crop
+from instrument.reconstruction_job import DarkChoice
+from recon.noise import NoiseModel
+from recon.volume.model import MODELS, ModelName
+
+DEFAULT_ITERATIONS = 300
+DEFAULT_VOLUME_ITERATIONS = 150
+
+
+class Method(enum.StrEnum):
+    """The methods of :func:`recon.reconstruct`."""
+
+    ADMM = "admm"
+    ADMM_SENSOR = "admm-sensor"
+    ADMM_GPU = "admm-gpu"
+    FISTA = "fista"
+    WIENER = "wiener"
+
+
+class PriorName(enum.StrEnum):
+    """The priors of :func:`recon.reconstruct`."""
+
+    TV = "tv"
+    TV_ISOTROPIC = "tv-isotropic"
+    TV_HAAR = "tv-haar"
+    L1 = "l1"
+    NONNEGATIVE = "nonnegative"
+    NONE = "none"
+
+
+class Rotation(enum.StrEnum):
+    """By how much the written picture is turned, degrees counter-clockwise."""
+
+    NONE = "0"
+    QUARTER = "90"
+    HALF = "180"
+    THREE_QUARTERS = "270"
+
+
+ImageOption = Annotated[
+    Path, typer.Option("--image", "-i", metavar="FILE", help="The photograph (raw frame).")
+]
+PsfOption = Annotated[
+    Path | None, typer.Option("--psf", "-p", metavar="FILE", help="The PSF image.", show_default=False)
+]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        "-c",
+        metavar="FOLDER",
+        help="Instead of --psf: a calibration, or a run with one.",
+        show_default=False,
+    ),
+]
+VolumeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--volume",
+        metavar="FOLDER|STACK",
+        help="A volume: PSFs, one a depth (folder, stack or calibration).",
+        show_default=False,
+    ),
+]
+ModelOption = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        metavar="auto|convolution|local|lowrank",
+        help="Camera model; local, lowrank: PSFs from several places of the field. auto: by their PSFs.",
+    ),
+]
+BackgroundOption = Annotated[
+    bool,
+    typer.Option("--background/--no-background", help="Of a volume: estimate a smooth background as well."),
+]
+DistanceOption = Annotated[
+    float | None,
+    typer.Option(
+        "--z-mm",
+        metavar="MM",
+        help="Distance of the scene; a PSF is refocused to it.",
+        show_default=False,
+    ),
+]
+DarkOption = Annotated[
+    str,
+    typer.Option(
+        "--dark", metavar="FILE|COUNTS|auto", help="Dark frame or offset; auto estimates the offset."
+    ),
+]
+CropOption = Annotated[
+    str | None,
+    typer.Option(
+        "--crop",
+        metavar="T,L,H,W|HxW",
+        help="Window in pixels, of PSF and image; HxW is centred.",
+        show_default=False,
+    ),
+]
+BinningOption = Annotated[
+    str,
+    typer.Option("--bin", metavar="N|auto", help="Average N x N pixels; auto: to at most 0.5 megapixel."),
+]
+ErasuresOption = Annotated[
+    str,
+    typer.Option(
+        "--erasures",
+        metavar="none|saturated|FILE|SHARE",
+        help="Pixels to leave out: saturated ones, a mask's zeros, or a random share.",
+    ),
+]
+NoiseOption = Annotated[
+    str | None,
+    typer.Option(
+        "--noise",
+        metavar="COUNTS|READ,GAIN",
+        help="Camera noise: one deviation, or read noise in counts and counts per electron. "
+        "Default: estimated.",
+        show_default=False,
+    ),
+]
+ScratchOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--scratch",
+        metavar="FOLDER",
+        help="Of a volume: where to keep what does not fit into memory, on a fast disk.",
+        show_default=False,
+    ),
+]
+MemoryOption = Annotated[
+    float | None,
+    typer.Option(
+        "--memory",
+        metavar="GIB",
+        help="Of a volume: memory that may be taken. Default: what is free.",
+        show_default=False,
+    ),
+]
+MethodOption = Annotated[
+    Method,
+    typer.Option(
+        "--method",
+        "-m",
+        help="admm: best; admm-sensor: dense scenes; admm-gpu: on a GPU; fista: plain; wiener: one shot.",
+    ),
+]
+PriorOption = Annotated[
+    PriorName | None,
+    typer.Option("--prior", help="What the scene is like. Default: tv; none for wiener.", show_default=False),
+]
+TauOption = Annotated[
+    float | None,
+    typer.Option(
+        "--tau",
+        metavar="X",
+        help="Weight of the prior, relative to the data. Default: from the noise.",
+        show_default=False,
+    ),
+]
+IterationsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--iterations",
+        "-n",
+        min=1,
+        metavar="N",
+        help=f"At most N iterations. Default: {DEFAULT_ITERATIONS}, or none with --time.",
+        show_default=False,
+    ),
+]
+TimeOption = Annotated[
+    float | None,
+    typer.Option("--time", min=0.0, metavar="S", help="At most S seconds.", show_default=False),
+]
+ToleranceOption = Annotated[
+    float | None,
+    typer.Option(
+        "--tolerance",
+        min=0.0,
+        metavar="X",
+        help="Stop when the relative change falls below X. Default: 2e-3 (fista: 5e-4).",
+        show_default=False,
+    ),
+]
+OutOption = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        "-o",
+        metavar="FILE",
+        help="float32 TIFF (volumes: or .ome.zarr); .png and .json go beside it.",
+    ),
+]
+RotateOption = Annotated[
+    Rotation,
+    typer.Option("--rotate", help="Turn the picture counter-clockwise, degrees; 180 if upside down."),
+]
+FigureOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--figure", metavar="FILE", help="Also a summary figure (.png, .pdf, .svg).", show_default=False
+    ),
+]
+DeviceOption = Annotated[
+    str,
+    typer.Option(
+        "--device", metavar="cpu|gpu", help="Of a volume: where to compute (pictures: --method admm-gpu)."
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")]
+AllowSaturatedOption = Annotated[
+    bool,
+    typer.Option("--allow-saturated", help="Accept a PSF with much of its light in saturated pixels."),
+]
+MixedDepthOption = Annotated[
+    bool, typer.Option("--mixed-depth", help="Accept PSF and image of different bit depth.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What pictures and volumes are both prepared and solved with: the options of those names, understood.
+
+    ``binning`` None chooses, ``prior`` and ``tau`` None take the method's default.
+    """
+
+    model: ModelName
+    dark: DarkChoice
+    crop: Crop | None
+    binning: int | None
+    erasures: Choice
+    noise: NoiseModel | float | None
+    prior: PriorName | None
+    tau: float | None
+    iterations: int | None
+    time_s: float | None
+    tolerance: float | None
+    force: bool
+
+    def limit(self, default: int) -> int | None:
+        """Return the largest count of iterations: as given, or the default, or none where time is the end."""
+        return default if self.iterations is None and self.time_s is None else self.iterations
+
+
+def parse_settings(
+    *,
+    model: str,
+    dark: str,
+    crop: str | None,
+    binning: str,
+    erasures: str,
+    noise: str | None,
+    prior: PriorName | None,
+    tau: float | None,
+    iterations: int | None,
+    time_s: float | None,
+    tolerance: float | None,
+    force: bool,
+) -> Settings:
+    """Understand the options that pictures and volumes share.
+
+    Raises
+    ------
+    BenchError
+        Which option is not understood, and what is expected.
+    """
+    chosen = next((m for m in MODELS if m == model), None)
+    if chosen is None:
+        raise BenchError(f"--model {model!r} is not known; choose one of {', '.join(MODELS)}.")
+    return Settings(
+        model=chosen,
+        dark=_dark(dark),
+        crop=None if crop is None else Crop.parse(crop),
+        binning=_binning(binning),
+        erasures=_erasures(erasures),
+        noise=parse_noise(noise),
+        prior=prior,
+        tau=tau,
+        iterations=iterations,
+        time_s=time_s,
+        tolerance=tolerance,
+        force=force,
+    )
+
+
+def _dark(text: str) -> DarkChoice:
+    if text == "auto":
+        return "auto"
+    try:
+        counts = float(text)
+    except ValueError:
+        return Path(text)
+    if not math.isfinite(counts):
+        raise BenchError(f"--dark {text}: the offset must be a finite number of counts.")
+    return counts
+
+
+def _erasures(text: str) -> Choice:
+    if text == "none":
+        return "none"
+    if text == "saturated":
+        return "saturated"
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
+def _binning(text: str) -> int | None:
+    if text == "auto":
+        return None
+    if not re.fullmatch(r"[1-9]\d*", text):
+        raise BenchError(f"--bin {text!r} is not understood; write a whole number from 1, or auto.")
+    return int(text)
