@@ -39,6 +39,7 @@ from instrument.cli.reconstruct_options import (
 )
 from instrument.errors import BenchError
 from instrument.reconstruction_file import Outputs
+from instrument.reconstruction_request import PictureRequest, VolumeRequest, known_device
 
 app = command_app()
 
@@ -101,7 +102,6 @@ def reconstruct(
         iterations=iterations,
         time_s=time_s,
         tolerance=tolerance,
-        force=force,
     )
     if volume is not None:
         pictures_only = {
@@ -116,10 +116,20 @@ def reconstruct(
         }
         if given := [option for option, is_given in pictures_only.items() if is_given]:
             raise BenchError(f"With --volume these do not apply: {', '.join(given)}. Leave them out.")
-        from instrument.cli.volume import VolumeOptions, reconstruct_to_volume
+        from instrument.cli.volume import reconstruct_to_volume
 
         reconstruct_to_volume(
-            volume, image, outputs, VolumeOptions(background, scratch, memory_gib, device), settings
+            VolumeRequest(
+                image=image,
+                psfs=volume,
+                estimate_background=background,
+                scratch=scratch,
+                memory_gib=memory_gib,
+                device=known_device(device),
+                settings=settings,
+            ),
+            outputs,
+            force=force,
         )
         return
     volumes_only = {
@@ -131,11 +141,20 @@ def reconstruct(
     for option, is_given in volumes_only.items():
         if is_given:
             raise BenchError(f"{option} is for volumes: give --volume, or leave it out.")
-    from instrument.cli.picture import PictureOptions, reconstruct_to_picture
+    from instrument.cli.picture import reconstruct_to_picture
 
     reconstruct_to_picture(
-        image,
+        PictureRequest(
+            image=image,
+            psf=psf,
+            calibration=calibration,
+            z_um=None if z_mm is None else 1e3 * z_mm,
+            method=method.value,
+            allow_saturated=allow_saturated,
+            allow_mixed_depth=mixed_depth,
+            settings=settings,
+        ),
         outputs,
-        PictureOptions(psf, calibration, z_mm, method, int(rotate), allow_saturated, mixed_depth),
-        settings,
+        rotate_deg=int(rotate),
+        force=force,
     )

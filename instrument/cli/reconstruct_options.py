@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import enum
-import math
-import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from instrument.cli.noise_option import parse_noise
-from instrument.erasures import Choice
-from instrument.errors import BenchError
 from instrument.preparation import Crop
-from instrument.reconstruction_job import DarkChoice
-from recon.noise import NoiseModel
-from recon.volume.model import MODELS, ModelName
-
-DEFAULT_ITERATIONS = 300
-DEFAULT_VOLUME_ITERATIONS = 150
+from instrument.reconstruction_request import PICTURE_ITERATIONS, Settings, known_model
+from instrument.reconstruction_words import parse_binning, parse_dark, parse_erasures, parse_noise
 
 
 class Method(enum.StrEnum):
@@ -182,7 +172,7 @@ IterationsOption = Annotated[
         "-n",
         min=1,
         metavar="N",
-        help=f"At most N iterations. Default: {DEFAULT_ITERATIONS}, or none with --time.",
+        help=f"At most N iterations. Default: {PICTURE_ITERATIONS}, or none with --time.",
         show_default=False,
     ),
 ]
@@ -235,31 +225,6 @@ MixedDepthOption = Annotated[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What pictures and volumes are both prepared and solved with: the options of those names, understood.
-
-    ``binning`` None chooses, ``prior`` and ``tau`` None take the method's default.
-    """
-
-    model: ModelName
-    dark: DarkChoice
-    crop: Crop | None
-    binning: int | None
-    erasures: Choice
-    noise: NoiseModel | float | None
-    prior: PriorName | None
-    tau: float | None
-    iterations: int | None
-    time_s: float | None
-    tolerance: float | None
-    force: bool
-
-    def limit(self, default: int) -> int | None:
-        """Return the largest count of iterations: as given, or the default, or none where time is the end."""
-        return default if self.iterations is None and self.time_s is None else self.iterations
-
-
 def parse_settings(
     *,
     model: str,
@@ -273,7 +238,6 @@ def parse_settings(
     iterations: int | None,
     time_s: float | None,
     tolerance: float | None,
-    force: bool,
 ) -> Settings:
     """Understand the options that pictures and volumes share.
 
@@ -282,51 +246,16 @@ def parse_settings(
     BenchError
         Which option is not understood, and what is expected.
     """
-    chosen = next((m for m in MODELS if m == model), None)
-    if chosen is None:
-        raise BenchError(f"--model {model!r} is not known; choose one of {', '.join(MODELS)}.")
     return Settings(
-        model=chosen,
-        dark=_dark(dark),
+        model=known_model(model),
+        dark=parse_dark(dark),
         crop=None if crop is None else Crop.parse(crop),
-        binning=_binning(binning),
-        erasures=_erasures(erasures),
+        binning=parse_binning(binning),
+        erasures=parse_erasures(erasures),
         noise=parse_noise(noise),
-        prior=prior,
+        prior=None if prior is None else prior.value,
         tau=tau,
         iterations=iterations,
         time_s=time_s,
         tolerance=tolerance,
-        force=force,
     )
-
-
-def _dark(text: str) -> DarkChoice:
-    if text == "auto":
-        return "auto"
-    try:
-        counts = float(text)
-    except ValueError:
-        return Path(text)
-    if not math.isfinite(counts):
-        raise BenchError(f"--dark {text}: the offset must be a finite number of counts.")
-    return counts
-
-
-def _erasures(text: str) -> Choice:
-    if text == "none":
-        return "none"
-    if text == "saturated":
-        return "saturated"
-    try:
-        return float(text)
-    except ValueError:
-        return Path(text)
-
-
-def _binning(text: str) -> int | None:
-    if text == "auto":
-        return None
-    if not re.fullmatch(r"[1-9]\d*", text):
-        raise BenchError(f"--bin {text!r} is not understood; write a whole number from 1, or auto.")
-    return int(text)

@@ -2,84 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import typer
 
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
-from instrument.cli.reconstruct_options import DEFAULT_VOLUME_ITERATIONS, Settings
-from instrument.errors import BenchError
 from instrument.reconstruction_file import Outputs
+from instrument.reconstruction_request import VOLUME_ITERATIONS, VolumeRequest
 from instrument.volume_file import write_volume
-from instrument.volume_job import volume_job
-from recon.gpu.namespace import DEVICES
 from recon.solvers.stopping import IterationRecord, StopReason
-from recon.volume.channel import PRIORS
-from recon.volume.reconstruct import reconstruct_volume
 
 
-@dataclass(frozen=True, slots=True)
-class VolumeOptions:
-    """The options that only a volume has, and no picture."""
-
-    background: bool
-    scratch: Path | None
-    memory_gib: float | None
-    device: str
-
-
-def reconstruct_to_volume(
-    psfs: Path, image: Path, outputs: Outputs, options: VolumeOptions, settings: Settings
-) -> None:
+def reconstruct_to_volume(request: VolumeRequest, outputs: Outputs, *, force: bool) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted."""
-    device = next((d for d in DEVICES if d == options.device), None)
-    if device is None:
-        raise BenchError(f"--device {options.device!r} is not known; choose one of {', '.join(DEVICES)}.")
-    prior = next((p for p in PRIORS if p == (settings.prior or "tv")), None)
-    if prior is None:
-        raise BenchError(f"--prior {settings.prior} is not for volumes; choose one of {', '.join(PRIORS)}.")
-    outputs.check(0, overwrite=settings.force)
-    limit = settings.limit(DEFAULT_VOLUME_ITERATIONS)
+    outputs.check(0, overwrite=force)
+    limit = request.settings.limit(VOLUME_ITERATIONS)
     with saying_what_is_left(*outputs.files()):
-        job = volume_job(
-            psfs,
-            image,
-            dark=settings.dark,
-            crop=settings.crop,
-            binning=settings.binning,
-            erasures=settings.erasures,
-        )
+        job = request.prepare()
         for name, text in job.notes.items():
             typer.echo(f"{name:<12}{text}")
         if job.simulated:
             typer.echo("SIMULATED   PSFs or image come from the simulated bench")
-        outputs.check(len(job.calibration.psfs) * job.measurement.size, overwrite=settings.force)
+        outputs.check(len(job.calibration.psfs) * job.measurement.size, overwrite=force)
         with progress_bar() as bar, first_interrupt_cancels() as cancel:
             task = bar.add_task("volume", total=limit, note="")
 
             def show(record: IterationRecord, _volume: object) -> None:
                 bar.update(task, completed=record.iteration, note=f"residual {record.data_residual:.3g}")
 
-            result = reconstruct_volume(
-                job.measurement,
-                job.calibration,
-                prior=prior,
-                tau=settings.tau,
-                model=settings.model,
-                estimate_background=options.background,
-                erasures=None if job.valid is None else ~job.valid,
-                noise=job.binned_noise(settings.noise),
-                scratch=options.scratch,
-                memory_gib=options.memory_gib,
-                device=device,
-                iterations=limit,
-                time_s=settings.time_s,
-                tolerance=1e-3 if settings.tolerance is None else settings.tolerance,
-                callback=show,
-                cancel=cancel,
-            )
+            result = request.solve(job, watch=show, cancel=cancel)
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
         typer.echo(f"{'Memory':<12}{result.provenance['memory']}")
         count = max(len(history) for history in result.histories)

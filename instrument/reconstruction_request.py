@@ -1,0 +1,275 @@
+"""What a reconstruction is asked for, as data: the command line, the window and scripts fill in the same."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.erasures import Choice
+from instrument.errors import BenchError
+from instrument.preparation import Crop
+from instrument.reconstruction_job import (
+    Binning,
+    DarkChoice,
+    Job,
+    job_from_calibration,
+    job_from_files,
+    refocused,
+)
+from instrument.volume_job import volume_job
+from recon.gpu.namespace import DEVICES, Device
+from recon.noise import NoiseModel
+from recon.picture import reconstruct
+from recon.result import Reconstruction
+from recon.solvers.stopping import IterationRecord
+from recon.volume.channel import PRIORS as VOLUME_PRIORS
+from recon.volume.channel import VolumePrior
+from recon.volume.model import MODELS, ModelName
+from recon.volume.reconstruct import reconstruct_volume
+from recon.volume.result import VolumeReconstruction
+
+Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+"""Called after each iteration with its record and what makes the present picture or volume."""
+
+PICTURE_ITERATIONS = 300
+VOLUME_ITERATIONS = 150
+
+
+def known_model(name: str) -> ModelName:
+    """Return the camera model of that name; BenchError where there is none."""
+    found = next((model for model in MODELS if model == name), None)
+    if found is None:
+        raise BenchError(f"--model {name!r} is not known; choose one of {', '.join(MODELS)}.")
+    return found
+
+
+def known_volume_prior(name: str) -> VolumePrior:
+    """Return the volume's prior of that name; BenchError where there is none."""
+    found = next((prior for prior in VOLUME_PRIORS if prior == name), None)
+    if found is None:
+        raise BenchError(f"--prior {name} is not for volumes; choose one of {', '.join(VOLUME_PRIORS)}.")
+    return found
+
+
+def known_device(name: str) -> Device:
+    """Return where to compute; BenchError where the name is not known."""
+    found = next((device for device in DEVICES if device == name), None)
+    if found is None:
+        raise BenchError(f"--device {name!r} is not known; choose one of {', '.join(DEVICES)}.")
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What pictures and volumes are both prepared and solved with.
+
+    Attributes
+    ----------
+    dark, crop, binning, erasures
+        As :func:`instrument.reconstruction_job.job_from_files`.
+    model : str
+        One of :data:`recon.volume.model.MODELS`.
+    prior : str or None
+        None: the method's default.
+    tau, noise, iterations, time_s, tolerance
+        As :func:`recon.reconstruct`. Without ``iterations`` and ``time_s`` a default count applies.
+    """
+
+    model: ModelName = "auto"
+    dark: DarkChoice = "auto"
+    crop: Crop | None = None
+    binning: Binning = None
+    erasures: Choice = "saturated"
+    noise: NoiseModel | float | None = None
+    prior: str | None = None
+    tau: float | None = None
+    iterations: int | None = None
+    time_s: float | None = None
+    tolerance: float | None = None
+
+    def limit(self, default: int) -> int | None:
+        """Return the largest count of iterations: as given, or the default, or none where time is the end."""
+        return default if self.iterations is None and self.time_s is None else self.iterations
+
+    def done_share(self, record: IterationRecord, default: int) -> float:
+        """Return how much of the work is done, 0 to 1: whichever of count and time is nearer to its end."""
+        limit = self.limit(default)
+        by_count = 0.0 if limit is None else record.iteration / limit
+        by_time = 0.0 if self.time_s is None else record.seconds / self.time_s
+        return min(max(by_count, by_time), 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureRequest:
+    """A picture of one depth, from a photograph and either a PSF file or a calibration.
+
+    Attributes
+    ----------
+    image : Path
+        The photograph.
+    psf, calibration : Path or None
+        One of the two.
+    z_um : float or None
+        Distance of the scene; a PSF is refocused to it.
+    method : str
+        One of :func:`recon.methods.method_names`.
+    allow_saturated, allow_mixed_depth : bool
+        With ``psf``: as :func:`instrument.reconstruction_job.job_from_files`.
+    settings : Settings
+    """
+
+    image: Path
+    psf: Path | None = None
+    calibration: Path | None = None
+    z_um: float | None = None
+    method: str = "admm"
+    allow_saturated: bool = False
+    allow_mixed_depth: bool = False
+    settings: Settings = field(default_factory=Settings)
+
+    def prepare(self) -> Job:
+        """Read the files and bring them together.
+
+        Raises
+        ------
+        FileError, BenchError
+            When a file cannot be used, or the files do not belong together.
+        """
+        given = self.settings
+        if self.method == "wiener" and (given.iterations, given.time_s, given.tolerance) != (
+            None,
+            None,
+            None,
+        ):
+            raise BenchError("wiener is one shot: --iterations, --time and --tolerance do not apply to it.")
+        if self.calibration is not None and self.psf is None:
+            job = job_from_calibration(
+                self.calibration,
+                self.image,
+                dark=given.dark,
+                crop=given.crop,
+                binning=given.binning,
+                erasures=given.erasures,
+            )
+        elif self.psf is not None and self.calibration is None:
+            job = job_from_files(
+                self.psf,
+                self.image,
+                dark=given.dark,
+                crop=given.crop,
+                binning=given.binning,
+                erasures=given.erasures,
+                allow_saturated=self.allow_saturated,
+                allow_mixed_depth=self.allow_mixed_depth,
+            )
+        else:
+            raise BenchError("Give either --psf FILE or --calibration FOLDER (one of them).")
+        return job if self.z_um is None else refocused(job, self.z_um)
+
+    def solve(
+        self, job: Job, *, watch: Watch | None = None, cancel: threading.Event | None = None
+    ) -> Reconstruction:
+        """Reconstruct what :meth:`prepare` returned.
+
+        Raises
+        ------
+        InputError
+            When the input does not allow it.
+        """
+        given = self.settings
+        return reconstruct(
+            job.measurement,
+            job.calibration,
+            z_um=self.z_um,
+            model=given.model,
+            method=self.method,
+            prior=given.prior or ("none" if self.method == "wiener" else "tv"),
+            noise=job.binned_noise(given.noise),
+            tau=given.tau,
+            iterations=given.limit(PICTURE_ITERATIONS),
+            time_s=given.time_s,
+            erasures=None if job.valid is None else ~job.valid,
+            tolerance=given.tolerance,
+            callback=watch,
+            cancel=cancel,
+        )
+
+    def share(self, record: IterationRecord) -> float:
+        """Return how much of the work is done, 0 to 1."""
+        return self.settings.done_share(record, PICTURE_ITERATIONS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeRequest:
+    """A volume, from a photograph and PSFs at several depths.
+
+    Attributes
+    ----------
+    image : Path
+        The photograph.
+    psfs : Path
+        As :func:`instrument.volume_job.volume_job`.
+    estimate_background : bool
+        Estimate a smooth background as well.
+    scratch : Path or None
+        Folder on a fast disk for what does not fit into memory.
+    memory_gib : float or None
+        Memory that may be taken; None: what is free.
+    device : "cpu" or "gpu"
+    settings : Settings
+        Its prior must be one of :data:`recon.volume.channel.PRIORS`.
+    """
+
+    image: Path
+    psfs: Path
+    estimate_background: bool = True
+    scratch: Path | None = None
+    memory_gib: float | None = None
+    device: Device = "cpu"
+    settings: Settings = field(default_factory=Settings)
+
+    def prepare(self) -> Job:
+        """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
+        given = self.settings
+        known_volume_prior(given.prior or "tv")
+        return volume_job(
+            self.psfs,
+            self.image,
+            dark=given.dark,
+            crop=given.crop,
+            binning=given.binning,
+            erasures=given.erasures,
+        )
+
+    def solve(
+        self, job: Job, *, watch: Watch | None = None, cancel: threading.Event | None = None
+    ) -> VolumeReconstruction:
+        """Reconstruct what :meth:`prepare` returned; errors as :meth:`PictureRequest.solve`."""
+        given = self.settings
+        return reconstruct_volume(
+            job.measurement,
+            job.calibration,
+            prior=known_volume_prior(given.prior or "tv"),
+            tau=given.tau,
+            model=given.model,
+            estimate_background=self.estimate_background,
+            erasures=None if job.valid is None else ~job.valid,
+            noise=job.binned_noise(given.noise),
+            scratch=self.scratch,
+            memory_gib=self.memory_gib,
+            device=self.device,
+            iterations=given.limit(VOLUME_ITERATIONS),
+            time_s=given.time_s,
+            tolerance=1e-3 if given.tolerance is None else given.tolerance,
+            callback=watch,
+            cancel=cancel,
+        )
+
+    def share(self, record: IterationRecord) -> float:
+        """Return how much of the work is done, 0 to 1."""
+        return self.settings.done_share(record, VOLUME_ITERATIONS)

@@ -1,0 +1,78 @@
+"""How a reconstruction's settings are written as words, on the command line and in the window's fields."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+from instrument.erasures import Choice
+from instrument.errors import BenchError
+from instrument.reconstruction_job import DarkChoice
+from recon.noise import NoiseModel
+
+
+def parse_dark(text: str) -> DarkChoice:
+    """Read ``auto``, an offset in counts, or the name of a dark frame.
+
+    Raises
+    ------
+    BenchError
+        When it is a number that is not finite.
+    """
+    if text == "auto":
+        return "auto"
+    try:
+        counts = float(text)
+    except ValueError:
+        return Path(text)
+    if not math.isfinite(counts):
+        raise BenchError(f"--dark {text}: the offset must be a finite number of counts.")
+    return counts
+
+
+def parse_erasures(text: str) -> Choice:
+    """Read ``none``, ``saturated``, a share of the pixels, or the name of a mask."""
+    if text == "none":
+        return "none"
+    if text == "saturated":
+        return "saturated"
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
+def parse_binning(text: str) -> int | None:
+    """Read a whole number from 1, or ``auto`` (None).
+
+    Raises
+    ------
+    BenchError
+    """
+    if text == "auto":
+        return None
+    if not re.fullmatch(r"[1-9]\d*", text):
+        raise BenchError(f"--bin {text!r} is not understood; write a whole number from 1, or auto.")
+    return int(text)
+
+
+def parse_noise(text: str | None) -> NoiseModel | float | None:
+    """Read ``COUNTS`` or ``READ,GAIN``: one deviation, or read noise in counts and counts per electron.
+
+    Raises
+    ------
+    BenchError
+    """
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(math.isfinite(v) and v >= 0 for v in values):
+        raise BenchError(
+            f"--noise {text!r} is not understood; write a standard deviation in counts (3.5), or read noise "
+            "in counts and counts per electron (2.1,0.13)."
+        )
+    return values[0] if len(values) == 1 else NoiseModel(*values)
