@@ -13,22 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-
-@njit(nogil=True, cache=True)
-def _stamp(image, y, x, sigma, light):
-    """Add a Gaussian spot of unit sum times ``light``, centred at a continuous position."""
-    reach = int(4 * sigma) + 1
-    iy, ix = int(np.floor(y)), int(np.floor(x))
-    total = 0.0
-    for j in range(iy - reach, iy + reach + 1):
-        for i in range(ix - reach, ix + reach + 1):
-            total += np.exp(-((j - y) ** 2 + (i - x) ** 2) / (2 * sigma**2))
-    for j in range(max(iy - reach, 0), min(iy + reach + 1, image.shape[0])):
-        for i in range(max(ix - reach, 0), min(ix + reach + 1, image.shape[1])):
-            image[j, i] += light / total * np.exp(-((j - y) ** 2 + (i - x) ** 2) / (2 * sigma**2))
+from recon.scenes.lenslets import stamp
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def _render(image, points, lenses, brightness, focus, blur):
     for p in range(points.shape[0]):
         y, x, m, light = points[p]
@@ -37,7 +25,7 @@ def _render(image, points, lenses, brightness, focus, blur):
             row = image.shape[0] // 2 + y + m * lenses[k, 0]
             column = image.shape[1] // 2 + x + m * lenses[k, 1]
             if -9 < row < image.shape[0] + 9 and -9 < column < image.shape[1] + 9:
-                _stamp(image, row, column, sigma, light * brightness[k])
+                stamp(image, row, column, sigma, light * brightness[k])
 
 
 @dataclass(frozen=True)

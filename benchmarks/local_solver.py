@@ -21,10 +21,11 @@ from numba import njit
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from lenslet_scene import _stamp, expose
+from lenslet_scene import expose
 
 from recon import Calibration, NoiseModel
 from recon.priors import NonNegativity, TotalVariation
+from recon.scenes.lenslets import stamp
 from recon.solvers import Fista, Solver, StoppingRules
 from recon.threads import set_threads
 from recon.volume.channel import ChannelProblem
@@ -33,7 +34,7 @@ from recon.volume.reconstruct import _prepare
 READ_NOISE = 2.0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def _cast(image, points, lenses, brightness, fall_off):
     half = image.shape[0] // 2
     for p in range(points.shape[0]):
@@ -43,7 +44,7 @@ def _cast(image, points, lenses, brightness, fall_off):
             # The response is centred beneath the source, across the axis from its pattern.
             response = np.exp(-((row + y) ** 2 + (column + x) ** 2) / (2 * fall_off**2))
             if -9 < row + half < image.shape[0] + 9 and -9 < column + half < image.shape[1] + 9:
-                _stamp(image, row + half, column + half, 1.0, light * brightness[k] * response)
+                stamp(image, row + half, column + half, 1.0, light * brightness[k] * response)
 
 
 def cast(size: int, points: np.ndarray) -> np.ndarray:
