@@ -11,9 +11,10 @@ from calibration_routines.field_response import FieldResponse, measure_field_res
 from calibration_routines.grid_plan import GridSweep, grid_sweep
 from calibration_routines.photograph import Photograph, expose_scene, photograph
 from calibration_routines.sampling import Sampling, axial_planes, lateral_spacing
-from calibration_routines.sweep import SweepCalibration, calibrate_sweep, finish_sweep
+from calibration_routines.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
 from calibration_routines.sweep_plan import PointSweep, Sweep, check_sweep, sweep_plan
 from calibration_routines.sweep_record import is_sweep
+from calibration_routines.sweep_watch import PointTaken, SourceVisit, SweepEvent
 
 __all__ = [
     "AngularResponse",
@@ -28,9 +29,12 @@ __all__ = [
     "GridSweep",
     "Photograph",
     "PointSweep",
+    "PointTaken",
     "Sampling",
+    "SourceVisit",
     "Sweep",
     "SweepCalibration",
+    "SweepEvent",
     "SweepExposures",
     "auto_expose",
     "axial_planes",
@@ -50,4 +54,5 @@ __all__ = [
     "photograph",
     "planes_needed",
     "sweep_plan",
+    "watch_resumed",
 ]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +21,7 @@ from scipy import ndimage
 from calibration_routines.angular_response import AngularResponse, Curve, save_response
 from calibration_routines.axial_analysis import DarkModel, replace_hot
 from calibration_routines.axial_exposure import SweepExposures, expose_sweep
-from calibration_routines.drift import judge_drift
+from calibration_routines.drift import Drift, judge_drift
 from calibration_routines.errors import CalibrationError
 from calibration_routines.sweep_plan import (
     DARK,
@@ -186,14 +187,15 @@ def measure_angular_response(
     run = acquire(bench, sweep_plan(points, exposures.exposures_ms), where, on_progress=on_progress)
     if run.condition is not RunCondition.COMPLETED:
         raise CalibrationError(f"The run ended early ({run.condition}); what was taken is in {run.path}.")
-    images = _images(run, points)
+    drift = _drift(run, points)
+    images = _images(run, points, drift)
     response = analyse_angular(
         images,
         points.points_um,
         pitch_um=geometry.pixel_pitch_um,
         distance_um=1e3 * geometry.diffuser_distance_mm,
         emission=sweep.emission,
-        findings=_drift(run, points),
+        findings=() if drift is None else drift.findings,
         bench=bench.label,
         simulated=bool(bench.simulated_kinds),
     )
@@ -319,8 +321,8 @@ def _part_seen(image: Floats, shift: tuple[float, float]) -> float:
 
 
 # Frames to light ---------------------------------------------------------------------------------------
-def _images(run: Run, points: PointSweep) -> list[npt.NDArray[np.float32]]:
-    """Return the light of every point, at the first point's exposure."""
+def _images(run: Run, points: PointSweep, drift: Drift | None) -> list[npt.NDArray[np.float32]]:
+    """Return the light of every point at the first point's exposure, the source's drift taken out."""
     dark = _dark(run)
     taken: dict[Position, list[int]] = {}
     for step in run.steps(PSF):
@@ -330,7 +332,12 @@ def _images(run: Run, points: PointSweep) -> list[npt.NDArray[np.float32]]:
     images = []
     for point in points.points_um:
         exposure_ms = run.metadata(taken[point][0]).exposure_ms
-        images.append(_light(run, taken[point], dark) * np.float32(reference_ms / exposure_ms))
+        brightness = 1.0
+        if drift is not None:
+            brightness = drift.brightness_at(
+                (run.metadata(taken[point][0]).utc - _began(run)).total_seconds()
+            )
+        images.append(_light(run, taken[point], dark) * np.float32(reference_ms / exposure_ms / brightness))
     return images
 
 
@@ -349,14 +356,21 @@ def _dark(run: Run) -> DarkModel:
     return DarkModel(list(steps), stacks, full_scale)
 
 
-def _drift(run: Run, points: PointSweep) -> tuple[str, ...]:
+def _began(run: Run) -> datetime:
+    """Return when the reference was visited first."""
+    return run.metadata(run.steps(REFERENCE)[0]).utc
+
+
+def _drift(run: Run, points: PointSweep) -> Drift | None:
     dark = _dark(run)
     visits: dict[int, list[int]] = {}
     for step in run.steps(REFERENCE):
         visits.setdefault(step.part, []).append(step.index)
     images = [_light(run, indices, dark) for indices in visits.values()]
     if len(images) < 2:
-        return ()
+        return None
     total = len(points.points_um)
     before = [min(k * points.reference_every, total) for k in range(len(images))]
-    return judge_drift(images, before, total).findings
+    times = [run.metadata(indices[0]).utc for indices in visits.values()]
+    seconds = [(time - _began(run)).total_seconds() for time in times]
+    return judge_drift(images, before, total, seconds)

@@ -34,6 +34,9 @@ class PlaneFrames:
         The largest count the camera can report.
     off_axis : bool
         Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the pattern.
+    brightness : float
+        The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
+        PSF.
     """
 
     source_um: tuple[float, float, float]
@@ -41,6 +44,7 @@ class PlaneFrames:
     frames: Counts
     full_scale: int
     off_axis: bool = False
+    brightness: float = 1.0
 
 
 class DarkModel:
@@ -131,21 +135,14 @@ def analyse_sweep(
     reference_ms = 0.0
     for plane in planes:
         reference_ms = reference_ms or plane.exposure_ms
-        scale = np.float32(reference_ms / plane.exposure_ms)
-        dark_frame = dark.at(plane.exposure_ms)
-        if dark_frame.shape != plane.frames.shape[1:]:
-            raise ValueError(
-                f"The frames at z = {plane.source_um[2] / 1e3:g} mm are {plane.frames.shape[1:]}, "
-                f"the dark frames {dark_frame.shape}."
-            )
-        light = channels_first(replace_hot(_mean(plane.frames) - dark_frame, dark.hot))
-        light = block_mean(light, binning)
+        scale = np.float32(reference_ms / plane.exposure_ms / plane.brightness)
+        light = block_mean(channels_first(plane_light(plane, dark)), binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
         measured = measure_psf(
             light - stray,
             z_um=plane.source_um[2],
-            noise=_noise(plane.frames) / binning,
-            saturated_pixels=_saturated(plane, dark.hot),
+            noise=noise_of_mean(plane.frames) / binning,
+            saturated_pixels=saturated_pixels(plane, dark.hot),
             may_be_clipped=plane.off_axis,
         )
         quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
@@ -164,6 +161,23 @@ def analyse_sweep(
         reference_exposure_ms=reference_ms,
         stages=stages,
     )
+
+
+def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
+    """Return the mean of a point's frames without dark frame and hot pixels, float32 counts.
+
+    Raises
+    ------
+    ValueError
+        When the dark frames have another shape.
+    """
+    dark_frame = dark.at(plane.exposure_ms)
+    if dark_frame.shape != plane.frames.shape[1:]:
+        raise ValueError(
+            f"The frames at z = {plane.source_um[2] / 1e3:g} mm are {plane.frames.shape[1:]}, "
+            f"the dark frames {dark_frame.shape}."
+        )
+    return replace_hot(_mean(plane.frames) - dark_frame, dark.hot)
 
 
 def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
@@ -197,8 +211,8 @@ def _mean(frames: Counts) -> Float:
     return mean
 
 
-def _noise(frames: Counts) -> float:
-    """Noise of one pixel of the averaged image; a dark average adds little to it and is left out."""
+def noise_of_mean(frames: Counts) -> float:
+    """Return the noise of one pixel of the frames' mean; a dark average adds little and is left out."""
     if len(frames) > 1:
         return temporal_noise(frames)
     # one frame: the photon noise is unknown, so differences between neighbouring pixels stand in for it; they
@@ -207,6 +221,7 @@ def _noise(frames: Counts) -> float:
     return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
 
 
-def _saturated(plane: PlaneFrames, hot: npt.NDArray[np.bool_]) -> int:
+def saturated_pixels(plane: PlaneFrames, hot: npt.NDArray[np.bool_]) -> int:
+    """Count the pixels at full scale in any of a point's frames, hot ones excepted."""
     ever = (plane.frames >= plane.full_scale).any(axis=0)
     return int(np.count_nonzero(ever & ~hot))

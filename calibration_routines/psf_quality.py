@@ -170,28 +170,64 @@ def judge_sweep(planes: Sequence[PsfQuality], diffuser_distance_um: float | None
     judged = list(planes)
     lit = [i for i, plane in enumerate(planes) if plane.radius_px > 0]
     if len(lit) >= 4:
-        for index, step in zip(lit, _centroid_steps([planes[i] for i in lit]), strict=True):
+        there = [planes[i] for i in lit]
+        for index, step in zip(lit, _centroid_steps(there, there), strict=True):
             judged[index] = replace(judged[index], step_px=step)
-            if step > MAX_STEP_PX:
-                judged[index] = with_finding(
-                    judged[index],
-                    f"the pattern lies {step:.1f} pixels beside the line through the other planes (up to "
-                    f"{MAX_STEP_PX:g} expected): the stage or the source slipped. Take the plane again.",
-                    retake=True,
-                )
+            judged[index] = _with_step(judged[index], step)
     if len(lit) >= 2:
         errors = _scale_errors([planes[i] for i in lit], diffuser_distance_um)
         for index, error in zip(lit, errors, strict=True):
-            judged[index] = replace(judged[index], scale_error=error)
-            if abs(error) > MAX_SCALE_ERROR and planes[index].clipped <= MAX_CLIPPED:
-                size = "large" if error > 0 else "small"
-                judged[index] = with_finding(
-                    judged[index],
-                    f"the support is {abs(error):.1%} too {size} for 1 + d/z (up to {MAX_SCALE_ERROR:.0%} "
-                    "expected): check the source's distance from the diffuser and d.",
-                    retake=False,
-                )
+            judged[index] = _with_scale_error(judged[index], error)
     return tuple(judged)
+
+
+def judge_next(
+    before: Sequence[PsfQuality], plane: PsfQuality, diffuser_distance_um: float | None
+) -> PsfQuality:
+    """Judge a plane of an axial sweep against the good ones taken before it.
+
+    Its place is held against the line through at least three of them, its support's size against at least
+    two: with fewer, a wrong one could be any of them.
+
+    Parameters
+    ----------
+    before : sequence of PsfQuality
+    plane : PsfQuality
+        Just taken.
+    diffuser_distance_um : float or None
+        As :func:`judge_sweep`.
+    """
+    if not plane.radius_px > 0:
+        return plane
+    if len({one.z_um for one in before}) >= 3:
+        plane = _with_step(plane, _centroid_steps(before, [plane])[0])
+    if len(before) >= 2:
+        plane = _with_scale_error(plane, _scale_errors([*before, plane], diffuser_distance_um)[-1])
+    return plane
+
+
+def _with_step(plane: PsfQuality, step_px: float) -> PsfQuality:
+    plane = replace(plane, step_px=step_px)
+    if step_px <= MAX_STEP_PX:
+        return plane
+    return with_finding(
+        plane,
+        f"the pattern lies {step_px:.1f} pixels beside the line through the other planes (up to "
+        f"{MAX_STEP_PX:g} expected): the stage or the source slipped. Take the plane again.",
+        retake=True,
+    )
+
+
+def _with_scale_error(plane: PsfQuality, error: float) -> PsfQuality:
+    plane = replace(plane, scale_error=error)
+    if abs(error) <= MAX_SCALE_ERROR or plane.clipped > MAX_CLIPPED:
+        return plane
+    return with_finding(
+        plane,
+        f"the support is {abs(error):.1%} too {'large' if error > 0 else 'small'} for 1 + d/z (up to "
+        f"{MAX_SCALE_ERROR:.0%} expected): check the source's distance from the diffuser and d.",
+        retake=False,
+    )
 
 
 def temporal_noise(frames: npt.NDArray[np.floating] | npt.NDArray[np.unsignedinteger]) -> float:
@@ -228,14 +264,15 @@ def _support(coarse: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     return support
 
 
-def _centroid_steps(planes: Sequence[PsfQuality]) -> list[float]:
-    """Distance of each centroid from a robust straight line in 1/z, pixels."""
+def _centroid_steps(planes: Sequence[PsfQuality], judged: Sequence[PsfQuality]) -> list[float]:
+    """Return the distance of each judged centroid from a robust straight line through the planes', in 1/z."""
     inverse_z = np.array([1.0 / plane.z_um for plane in planes])
     centroids = np.array([plane.centroid_px for plane in planes])
-    residuals = np.empty_like(centroids)
+    at = np.array([1.0 / plane.z_um for plane in judged])
+    residuals = np.array([plane.centroid_px for plane in judged], np.float64)
     for axis in (0, 1):
         slope, intercept, *_ = theilslopes(centroids[:, axis], inverse_z)
-        residuals[:, axis] = centroids[:, axis] - (slope * inverse_z + intercept)
+        residuals[:, axis] -= slope * at + intercept
     return [float(step) for step in np.hypot(residuals[:, 0], residuals[:, 1])]
 
 
@@ -255,3 +292,10 @@ def _scale_errors(planes: Sequence[PsfQuality], diffuser_distance_um: float | No
 def with_finding(plane: PsfQuality, finding: str, *, retake: bool) -> PsfQuality:
     """Return a PSF's quality with one more finding."""
     return replace(plane, findings=(*plane.findings, finding), retake=plane.retake or retake)
+
+
+def place_of(quality: PsfQuality) -> str:
+    """Return where a PSF's source stood, in words; x and y only off the axis."""
+    x_mm, y_mm, z_mm = (1e-3 * v for v in quality.source_um)
+    across = f"x = {x_mm:.4g}, y = {y_mm:.4g}, " if x_mm or y_mm else ""
+    return f"{across}z = {z_mm:.4g} mm"

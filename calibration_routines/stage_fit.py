@@ -162,14 +162,14 @@ def _judge_depth(
 ) -> StageFit:
     """Register a depth's PSFs to the central one; puts steps, similarities and findings into ``judged``."""
     here = judged[centre]
-    nominal = _nominal(geometry, here.z_um)
+    nominal = nominal_px_per_um(geometry, here.z_um)
     factor = max(1, int(np.ceil(np.sqrt(psfs[0, 0].size / LARGEST_PX))))
     reference = block_mean(psfs[centre].mean(axis=0), factor)
     places, shifts, seen = [], [], []
     for index in others:
         point = judged[index]
         place = np.array([point.y_um - here.y_um, point.x_um - here.x_um])
-        found = _registered(block_mean(psfs[index].mean(axis=0), factor), reference, place, nominal, factor)
+        found = find_pattern(block_mean(psfs[index].mean(axis=0), factor), reference, place, nominal, factor)
         if found is None or not found.reliable:
             judged[index] = with_finding(
                 point,
@@ -234,14 +234,30 @@ def _held_against_stage(
     )
 
 
-def _registered(
+def find_pattern(
     psf: npt.NDArray[np.float32],
     reference: npt.NDArray[np.float32],
     place_um: Floats,
     nominal_px_per_um: float | None,
     factor: int,
 ) -> Registration | None:
-    """Register near where the stage says; everywhere when it is not there. None when nothing is seen."""
+    """Register a PSF near where the stage says; everywhere when it is not there.
+
+    Parameters
+    ----------
+    psf, reference : ndarray, float32, (height, width)
+        Both binned by ``factor``.
+    place_um : ndarray, (2,)
+        ``(y, x)`` of the PSF's source from the reference's.
+    nominal_px_per_um : float, optional
+        :func:`nominal_px_per_um`.
+    factor : int
+
+    Returns
+    -------
+    Registration or None
+        In binned pixels; None when nothing is seen.
+    """
     if not np.ptp(psf) > 0 or not np.ptp(reference) > 0:
         return None
     if nominal_px_per_um is not None:
@@ -254,7 +270,8 @@ def _registered(
     return found if nominal_px_per_um is None or found.prominence >= _FAR_PROMINENCE else None
 
 
-def _nominal(geometry: Geometry, z_um: float) -> float | None:
+def nominal_px_per_um(geometry: Geometry, z_um: float) -> float | None:
+    """Return ``d / z / pitch``: the pattern's shift in pixels a micrometre; None where it is not known."""
     d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
     return None if d_mm is None or pitch_um is None else 1e3 * d_mm / z_um / pitch_um
 

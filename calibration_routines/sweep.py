@@ -7,6 +7,7 @@ or without the bench.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -28,7 +29,7 @@ from calibration_routines.axial_exposure import SweepExposures, expose_sweep
 from calibration_routines.drift import Drift, judge_drift
 from calibration_routines.errors import CalibrationError
 from calibration_routines.feature_size import optical_binning
-from calibration_routines.psf_quality import PsfQuality
+from calibration_routines.psf_quality import PsfQuality, place_of
 from calibration_routines.stage_fit import StageFit
 from calibration_routines.sweep_plan import (
     DARK,
@@ -46,25 +47,31 @@ from calibration_routines.sweep_plan import (
 from calibration_routines.sweep_record import (
     SWEEP_FILE,
     SweepRecord,
+    add_retakes,
     read_record,
+    read_retakes,
     rebinned,
     sweep_json,
     to_json,
 )
+from calibration_routines.sweep_watch import OnEvent, SweepWatch, TakeAgain, retake_dimming
 from instrument.acquire import acquire, prepare
 from instrument.atomic import write_text
 from instrument.bench import Bench
 from instrument.calibration_file import save_calibration
 from instrument.errors import BenchError
-from instrument.runner import Progress
+from instrument.photograph import Snapshot
+from instrument.plan import Step
+from instrument.runner import Progress, Runner
 from instrument.store import Run, RunCondition
 from recon.types import Calibration, Geometry
 
+OnRunner = Callable[[Runner], None]
+"""Takes each runner of a sweep before it begins: who wants to pause, abort or stop it keeps it."""
 Analysed = Callable[[int, int], None]
 """Takes how many PSFs have been analysed, and how many there are."""
 FOLDER = "calibration"
 """Name of the calibration's folder inside the run's folder."""
-_RETAKE_DIMMING = 0.7  # a PSF that saturated is taken again with this part of its exposure
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +105,7 @@ class SweepCalibration:
     @property
     def findings(self) -> tuple[str, ...]:
         """What is wrong with which PSF, stage or source, in words; empty when the sweep is good."""
-        psfs = tuple(f"{_place(q)}: {finding}" for q in self.quality for finding in q.findings)
+        psfs = tuple(f"{place_of(q)}: {finding}" for q in self.quality for finding in q.findings)
         stages = tuple(finding for stage in self.stages for finding in stage.findings)
         return psfs + stages + (self.drift.findings if self.drift is not None else ())
 
@@ -111,6 +118,8 @@ def calibrate_sweep(
     exposures: SweepExposures | None = None,
     on_progress: Progress | None = None,
     on_analysis: Analysed | None = None,
+    on_event: OnEvent | None = None,
+    on_runner: OnRunner | None = None,
 ) -> SweepCalibration:
     """Take a sweep and save its calibration inside the run's folder.
 
@@ -127,6 +136,13 @@ def calibrate_sweep(
         Called with a :class:`~instrument.runner.RunStatus` after every frame.
     on_analysis : callable, optional
         Called with how many PSFs have been analysed, and how many there are.
+    on_event : callable, optional
+        Called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been taken and judged,
+        and with a :class:`~calibration_routines.SourceVisit` after each visit to the reference point. All
+        callables are called in the thread that sweeps.
+    on_runner : callable, optional
+        Called with the sweep's :class:`~instrument.runner.Runner` before it begins, and with that of each
+        round of retakes after it.
 
     Returns
     -------
@@ -146,7 +162,37 @@ def calibrate_sweep(
     runner = prepare(bench, sweep_plan(sweep, exposures.exposures_ms), where, on_progress=on_progress)
     record = SweepRecord(sweep, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
     write_text(runner.path / SWEEP_FILE, to_json(record))
-    return _finished(_complete(runner.execute()), record, bench, on_progress, on_analysis)
+    runner.on_frame = _watch(bench, record, runner.path, on_event).see
+    if on_runner is not None:
+        on_runner(runner)
+    return _finished(_complete(runner.execute()), record, bench, on_progress, on_analysis, on_runner)
+
+
+def watch_resumed(bench: Bench, runner: Runner, on_event: OnEvent | None = None) -> None:
+    """Let a sweep's run that goes on be watched as from its beginning: what it has is looked at first.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    runner : Runner
+        From :func:`~instrument.resume.prepare_resume`, not yet begun.
+    on_event : callable, optional
+        As :func:`calibrate_sweep`; not called for what was taken before.
+
+    Raises
+    ------
+    CalibrationError
+        When the run is no sweep.
+    """
+    record = read_record(runner.path)
+    watch = SweepWatch(record.sweep, record.geometry)
+    run = Run.open(runner.path)
+    for step in run.plan.whole_steps(run.start) if run.plan is not None else ():
+        if step.index in run.records and run.verify(step.index) is None:
+            watch.see(step, _stored(run, step.index))
+    watch.on_event, watch.take_again = on_event, _retaker(bench, record.sweep, runner.path)
+    runner.on_frame = watch.see
 
 
 def finish_sweep(
@@ -155,6 +201,7 @@ def finish_sweep(
     *,
     on_progress: Progress | None = None,
     on_analysis: Analysed | None = None,
+    on_runner: OnRunner | None = None,
 ) -> SweepCalibration:
     """Make the calibration of a sweep's complete run, e.g. of one that was resumed.
 
@@ -164,7 +211,7 @@ def finish_sweep(
         The run's folder.
     bench : Bench, optional
         For retakes; without one, PSFs that need them are only flagged.
-    on_progress, on_analysis : callable, optional
+    on_progress, on_analysis, on_runner : callable, optional
         As :func:`calibrate_sweep`.
 
     Raises
@@ -176,7 +223,7 @@ def finish_sweep(
     """
     path = Path(run)
     record = read_record(path)
-    return _finished(_complete(Run.open(path)), record, bench, on_progress, on_analysis)
+    return _finished(_complete(Run.open(path)), record, bench, on_progress, on_analysis, on_runner)
 
 
 def _finished(
@@ -185,10 +232,11 @@ def _finished(
     bench: Bench | None,
     on_progress: Progress | None,
     on_analysis: Analysed | None,
+    on_runner: OnRunner | None,
 ) -> SweepCalibration:
     """Make the calibration of a complete run; an interruption says that all frames of it are kept."""
     try:
-        return _judged(run, record, bench, on_progress, on_analysis)
+        return _judged(run, record, bench, on_progress, on_analysis, on_runner)
     except (KeyboardInterrupt, SystemExit) as interruption:
         interruption.add_note(
             f"All frames of the sweep are kept. For its calibration: diffuserbench resume {run.path}"
@@ -202,6 +250,7 @@ def _judged(
     bench: Bench | None,
     on_progress: Progress | None,
     on_analysis: Analysed | None,
+    on_runner: OnRunner | None,
 ) -> SweepCalibration:
     """Analyse, take again what needs it, judge the source, save."""
     sweep, exposures = record.sweep, record.exposures
@@ -216,25 +265,34 @@ def _judged(
             f"{run.path / SWEEP_FILE}: {error} All frames are kept: change binning or dct_order there, then: "
             f"diffuserbench resume {run.path}"
         ) from None
-    runs = [run]
-    takes = dict.fromkeys(sweep.points_um, run)
-    analysis = _analysed(takes, sweep, dark, record.geometry, on_analysis)
-    for _ in range(sweep.retakes if bench is not None else 0):
-        again = [q for q in analysis.quality if q.retake]
-        if not again or bench is None:
-            break
-        present = dict(zip(sweep.points_um, exposures.exposures_ms, strict=True))
-        points = [
-            (q.source_um, present[q.source_um] * (_RETAKE_DIMMING if q.saturated_pixels else 1.0))
-            for q in again
-        ]
-        retake = _complete(acquire(bench, retake_plan(sweep, points), where, on_progress=on_progress))
-        runs.append(retake)
-        takes.update({point: retake for point, _ in points})
-        renewed = present | dict(points)
-        exposures = replace(exposures, exposures_ms=tuple(renewed[point] for point in sweep.points_um))
-        analysis = _analysed(takes, sweep, dark, record.geometry, on_analysis)
+    runs, takes, rounds = [run], dict.fromkeys(sweep.points_um, run), Counter[Position]()
+    for point, name in read_retakes(run.path):
+        retake = next((known for known in runs if known.path.name == name), None) or Run.open(where / name)
+        runs += [] if retake in runs else [retake]
+        takes[point] = retake
+        rounds[point] += 1
     drift = _drift(run, sweep, dark)
+    analysis = _analysed(takes, run, sweep, dark, record.geometry, drift, on_analysis)
+    while bench is not None:
+        again = [q for q in analysis.quality if q.retake and rounds[q.source_um] < sweep.retakes]
+        if not again:
+            break
+        points = [
+            (q.source_um, _exposure_ms(takes[q.source_um], q.source_um) * retake_dimming(q)) for q in again
+        ]
+        runner = prepare(bench, retake_plan(sweep, points), where, on_progress=on_progress)
+        if on_runner is not None:
+            on_runner(runner)
+        retake = _complete(runner.execute())
+        add_retakes(run.path, [point for point, _ in points], retake.path.name)
+        runs.append(retake)
+        for point, _ in points:
+            takes[point] = retake
+            rounds[point] += 1
+        analysis = _analysed(takes, run, sweep, dark, record.geometry, drift, on_analysis)
+    exposures = replace(
+        exposures, exposures_ms=tuple(_exposure_ms(takes[point], point) for point in sweep.points_um)
+    )
     good = not any(q.findings for q in analysis.quality) and not any(s.findings for s in analysis.stages)
     calibration = Calibration(
         psfs=analysis.psfs,
@@ -253,6 +311,30 @@ def _judged(
     return SweepCalibration(
         calibration, path, analysis.quality, tuple(runs), exposures, analysis.stages, drift
     )
+
+
+def _watch(bench: Bench, record: SweepRecord, path: Path, on_event: OnEvent | None) -> SweepWatch:
+    return SweepWatch(
+        record.sweep,
+        record.geometry,
+        on_event=on_event,
+        take_again=_retaker(bench, record.sweep, path),
+    )
+
+
+def _retaker(bench: Bench, sweep: Sweep, path: Path) -> TakeAgain:
+    """Return what takes a point again between two points of the sweep in ``path``, as a run beside it."""
+
+    def take_again(point: Position, exposure_ms: float) -> list[Snapshot]:
+        retake = _complete(acquire(bench, retake_plan(sweep, [(point, exposure_ms)]), path.parent))
+        add_retakes(path, [point], retake.path.name)
+        return [_stored(retake, step.index) for step in retake.steps(PSF)]
+
+    return take_again
+
+
+def _stored(run: Run, index: int) -> Snapshot:
+    return Snapshot(run.frame(index), run.metadata(index), run.records[index].average)
 
 
 def _complete(run: Run) -> Run:
@@ -279,38 +361,55 @@ def _full_scale(run: Run) -> int:
 
 def _analysed(
     takes: Mapping[Position, Run],
+    first: Run,
     sweep: Sweep,
     dark: DarkModel,
     geometry: Geometry,
+    drift: Drift | None,
     on_analysis: Analysed | None,
 ) -> SweepAnalysis:
-    return analyse_sweep(
-        _planes(takes, sweep, on_analysis), dark, geometry, dct_order=sweep.dct_order, binning=sweep.binning
-    )
+    planes = _planes(takes, first, sweep, drift, on_analysis)
+    return analyse_sweep(planes, dark, geometry, dct_order=sweep.dct_order, binning=sweep.binning)
 
 
 def _planes(
-    takes: Mapping[Position, Run], sweep: Sweep, on_analysis: Analysed | None
+    takes: Mapping[Position, Run],
+    first: Run,
+    sweep: Sweep,
+    drift: Drift | None,
+    on_analysis: Analysed | None,
 ) -> Iterator[PlaneFrames]:
     central = {axis_point(sweep, z_um) for z_um in depths_um(sweep)}
+    visits = first.steps(REFERENCE)
+    began = first.metadata(visits[0]).utc if visits else None
     for done, point in enumerate(sweep.points_um):
         if on_analysis is not None:
             on_analysis(done, len(sweep.points_um))
         run = takes[point]
-        steps = [step for step in run.steps(PSF) if step.source_um is None or step.source_um == point]
+        steps = _steps_of(run, point)
+        seconds = 0.0 if began is None else (run.metadata(steps[0]).utc - began).total_seconds()
         yield PlaneFrames(
             source_um=point,
             exposure_ms=run.metadata(steps[0]).exposure_ms,
             frames=np.stack([run.frame(step) for step in steps]),
             full_scale=_full_scale(run),
             off_axis=point not in central,
+            brightness=1.0 if drift is None else drift.brightness_at(seconds),
         )
+
+
+def _steps_of(run: Run, point: Position) -> list[Step]:
+    return [step for step in run.steps(PSF) if step.source_um is None or step.source_um == point]
+
+
+def _exposure_ms(run: Run, point: Position) -> float:
+    return run.metadata(_steps_of(run, point)[0]).exposure_ms
 
 
 def _binned_to_resolution(run: Run, sweep: Sweep, dark: DarkModel) -> Sweep:
     """Choose the binning by the finest structure, which is that of the farthest central PSF."""
     point = axis_point(sweep, depths_um(sweep)[-1])
-    steps = [step for step in run.steps(PSF) if step.source_um is None or step.source_um == point]
+    steps = _steps_of(run, point)
     exposure_ms = run.metadata(steps[0]).exposure_ms
     frames = [
         replace_hot(run.frame(step).astype(np.float32) - dark.at(exposure_ms), dark.hot) for step in steps[:2]
@@ -332,12 +431,9 @@ def _drift(run: Run, sweep: Sweep, dark: DarkModel) -> Drift | None:
         images.append(light.mean(axis=-1) if light.ndim == 3 else light)
     every = sweep.reference_every
     before = [min(k * every, len(sweep.points_um)) for k in range(len(images))]
-    return judge_drift(images, before, len(sweep.points_um))
-
-
-def _place(q: PsfQuality) -> str:
-    across = f"x = {q.x_um / 1e3:.4g}, y = {q.y_um / 1e3:.4g}, " if q.x_um or q.y_um else ""
-    return f"{across}z = {q.z_um / 1e3:.4g} mm"
+    times = [run.metadata(indices[0]).utc for indices in visits.values()]
+    seconds = [(time - times[0]).total_seconds() for time in times]
+    return judge_drift(images, before, len(sweep.points_um), seconds)
 
 
 def _provenance(

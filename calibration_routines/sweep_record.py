@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,14 @@ from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, Ex
 from calibration_routines.axial_exposure import SweepExposures
 from calibration_routines.axial_plan import AxialSweep
 from calibration_routines.errors import CalibrationError
-from calibration_routines.sweep_plan import PointSweep, Sweep
+from calibration_routines.sweep_plan import PointSweep, Position, Sweep
+from instrument.atomic import write_text
 from recon.types import Geometry
 
 SWEEP_FILE = "sweep.json"
 """In the run's folder, beside the files of any run."""
+RETAKES_FILE = "retakes.json"
+"""Beside it, once a point was taken again: which, and in which run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +101,38 @@ def read_record(run: Path) -> SweepRecord:
             f"{path} cannot be read ({error}): it was changed or damaged. The frames beside it are not "
             "touched; take the sweep again, or restore the file from a copy."
         ) from error
+
+
+def add_retakes(run: Path, points_um: Iterable[Position], retake: str) -> None:
+    """Keep that points of the sweep in folder ``run`` were taken again in the run named ``retake``."""
+    entries = [{"point_um": list(point), "run": name} for point, name in read_retakes(run)]
+    entries += [{"point_um": list(point), "run": retake} for point in points_um]
+    write_text(run / RETAKES_FILE, json.dumps(entries, indent=1) + "\n")
+
+
+def read_retakes(run: Path) -> list[tuple[Position, str]]:
+    """Return which points were taken again in which run beside this one, in the order of time.
+
+    Raises
+    ------
+    CalibrationError
+        When the file is damaged.
+    """
+    path = run / RETAKES_FILE
+    if not path.exists():
+        return []
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        found: list[tuple[Position, str]] = []
+        for entry in entries:
+            x, y, z = (float(v) for v in entry["point_um"])
+            found.append(((x, y, z), str(entry["run"])))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}): it was changed or damaged. Without it the sweep's first takes "
+            "count: remove the file, or restore it from a copy."
+        ) from error
+    return found
 
 
 def _known(sweep: Sweep) -> AxialSweep | PointSweep:

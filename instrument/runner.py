@@ -81,6 +81,8 @@ class RunStatus:
 
 
 Progress = Callable[[RunStatus], None]
+FrameWatch = Callable[[Step, Snapshot], bool]
+"""Sees each step's photograph once it is stored; returns whether it touched the bench."""
 
 
 class _EndedEarlyError(Exception):
@@ -110,6 +112,10 @@ class Runner:
         then is as it was.
     on_progress : callable, optional
         Called with the status after every step and change of state, in the thread that executes.
+    on_frame : callable, optional
+        Called with each step and its photograph once that is stored, in the thread that executes, before the
+        next step begins. It may use the bench, and then returns True: the next step sets everything anew.
+        What it raises ends the run as failed.
     """
 
     def __init__(
@@ -121,6 +127,7 @@ class Runner:
         todo: Sequence[int] | None = None,
         start: Step | None = None,
         on_progress: Progress | None = None,
+        on_frame: FrameWatch | None = None,
     ) -> None:
         self._bench = bench
         self._plan = plan
@@ -128,6 +135,7 @@ class Runner:
         self._start = start
         self._todo = frozenset(range(len(plan)) if todo is None else todo)
         self.on_progress = on_progress
+        self.on_frame = on_frame
         self._settings = StepSettings(bench)
         self._condition = threading.Condition()
         self._pausing = False
@@ -255,6 +263,8 @@ class Runner:
                 [FrameToStore(step.index, snapshot.image, snapshot.metadata, snapshot.average)]
             )
             self._report_stored(snapshot)
+            if self.on_frame is not None and self.on_frame(step, snapshot):
+                self._settings = StepSettings(self._bench)
 
     def _take(self, step: Step) -> Snapshot:
         for setting in self._settings.actions(step):

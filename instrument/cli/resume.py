@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calibration_routines import finish_sweep, is_sweep
+from calibration_routines import finish_sweep, is_sweep, watch_resumed
 from calibration_routines.sweep import FOLDER
 from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import one_task, progress_bar
 from instrument.cli.running import carry_out, home_if_needed
-from instrument.cli.sweeping import describe_result
+from instrument.cli.sweeping import describe_result, say_event
 from instrument.resume import prepare_resume
 from instrument.store import FinishReason, Run, RunCondition, RunWriter
 from instrument.store.layout import BENCH_TOML
@@ -51,6 +51,9 @@ def resume(
                 opened, run, on_verify=lambda done, _: bar.update(task, completed=done)
             )
         typer.echo(f"Found {findings}", err=True)
+        if is_sweep(run):
+            console = Console(stderr=True)
+            watch_resumed(opened, runner, lambda event: say_event(console, event))
         done = carry_out(opened, runner)
         if is_sweep(run) and done.condition is RunCondition.COMPLETED:
             _finish(run, opened)

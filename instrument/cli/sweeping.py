@@ -9,14 +9,17 @@ from rich.console import Console
 from rich.markup import escape
 
 from calibration_routines import (
+    SourceVisit,
     Sweep,
     SweepCalibration,
+    SweepEvent,
     SweepExposures,
     calibrate_sweep,
     check_sweep,
     expose_sweep,
     sweep_plan,
 )
+from calibration_routines.psf_quality import place_of
 from calibration_routines.sweep_plan import DARK, depths_um, reference_point
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
@@ -66,6 +69,11 @@ def take_sweep(
     with progress_bar() as bar:
         frames = bar.add_task("Sweeping", total=None, note="")
         psfs = bar.add_task("Analysing", total=None, note="", visible=False)
+
+        def report(event: SweepEvent) -> None:
+            bar.update(frames, note=event_note(event))
+            say_event(bar.console, event)
+
         done = calibrate_sweep(
             bench,
             sweep,
@@ -73,8 +81,35 @@ def take_sweep(
             exposures=exposures,
             on_progress=lambda status: bar.update(frames, completed=status.done, total=status.total),
             on_analysis=lambda count, total: bar.update(psfs, completed=count, total=total, visible=True),
+            on_event=report,
         )
     describe_result(console, done)
+
+
+def event_note(event: SweepEvent) -> str:
+    """Return the newest PSF's or visit's figures for the end of a progress bar."""
+    if isinstance(event, SourceVisit):
+        return f"source {event.brightness:.1%}, {event.shift_px:.2f} px off"
+    quality = event.quality
+    words = [f"PSF {event.number}/{event.total}: signal {quality.snr:.0f} x noise"]
+    words += [f"SATURATED {quality.saturated_pixels}"] if quality.saturated_pixels else []
+    words += [f"{quality.step_px:.1f} px off"] if quality.step_px else []
+    return ", ".join(words)
+
+
+def say_event(console: Console, event: SweepEvent) -> None:
+    """Print what is wrong with a PSF or the source as soon as it is known, and whether it is taken again."""
+    if isinstance(event, SourceVisit):
+        for finding in event.findings:
+            console.print(f"Source: {escape(finding)}", soft_wrap=True)
+        return
+    again = " Taking it again now." if event.retaking else ""
+    taken = "" if event.take == 1 else f", take {event.take}"
+    for finding in event.quality.findings:
+        place = f"PSF {event.number} of {event.total} ({place_of(event.quality)}{taken})"
+        console.print(f"{escape(place)}: {escape(finding)}{again}", soft_wrap=True)
+    if event.take > 1 and not event.quality.findings:
+        console.print(f"PSF {event.number} of {event.total}: good now.", soft_wrap=True)
 
 
 def describe_exposures(console: Console, exposures: SweepExposures) -> None:
@@ -146,7 +181,7 @@ def describe_quality(console: Console, done: SweepCalibration) -> None:
     if done.drift is not None and not done.drift.findings:
         console.print(
             f"Source: {len(done.drift.brightness)} visits to the reference; brightness within "
-            f"{max(abs(b - 1) for b in done.drift.brightness):.1%}, place within "
+            f"{max(abs(b - 1) for b in done.drift.brightness):.1%} (taken out of the PSFs), place within "
             f"{max(done.drift.shift_px):.2f} pixels.",
             soft_wrap=True,
         )

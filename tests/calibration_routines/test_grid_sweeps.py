@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -12,25 +13,31 @@ import pytest
 from calibration_routines import (
     CalibrationError,
     PointSweep,
+    PointTaken,
+    SourceVisit,
+    SweepEvent,
     axial_planes,
     calibrate_sweep,
     expose_scene,
+    expose_sweep,
     finish_sweep,
     grid_sweep,
     lateral_spacing,
     photograph,
+    watch_resumed,
 )
 from calibration_routines.drift import judge_drift
 from calibration_routines.feature_size import feature_size_px, optical_binning
 from calibration_routines.stage_fit import fit_stage
+from calibration_routines.sweep_record import read_retakes
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench import Bench, open_bench
 from instrument.calibration_file import load_calibration
 from instrument.config_file import parse_config
 from instrument.errors import BenchError
 from instrument.resume import prepare_resume
-from instrument.runner import RunStatus
-from instrument.store import RunCondition
+from instrument.runner import Runner, RunStatus
+from instrument.store import FinishReason, RunCondition
 from recon import metrics
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
 from recon.types import Geometry
@@ -123,24 +130,97 @@ def test_a_close_scene_needs_the_lateral_calibration(tmp_path: Path) -> None:
     assert quality["local"] > quality["convolution"] + 5
 
 
-def test_a_point_where_the_stage_slipped_is_taken_again(bench: Bench, tmp_path: Path) -> None:
+def test_a_point_where_the_stage_slipped_is_taken_again_at_once(bench: Bench, tmp_path: Path) -> None:
     world = world_of(bench)
     carrier = world._carrier
-    slipped: list[bool] = []
+    events: list[SweepEvent] = []
 
-    def watch(status: RunStatus) -> None:
+    def slip(status: RunStatus) -> None:
         step = status.step
         here = step is not None and step.label == "psf" and step.source_um == POINTS[5]
-        if here and not slipped:
+        if here and not any(isinstance(e, PointTaken) and e.retaking for e in events):
             x, y, z = POINTS[5]
             world.carry_source(lambda: (x + 2000.0, y, z))
-            slipped.append(True)
-        elif slipped and not here:
-            world.carry_source(carrier)
 
-    done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=watch)
+    def hear(event: SweepEvent) -> None:
+        events.append(event)
+        world.carry_source(carrier)
+
+    done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=slip, on_event=hear)
     assert [len(run.steps("psf")) for run in done.runs] == [18, 2]
     assert done.findings == ()
+    visits = [e for e in events if isinstance(e, SourceVisit)]
+    points = [e for e in events if isinstance(e, PointTaken)]
+    assert [(v.number, v.before_point, v.findings) for v in visits] == [
+        (1, 0, ()),
+        (2, 4, ()),
+        (3, 8, ()),
+        (4, 9, ()),
+    ]
+    # the point is judged before the next one is taken, and again after its retake
+    assert [(p.number, p.take, p.retaking) for p in points[4:8]] == [
+        (5, 1, False),
+        (6, 1, True),
+        (6, 2, False),
+        (7, 1, False),
+    ]
+    assert "from where the stage says" in points[5].quality.findings[0]
+    assert all(p.quality.findings == () for p in points if not p.retaking)
+    assert all(p.quality.snr > 20 and p.image.shape == (120, 160) for p in points)
+    # a crash after the retake would not lose it: the folder says where it is
+    assert read_retakes(done.runs[0].path) == [(POINTS[5], done.runs[1].path.name)]
+
+
+def test_retakes_are_bounded_and_a_point_that_stays_bad_is_flagged(bench: Bench, tmp_path: Path) -> None:
+    world = world_of(bench)
+    carrier = world._carrier
+    x, y, z = POINTS[5]
+
+    def where() -> tuple[float, float, float]:
+        here = carrier()
+        return (x + 2000.0, y, z) if here == pytest.approx((x, y, z), abs=1.0) else here
+
+    world.carry_source(where)
+    runners: list[Runner] = []
+    done = calibrate_sweep(bench, replace(SWEEP, retakes=2), tmp_path, on_runner=runners.append)
+    assert [len(run.steps("psf")) for run in done.runs] == [18, 2, 2]
+    assert [q.source_um for q in done.quality if q.retake] == [POINTS[5]]
+    assert any("beside where the stage says" in finding for finding in done.findings)
+    assert [runner.path for runner in runners] == [done.runs[0].path]
+
+
+def test_stop_during_a_retake_stops_the_sweep(bench: Bench, tmp_path: Path) -> None:
+    runners: list[Runner] = []
+    found = expose_sweep(bench, SWEEP)
+    too_long = replace(found, exposures_ms=tuple(1.6 * e for e in found.exposures_ms))
+
+    def hear(event: SweepEvent) -> None:
+        if isinstance(event, PointTaken) and event.retaking:
+            Thread(target=runners[0].stop).start()
+
+    with pytest.raises(CalibrationError, match="ended early"):
+        calibrate_sweep(bench, SWEEP, tmp_path, exposures=too_long, on_event=hear, on_runner=runners.append)
+    assert runners[0].status.reason is FinishReason.STOPPED
+    assert bench.led_array is not None
+    assert bench.led_array.pattern.is_dark
+
+
+def test_a_drift_of_brightness_is_taken_out_of_the_psfs(bench: Bench, tmp_path: Path) -> None:
+    world = world_of(bench)
+    steady = calibrate_sweep(bench, SWEEP, tmp_path / "steady").calibration.psfs.sum(axis=(1, 2, 3))
+    exposures = expose_sweep(bench, SWEEP)
+    options = world.options
+
+    def dim(status: RunStatus) -> None:
+        left = 1.0 - 0.12 * status.done / status.total
+        world.options = options.model_copy(update={"source_brightness": left})
+
+    done = calibrate_sweep(bench, SWEEP, tmp_path / "drift", exposures=exposures, on_progress=dim)
+    light = done.calibration.psfs.sum(axis=(1, 2, 3))
+    assert done.findings == ()
+    assert done.calibration.quality["drift"]["corrected"] is True
+    assert done.calibration.quality["drift"]["brightness"][-1] < 0.93
+    assert light / light[4] == pytest.approx(steady / steady[4], rel=0.02)
 
 
 def test_a_source_that_dims_and_a_wrong_distance_are_reported(tmp_path: Path) -> None:
@@ -168,15 +248,22 @@ def test_drift_is_read_from_the_reference() -> None:
 
     pattern = gaussian_filter(pattern * (np.hypot(*np.mgrid[-48:48, -64:64]) < 40), 1.5)
     moved = shift(pattern, (1.2, 0.5), order=3)
-    steady = judge_drift([pattern, 1.01 * pattern], [0, 10], 10)
+    steady = judge_drift([pattern, 1.05 * pattern], [0, 10], 10, [0.0, 60.0])
     assert steady.findings == ()
-    drift = judge_drift([pattern, 0.9 * pattern, 0.9 * moved], [0, 10, 20], 20)
+    assert steady.brightness_at(30.0) == pytest.approx(1.025)
+    drift = judge_drift([pattern, 0.85 * pattern, 0.85 * moved], [0, 10, 20], 20, [0.0, 60.0, 120.0])
     assert [finding.split(" the ")[0] for finding in drift.findings] == [
         "between points 1 and 10",
         "between points 11 and 20",
     ]
-    assert "10.0% dimmer" in drift.findings[0]
+    assert "15.0% dimmer" in drift.findings[0]
     assert "moved from 0.0 to 1.3 pixels" in drift.findings[1]
+    set_clock = replace(drift, seconds=(0.0, 60.0, 50.0))
+    assert not set_clock.is_correctable
+    assert set_clock.brightness_at(30.0) == 1.0
+    dark = judge_drift([pattern, 0 * pattern, 0 * pattern], [0, 10, 20], 20, [0.0, 60.0, 120.0])
+    assert len(dark.findings) == 4
+    assert not dark.is_correctable
 
 
 def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Bench, tmp_path: Path) -> None:
@@ -194,11 +281,16 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
         finish_sweep(run)
     runner, findings = prepare_resume(bench, run)
     assert findings.stored >= 9
+    events: list[SweepEvent] = []
+    watch_resumed(bench, runner, events.append)
     assert runner.execute().condition is RunCondition.COMPLETED
     done = finish_sweep(run, bench)
     assert done.findings == ()
     assert done.path == run / "calibration"
     assert len(load_calibration(done.path).psfs) == 9
+    # the watch goes on where it was: no point twice, the source held against the first visit of all
+    assert [e.number for e in events if isinstance(e, PointTaken)] == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert [e.number for e in events if isinstance(e, SourceVisit)] == [2, 3, 4]
 
 
 def test_the_grid_covers_what_a_reconstruction_shows(bench: Bench) -> None:
