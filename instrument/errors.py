@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from drivers.errors import DeviceError
 
 
 class BenchError(Exception):
@@ -94,3 +97,26 @@ _REASONS = {
 def os_reason(error: OSError) -> str:
     """Return what the operating system refused, as a sentence without the path, and what to do about it."""
     return _REASONS.get(error.errno or 0, f"{error.strerror or error}.")
+
+
+def in_words(error: BaseException) -> str | None:
+    """Return what a person is told of a known mistake or failure; None for an error of the program itself.
+
+    Notes that were added to the error on its way are not included.
+    """
+    if isinstance(error, BenchError | DeviceError):
+        return str(error)
+    if isinstance(error, ValueError) and _is_input_error(error):
+        return str(error)
+    if isinstance(error, OSError):
+        if error.filename is not None:
+            return f"{os.fsdecode(error.filename)}: {os_reason(error)}"
+        if error.errno == errno.ENOSPC:
+            return os_reason(error)
+    return None
+
+
+def _is_input_error(error: ValueError) -> bool:
+    from recon.errors import InputError  # costs half a second, which only an error has to wait
+
+    return isinstance(error, InputError)

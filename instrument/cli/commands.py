@@ -25,6 +25,7 @@ DISPLAY = "Holographic display"
 
 COMMANDS: Mapping[str, Command] = {
     "demo": Command(BENCH, "the main job, start to end, on the simulated bench", "instrument.cli.demo"),
+    "gui": Command(BENCH, "the desktop program: live view, stage, sweeps, results", "instrument.cli.gui"),
     "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
     "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
     "drivers": Command(BENCH, "list the installed drivers by kind of device", "instrument.cli.drivers"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import importlib
 import logging
 import os
@@ -15,7 +14,7 @@ import typer
 
 from drivers.errors import DeviceError, LimitError
 from instrument.cli.commands import Command
-from instrument.errors import BenchError, os_reason
+from instrument.errors import BenchError, in_words
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130
@@ -67,26 +66,10 @@ def report(error: BaseException) -> int:
     if isinstance(error, DeviceError):
         _say(str(error), error)
         return 2 if isinstance(error, LimitError) else 1  # a value to put right, not a device that failed
-    if isinstance(error, ValueError) and _is_input_error(error):
-        _say(str(error), error)
-        return 2
-    if isinstance(error, OSError) and (sentence := _file_trouble(error)):
+    if sentence := in_words(error):
         _say(sentence, error)
         return 2
     raise error
-
-
-def _is_input_error(error: ValueError) -> bool:
-    from recon.errors import InputError  # costs half a second, which only an error has to wait
-
-    return isinstance(error, InputError)
-
-
-def _file_trouble(error: OSError) -> str:
-    """Return a sentence for trouble with a named file or a full disk, else nothing."""
-    if error.filename is not None:
-        return f"{os.fsdecode(error.filename)}: {os_reason(error)}"
-    return os_reason(error) if error.errno == errno.ENOSPC else ""
 
 
 def _say(text: str, error: BaseException) -> None:

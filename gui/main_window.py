@@ -1,0 +1,354 @@
+"""The window: panels around a STOP button that is always in reach."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from PySide6.QtCore import QEvent, QObject, QSettings, Qt
+from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
+from PySide6.QtWidgets import (
+    QApplication,
+    QDockWidget,
+    QLabel,
+    QMainWindow,
+    QMessageBox,
+    QPlainTextEdit,
+    QProgressBar,
+    QPushButton,
+    QSizePolicy,
+    QTabWidget,
+    QToolBar,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.jobs import Job, words_for
+from gui.panel import Panel
+from gui.panels import PANELS, PanelEntry
+from gui.session import BenchSession, OperatorRequest
+from gui.theme import THEMES, apply_theme
+from gui.widgets.device_chips import DeviceChips
+
+_AREAS = {
+    "top right": Qt.DockWidgetArea.RightDockWidgetArea,
+    "right": Qt.DockWidgetArea.RightDockWidgetArea,
+    "bottom": Qt.DockWidgetArea.BottomDockWidgetArea,
+}
+_LAYOUT_VERSION = 1
+"""Raised when docks are renamed: a layout kept by an older program is then not restored."""
+
+
+class MainWindow(QMainWindow):
+    """All panels, the devices' states, the running job, the log, and STOP.
+
+    Parameters
+    ----------
+    session : BenchSession
+        Not yet open; the caller opens it.
+    settings : QSettings
+        Where the window's layout is kept.
+    """
+
+    def __init__(self, session: BenchSession, settings: QSettings) -> None:
+        super().__init__()
+        self.session = session
+        self._settings = settings
+        self._panels: dict[str, Panel] = {}
+        self._places: dict[str, QWidget] = {}
+        self._docks: dict[str, QDockWidget] = {}
+        self._may_close = False
+        self.question: QMessageBox | None = None
+        """The question that is open now."""
+        self.setWindowTitle(f"diffuserbench – {session.config.label}")
+        self.setDockOptions(
+            QMainWindow.DockOption.AllowTabbedDocks
+            | QMainWindow.DockOption.AllowNestedDocks
+            | QMainWindow.DockOption.AnimatedDocks
+        )
+        self.tabs = QTabWidget()
+        self.tabs.setDocumentMode(True)
+        self.tabs.currentChanged.connect(self._fill_current)
+        self.setCentralWidget(self.tabs)
+        self._make_top_bar()
+        self._make_status_bar()
+        self._make_panels()
+        self._make_menus()
+        self._make_stop_keys()
+        session.device_changed.connect(self._show_simulated)
+        session.asked.connect(self._ask_operator)
+        session.closed.connect(self._close_now)
+        session.jobs.job_started.connect(self._job_started)
+        session.jobs.job_ended.connect(self._job_ended)
+        self.resize(1600, 980)
+        self._restore_layout()
+        self._show_simulated()
+        self.panel("log")  # from the first line on
+        self._fill_current()
+
+    # Panels --------------------------------------------------------------------------------------
+    def panel(self, name: str) -> Panel:
+        """Return a panel of the table, made now if it was not yet."""
+        if name not in self._panels:
+            panel = PANELS[name].load()(self.session)
+            self._panels[name] = panel
+            layout = self._places[name].layout()
+            assert layout is not None
+            layout.addWidget(panel)
+        return self._panels[name]
+
+    def show_panel(self, name: str) -> Panel:
+        """Bring a panel to the front, with the keyboard in it."""
+        panel = self.panel(name)
+        if name in self._docks:
+            self._docks[name].show()
+            self._docks[name].raise_()
+        else:
+            self.tabs.setCurrentWidget(self._places[name])
+        panel.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        return panel
+
+    def _make_panels(self) -> None:
+        first: dict[str, QDockWidget] = {}
+        for name, entry in PANELS.items():
+            place = QWidget()
+            box = QVBoxLayout(place)
+            box.setContentsMargins(0, 0, 0, 0)
+            self._places[name] = place
+            if entry.area == "centre":
+                index = self.tabs.addTab(place, entry.title)
+                self.tabs.setTabToolTip(index, f"{entry.tip} ({entry.shortcut})")
+                continue
+            dock = QDockWidget(entry.title)
+            dock.setObjectName(f"dock-{name}")
+            dock.setWidget(place)
+            dock.setToolTip(entry.tip)
+            self.addDockWidget(_AREAS[entry.area], dock)
+            if entry.area in first:
+                self.tabifyDockWidget(first[entry.area], dock)
+            else:
+                first[entry.area] = dock
+            dock.visibilityChanged.connect(partial(self._dock_seen, name))
+            self._docks[name] = dock
+        for dock in first.values():
+            dock.raise_()
+        self.setCorner(Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
+        if "top right" in first and "right" in first:
+            self.resizeDocks([first["top right"], first["right"]], [430, 430], Qt.Orientation.Vertical)
+            self.resizeDocks([first["top right"]], [560], Qt.Orientation.Horizontal)
+        if "bottom" in first:
+            self.resizeDocks([first["bottom"]], [150], Qt.Orientation.Vertical)
+
+    def _dock_seen(self, name: str, visible: bool) -> None:
+        if visible:
+            self._try_to_fill(name)
+
+    def _fill_current(self, _index: int = 0) -> None:
+        place = self.tabs.currentWidget()
+        for name, widget in self._places.items():
+            if widget is place:
+                self._try_to_fill(name)
+
+    def _try_to_fill(self, name: str) -> None:
+        """Make a panel; one that cannot be made says why in its place, and the others are not touched."""
+        try:
+            self.panel(name)
+        except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
+            text = words_for(error)
+            self.session.log("error", f"{PANELS[name].title}: {text}")
+            layout = self._places[name].layout()
+            assert layout is not None
+            if layout.count() == 0:
+                view = QPlainTextEdit(text)
+                view.setReadOnly(True)
+                layout.addWidget(view)
+
+    # Bars and menus ------------------------------------------------------------------------------
+    def _make_top_bar(self) -> None:
+        bar = QToolBar("Bench")
+        bar.setObjectName("bench-bar")
+        bar.setMovable(False)
+        bar.toggleViewAction().setEnabled(False)  # STOP stays in reach
+        self.simulated = QLabel("SIMULATED")
+        self.simulated.setObjectName("simulated")
+        self.simulated.setToolTip("Some or all devices of this bench have no hardware behind them")
+        self._simulated_action = bar.addWidget(self.simulated)
+        self.chips = DeviceChips(self.session)
+        bar.addWidget(self.chips)
+        stretch = QWidget()
+        stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
+        bar.addWidget(stretch)
+        self.stop_button = QPushButton("STOP")
+        self.stop_button.setObjectName("stop")
+        self.stop_button.setToolTip("Halt all motion, turn the light off, end what runs (Esc)")
+        self.stop_button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
+        self.stop_button.clicked.connect(self.session.stop)
+        bar.addWidget(self.stop_button)
+        bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
+        self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
+
+    def _make_status_bar(self) -> None:
+        self.job_label = QLabel("Ready")
+        self.job_progress = QProgressBar()
+        self.job_progress.setRange(0, 0)
+        self.job_progress.setFixedWidth(140)
+        self.job_progress.hide()
+        self.statusBar().addWidget(self.job_progress)
+        self.statusBar().addWidget(self.job_label, 1)
+        self.session.logged.connect(self._show_problem)
+
+    def _make_menus(self) -> None:
+        view = self.menuBar().addMenu("&View")
+        for name, entry in PANELS.items():
+            view.addAction(self._panel_action(name, entry))
+        view.addSeparator()
+        theme = self.menuBar().addMenu("&Theme")
+        for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
+            action = QAction(words, self)
+            action.setShortcut(QKeySequence(f"Ctrl+Shift+{number + 1}"))
+            action.triggered.connect(partial(self.set_theme, name))
+            theme.addAction(action)
+        bench = self.menuBar().addMenu("&Bench")
+        for kind in self.session.kinds:
+            action = QAction(f"Reconnect the {kind.replace('_', ' ')}", self)
+            action.triggered.connect(partial(self.session.reconnect, kind))
+            bench.addAction(action)
+        bench.addSeparator()
+        leave = QAction("&Quit", self)
+        leave.setShortcut(QKeySequence("Ctrl+Q"))
+        leave.triggered.connect(self.close)
+        bench.addAction(leave)
+
+    def _panel_action(self, name: str, entry: PanelEntry) -> QAction:
+        action = QAction(entry.title, self)
+        action.setShortcut(QKeySequence(entry.shortcut))
+        action.setToolTip(entry.tip)
+        action.triggered.connect(lambda: self.show_panel(name))
+        return action
+
+    def set_theme(self, name: str) -> None:
+        """Change the looks of the whole program and remember it."""
+        app = QApplication.instance()
+        assert isinstance(app, QApplication)
+        apply_theme(app, name)
+        self._settings.setValue("theme", name)
+        for kind in self.session.kinds:
+            self.chips.show_state(kind)
+        for panel in self._panels.values():
+            panel.theme_changed()
+
+    # STOP ----------------------------------------------------------------------------------------
+    def _make_stop_keys(self) -> None:
+        shortcut = QShortcut(QKeySequence(Qt.Key.Key_Escape), self)
+        shortcut.setContext(Qt.ShortcutContext.ApplicationShortcut)
+        shortcut.activated.connect(self.session.stop)
+        # Dialogs and menus take Escape for themselves: there it is seen at the door.
+        app = QGuiApplication.instance()
+        assert isinstance(app, QGuiApplication)
+        app.focusWindowChanged.connect(self._watch_window)
+
+    def _watch_window(self, window: QWindow | None) -> None:
+        if window is not None and window is not self.windowHandle():
+            window.removeEventFilter(self)
+            window.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """Stop when Escape is pressed in a dialog or menu, which then closes as usual."""
+        if (
+            event.type() == QEvent.Type.KeyPress
+            and isinstance(event, QKeyEvent)
+            and event.key() == Qt.Key.Key_Escape
+        ):
+            self.session.stop()
+        return False
+
+    # What runs -----------------------------------------------------------------------------------
+    def _show_simulated(self, _kind: str = "") -> None:
+        simulated = [k.replace("_", " ") for k in self.session.kinds if self.session.state(k).simulated]
+        self._simulated_action.setVisible(bool(simulated))
+        everything = len(simulated) == len(self.session.kinds)
+        self.simulated.setText("SIMULATED" if everything else f"SIMULATED: {', '.join(simulated)}")
+
+    def _job_started(self, job: Job) -> None:
+        if job.exclusive or not job.lanes:
+            self.job_progress.show()
+        self.job_label.setText(f"{job.title} …")
+
+    def _job_ended(self, job: Job) -> None:
+        running = [other for other in self.session.jobs.jobs if other.exclusive or not other.lanes]
+        self.job_progress.setVisible(bool(running))
+        if running:
+            self.job_label.setText(f"{running[0].title} …")
+        elif job.state.value == "succeeded":
+            self.job_label.setText(f"{job.title}: done")
+
+    def _show_problem(self, level: str, text: str) -> None:
+        if level in ("warning", "error"):
+            self.job_label.setText(text.splitlines()[0][:200])
+
+    def _ask_operator(self, request: OperatorRequest) -> None:
+        box = QMessageBox(QMessageBox.Icon.Information, "To be done by hand", request.text, parent=self)
+        done = box.addButton("Done", QMessageBox.ButtonRole.AcceptRole)
+        box.addButton("Stop", QMessageBox.ButtonRole.RejectRole)
+        box.finished.connect(lambda _: request.confirm() if box.clickedButton() is done else request.refuse())
+        self._open(box)
+
+    def _open(self, box: QMessageBox) -> None:
+        self.question = box
+        box.finished.connect(lambda _: setattr(self, "question", None))
+        box.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        box.open()
+
+    # The end -------------------------------------------------------------------------------------
+    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
+        """Close the bench first, and ask before anything that runs is broken off."""
+        if self._may_close:
+            self._keep_layout()
+            event.accept()
+            return
+        event.ignore()
+        running = [job.title for job in self.session.jobs.jobs if job.exclusive or not job.lanes]
+        if running and self.question is None:
+            box = QMessageBox(
+                QMessageBox.Icon.Warning,
+                "Close?",
+                f"{', '.join(running)} is running. Stop it and close?\nWhat was acquired is kept.",
+                parent=self,
+            )
+            stop = box.addButton("Stop and close", QMessageBox.ButtonRole.DestructiveRole)
+            stay = box.addButton("Go on", QMessageBox.ButtonRole.RejectRole)
+            box.setDefaultButton(stay)
+            box.finished.connect(lambda _: self._end() if box.clickedButton() is stop else None)
+            self._open(box)
+        elif not running:
+            self._end()
+
+    def _end(self) -> None:
+        self.job_label.setText("Closing: light off, motion stopped …")
+        for panel in self._panels.values():
+            panel.shutdown()
+        self.session.close()
+
+    def _close_now(self) -> None:
+        self._may_close = True
+        self.close()
+
+    def _keep_layout(self) -> None:
+        self._settings.setValue("version", _LAYOUT_VERSION)
+        self._settings.setValue("geometry", self.saveGeometry())
+        self._settings.setValue("state", self.saveState(_LAYOUT_VERSION))
+        self._settings.sync()
+
+    def _restore_layout(self) -> None:
+        if self._settings.value("version", type=int) != _LAYOUT_VERSION:
+            return
+        geometry, state = self._settings.value("geometry"), self._settings.value("state")
+        if geometry is not None:
+            self.restoreGeometry(geometry)
+        if state is not None:
+            self.restoreState(state, _LAYOUT_VERSION)
+
+
+def theme_of(settings: QSettings) -> str:
+    """Return the theme that was chosen last."""
+    name = str(settings.value("theme", "dark"))
+    return name if name in THEMES else "dark"

@@ -1,0 +1,37 @@
+"""The table of panels: a new panel is a module and one row here; it is imported when it is first shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Literal, NamedTuple
+
+from gui.panel import Panel
+
+Area = Literal["centre", "top right", "right", "bottom"]
+
+
+class PanelEntry(NamedTuple):
+    """A row of the table."""
+
+    title: str
+    """On its tab."""
+    place: str
+    """``module:class``."""
+    area: Area
+    """``"centre"``: a tab of its own size; the others are docks."""
+    shortcut: str
+    """Keys that bring it to the front."""
+    tip: str
+
+    def load(self) -> type[Panel]:
+        """Import the panel's class."""
+        module, _, name = self.place.partition(":")
+        panel: type[Panel] = getattr(import_module(module), name)
+        return panel
+
+
+PANELS: Mapping[str, PanelEntry] = {
+    "live": PanelEntry("Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running"),
+    "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
+}

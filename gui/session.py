@@ -1,0 +1,429 @@
+"""The bench as the windows have it: devices with their state, the live view, runs, STOP, the log."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from PySide6.QtCore import QObject, Qt, QTimer, Signal
+
+from drivers.errors import DeviceError, LimitError, StoppedError
+from gui.jobs import Job, JobContext, JobRunner, Work, words_for
+from instrument.bench import Bench
+from instrument.config import BenchConfig, Kind
+from instrument.live_view import LiveView
+from instrument.safety import StepsFailedError
+
+DeviceCondition = Literal["closed", "opening", "open", "failed"]
+Level = Literal["debug", "info", "warning", "error"]
+
+_STOP_REPEAT_S = 0.05
+_STOP_WAIT_S = 10.0
+"""How long STOP goes on stopping while a job has not ended: it may have been about to start a move."""
+_WATCH_MS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """How a device is doing.
+
+    Attributes
+    ----------
+    condition : str
+        ``"closed"``, ``"opening"``, ``"open"`` or ``"failed"``.
+    text : str
+        Who the device says it is, or why it failed and what to check.
+    simulated : bool
+    """
+
+    condition: DeviceCondition
+    text: str = ""
+    simulated: bool = False
+
+
+class BenchSession(QObject):
+    """One bench, opened device by device, so that one that fails leaves the others at work.
+
+    Parameters
+    ----------
+    config : BenchConfig
+    parent : QObject, optional
+
+    Signals (all in the window's thread)
+    ------------------------------------
+    device_changed : str
+        The kind of device whose state changed.
+    logged : str, str
+        Level (``"debug"``, ``"info"``, ``"warning"``, ``"error"``) and text.
+    run_finished : Path
+        A run's or calibration's folder that was just written.
+    stopped
+        STOP was pressed, and everything is safe or known not to be.
+    asked : object
+        An :class:`OperatorRequest`: something is to be done by hand.
+    opened, closed
+        Every device was tried; everything was closed.
+    """
+
+    device_changed = Signal(str)
+    logged = Signal(str, str)
+    run_finished = Signal(object)
+    stopped = Signal()
+    asked = Signal(object)
+    opened = Signal()
+    closed = Signal()
+    _from_thread = Signal(str, object)
+
+    def __init__(self, config: BenchConfig, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self.config = config
+        self.bench = Bench(config, self._ask)
+        self.live = LiveView(self.bench.camera)
+        self.jobs = JobRunner(self)
+        self.jobs.job_ended.connect(self._job_ended)
+        self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
+        self._stopping = False
+        self._closing = False
+        self.is_closed = False
+        self._live_wanted = True
+        self._live_job: Job | None = None
+        self._requests: list[OperatorRequest] = []
+        self._from_thread.connect(self._receive, Qt.ConnectionType.QueuedConnection)
+        self._handler = _ToSession(self)
+        logging.getLogger().addHandler(self._handler)
+        self._watch = QTimer(self)
+        self._watch.setInterval(_WATCH_MS)
+        self._watch.timeout.connect(self._look_after_devices)
+
+    # What there is -------------------------------------------------------------------------------
+    @property
+    def runs_folder(self) -> Path:
+        """Where runs and calibrations are written."""
+        return self.config.data_folder
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of devices that the bench has."""
+        return tuple(self.bench.devices)
+
+    def state(self, kind: str) -> DeviceState:
+        """Return how a device is doing; ``"closed"`` for one that the bench does not have."""
+        return self._states.get(kind, DeviceState("closed"))
+
+    def is_open(self, kind: str) -> bool:
+        """Whether a device can be used."""
+        return self.state(kind).condition == "open"
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether any device of the bench is simulated."""
+        return any(state.simulated for state in self._states.values())
+
+    # Opening -------------------------------------------------------------------------------------
+    def open(self) -> Job:
+        """Open every device, each whatever happens to the others, then start the live view."""
+        for kind in self._states:
+            self._set_state(kind, DeviceState("opening"))
+
+        def work(context: JobContext) -> None:
+            for kind in self.kinds:
+                context.check()
+                self._open_one(kind)
+
+        job = self.jobs.exclusive("Opening the bench", work)
+        job.ended.connect(self._all_tried)
+        return job
+
+    def reconnect(self, kind: Kind) -> Job:
+        """Close and open a device again."""
+        self._set_state(kind, DeviceState("opening"))
+
+        def work(_: JobContext) -> None:
+            device = self.bench.devices[kind]
+            if kind == "camera":
+                with contextlib.suppress(DeviceError):  # it is the broken connection that is given up
+                    self.live.stop()
+            with contextlib.suppress(DeviceError):
+                device.close()
+            self._open_one(kind)
+
+        job = self.jobs.device(f"Connecting the {kind.replace('_', ' ')}", work, {kind})
+        job.ended.connect(lambda: self._tried(kind))
+        return job
+
+    def _open_one(self, kind: Kind) -> None:
+        """Open a device, in a job's thread; a failure becomes its state."""
+        try:
+            device = self.bench.open_device(kind)
+            identity = device.identity
+        except DeviceError as error:
+            self._from_thread.emit("failed", (kind, words_for(error)))
+        else:
+            self._from_thread.emit("open", (kind, str(identity), identity.simulated))
+
+    def _all_tried(self) -> None:
+        for kind in self.kinds:
+            self._tried(kind)
+        if not self._closing:
+            self._watch.start()
+            self.opened.emit()
+
+    def _tried(self, kind: str) -> None:
+        if self.state(kind).condition == "opening":
+            self._set_state(kind, DeviceState("failed", "It was not opened."))
+        if kind == "camera" and self.is_open("camera") and self._live_wanted:
+            self.start_live()
+
+    # The live view -------------------------------------------------------------------------------
+    @property
+    def live_wanted(self) -> bool:
+        """Whether the live view is to run whenever nothing else needs the camera."""
+        return self._live_wanted
+
+    def start_live(self) -> None:
+        """Start the live view; it also goes on by itself after a run."""
+        self._live_wanted = True
+        if self.is_open("camera") and not self.jobs.is_busy("camera") and not self._closing:
+            self._live_job = self.jobs.device(
+                "Starting the live view", lambda _: self.live.start(), {"camera"}
+            )
+
+    def stop_live(self) -> None:
+        """End the live view until it is started again."""
+        self._live_wanted = False
+        if self.live.is_running and self.jobs.exclusive_job is None:
+            self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"})
+
+    # Jobs ----------------------------------------------------------------------------------------
+    def device_job(self, title: str, work: Work, lanes: Collection[str]) -> Job:
+        """Run a short job on devices; errors as ``JobRunner.device``."""
+        return self.jobs.device(title, work, lanes)
+
+    def exclusive_job(self, title: str, work: Work) -> Job:
+        """Run a job that needs the whole bench (a run, a calibration): the live view is ended for it.
+
+        Raises
+        ------
+        BusyError
+            When another such job runs.
+        """
+
+        def alone(context: JobContext) -> Any:
+            self.live.stop()
+            return work(context)
+
+        return self.jobs.exclusive(title, alone)
+
+    def _job_ended(self, job: Job) -> None:
+        if job.error is not None:
+            self._note_error(job)
+        elif job.lanes:
+            self.log("debug", f"{job.title}: done.")
+        if job is self._live_job:
+            self._live_job = None
+        elif job.lanes and self._live_wanted and not self.live.is_running and not self._stopping:
+            self.start_live()
+
+    def _note_error(self, job: Job) -> None:
+        error = job.error
+        assert error is not None
+        if job.state.value == "cancelled":
+            self.log("info", f"{job.title}: stopped. " + " ".join(getattr(error, "__notes__", ())))
+            return
+        self.log("error", f"{job.title}: {words_for(error)}")
+        if isinstance(error, DeviceError) and not isinstance(error, LimitError | StoppedError):
+            self.note_failure(error)
+
+    def note_failure(self, error: DeviceError) -> None:
+        """Mark the device that an error names as failed."""
+        for kind, device in self.bench.devices.items():
+            if error.device.startswith(device.name) and self.state(kind).condition == "open":
+                self._set_state(kind, DeviceState("failed", words_for(error), self.state(kind).simulated))
+
+    def _look_after_devices(self) -> None:
+        """Notice a stream that ended by an error, and devices that were lost while nobody used them."""
+        error = self.live.error
+        if error is not None and self.is_open("camera"):
+            self.log("error", f"Live view: {words_for(error)}")
+            self.note_failure(error)
+        for kind, device in self.bench.devices.items():
+            if self.is_open(kind) and not device.is_open and not self.jobs.is_busy(kind):
+                text = f"{device.name} was lost. Check its cable and power, then reconnect it."
+                self.log("error", text)
+                self._set_state(kind, DeviceState("failed", text, self.state(kind).simulated))
+
+    # STOP ----------------------------------------------------------------------------------------
+    def stop(self) -> None:
+        """STOP: motion halted, light off, the running device jobs cancelled. Returns at once.
+
+        Overtakes everything: the devices' stop functions are called from a thread of their own, again and
+        again until no job can start anything any more.
+        """
+        self.jobs.cancel_device_jobs()
+        for request in list(self._requests):
+            request.refuse()
+        if self._stopping:
+            return
+        self._stopping = True
+        self.log("warning", "STOP")
+        running = self.jobs.device_jobs
+        threading.Thread(target=self._stop_all, args=(running,), name="STOP", daemon=True).start()
+
+    def _stop_all(self, running: tuple[Job, ...]) -> None:
+        deadline_s = time.monotonic() + _STOP_WAIT_S
+        failure: BaseException | None = None
+        while True:
+            try:
+                self.bench.stop()
+                failure = None
+            except StepsFailedError as error:
+                failure = error
+            if all(job.is_over for job in running) or time.monotonic() > deadline_s:
+                break
+            time.sleep(_STOP_REPEAT_S)
+        late = tuple(job.title for job in running if not job.is_over)
+        self._from_thread.emit("stopped", (failure, late))
+
+    def _stop_ended(self, failure: BaseException | None, late: tuple[str, ...]) -> None:
+        self._stopping = False
+        if failure is not None:
+            self.log("error", str(failure))
+        elif late:
+            self.log("error", f"Light off, nothing moving; but {', '.join(late)} has not ended yet.")
+        else:
+            self.log("info", "Stopped: light off, nothing moving.")
+        self.stopped.emit()
+        if self._live_wanted and not self._closing:
+            self.start_live()
+
+    # The end -------------------------------------------------------------------------------------
+    def close(self) -> None:
+        """End safely: jobs cancelled, light off, motion stopped, devices closed; ``closed`` follows."""
+        if self._closing:
+            return
+        self._closing = True
+        self._watch.stop()
+        self._live_wanted = False
+        for job in self.jobs.jobs:
+            job.cancel()
+        self.stop()
+        jobs = self.jobs.jobs
+        threading.Thread(target=self._close_all, args=(jobs,), name="closing the bench", daemon=True).start()
+
+    def _close_all(self, jobs: tuple[Job, ...]) -> None:
+        deadline_s = time.monotonic() + _STOP_WAIT_S
+        while not all(job.is_over for job in jobs) and time.monotonic() < deadline_s:
+            time.sleep(_STOP_REPEAT_S)
+        problem = ""
+        try:
+            self.live.stop()
+        except DeviceError as error:
+            problem = words_for(error)
+        try:
+            self.bench.close()
+        except StepsFailedError as error:
+            problem = str(error)
+        self._from_thread.emit("closed", problem)
+
+    def _ended(self, problem: str) -> None:
+        if problem:
+            self.log("error", problem)
+        logging.getLogger().removeHandler(self._handler)
+        self.is_closed = True
+        for kind in self._states:
+            self._set_state(kind, DeviceState("closed"))
+        self.closed.emit()
+
+    # The log and the operator --------------------------------------------------------------------
+    def log(self, level: Level, text: str) -> None:
+        """Write a line into the log panel; for the window's thread."""
+        self.logged.emit(level, text.strip())
+
+    def _ask(self, request: str) -> None:
+        """Ask the operator, from a job's thread; returns when it is done."""
+        asked = OperatorRequest(request)
+        self._from_thread.emit("ask", asked)
+        asked.wait()
+
+    def _set_state(self, kind: str, state: DeviceState) -> None:
+        if self._states[kind] != state:
+            self._states[kind] = state
+            self.device_changed.emit(kind)
+
+    def _receive(self, what: str, value: Any) -> None:
+        """Take a message from another thread."""
+        if what == "open":
+            kind, text, simulated = value
+            self._set_state(kind, DeviceState("open", text, simulated))
+            self.log("info", f"{kind.replace('_', ' ')} opened: {text}")
+        elif what == "failed":
+            kind, text = value
+            self._set_state(kind, DeviceState("failed", text))
+            self.log("error", text)
+        elif what == "stopped":
+            self._stop_ended(*value)
+        elif what == "closed":
+            self._ended(value)
+        elif what == "ask":
+            self._requests.append(value)
+            value.answered = lambda: self._requests.remove(value)
+            self.asked.emit(value)
+        else:
+            self.log(*value)
+
+
+class OperatorRequest:
+    """Something that the operator is asked to do by hand; a job waits for the answer."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.answered: Callable[[], None] | None = None
+        self._done = threading.Event()
+        self._refused = False
+
+    def confirm(self) -> None:
+        """Say that it is done."""
+        self._answer()
+
+    def refuse(self) -> None:
+        """Say that it will not be done: the job ends."""
+        self._refused = True
+        self._answer()
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the operator (or STOP) has answered."""
+        return self._done.is_set()
+
+    def _answer(self) -> None:
+        if not self._done.is_set():
+            self._done.set()
+            if self.answered is not None:
+                self.answered()
+
+    def wait(self) -> None:
+        """Wait for the answer, in the job's thread; KeyboardInterrupt when it is no."""
+        self._done.wait()
+        if self._refused:
+            raise KeyboardInterrupt
+
+
+class _ToSession(logging.Handler):
+    """Brings what the rooms below log into the log panel."""
+
+    def __init__(self, session: BenchSession) -> None:
+        super().__init__(logging.INFO)
+        self._session = session
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = {logging.WARNING: "warning", logging.ERROR: "error", logging.CRITICAL: "error"}.get(
+            record.levelno, "info"
+        )
+        with contextlib.suppress(RuntimeError):  # the window is gone
+            self._session._from_thread.emit("log", (level, f"{record.name}: {record.getMessage()}"))

@@ -1,0 +1,162 @@
+"""Looks for a dark room: a dark theme, and a red one that spares night vision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from PySide6.QtGui import QColor, QPalette
+from PySide6.QtWidgets import QApplication
+
+
+@dataclass(frozen=True, slots=True)
+class Colours:
+    """The colours of a theme, as ``#rrggbb``."""
+
+    window: str
+    panel: str
+    field: str
+    line: str
+    text: str
+    dim: str
+    accent: str
+    ok: str
+    warning: str
+    error: str
+    stop: str
+    stop_text: str
+    curves: tuple[str, ...]
+    """For plots, in turn."""
+    colour_map: str
+    """The images' colour map to begin with: a name of ``gui.widgets.colour_maps``."""
+
+
+DARK = Colours(
+    window="#14171c",
+    panel="#1b1f26",
+    field="#242a33",
+    line="#343c48",
+    text="#d7dde6",
+    dim="#8792a2",
+    accent="#4aa3df",
+    ok="#58c08a",
+    warning="#e5b454",
+    error="#f0716b",
+    stop="#d5322d",
+    stop_text="#ffffff",
+    curves=("#4aa3df", "#e5b454", "#58c08a", "#c58af0", "#f0716b", "#7fd3d6"),
+    colour_map="grey",
+)
+RED = Colours(
+    window="#0a0000",
+    panel="#120202",
+    field="#1d0404",
+    line="#3f0b0b",
+    text="#d83a30",
+    dim="#94241f",
+    accent="#ff4a3d",
+    ok="#b5322a",
+    warning="#ff5c4d",
+    error="#ff2a1c",
+    stop="#a80f08",
+    stop_text="#000000",
+    curves=("#ff4a3d", "#a82a22", "#ff8074", "#7a1a14", "#d83a30", "#ff2a1c"),
+    colour_map="red",
+)
+"""Only red light: no channel but red above a few levels."""
+THEMES = {"dark": DARK, "red": RED}
+
+_now = [DARK]
+
+
+def colours() -> Colours:
+    """Return the colours in use."""
+    return _now[0]
+
+
+def apply_theme(app: QApplication, name: str) -> None:
+    """Give the whole program the looks of a theme, ``"dark"`` or ``"red"``."""
+    theme = THEMES[name]
+    _now[0] = theme
+    app.setStyle("Fusion")
+    palette = QPalette()
+    role = QPalette.ColorRole
+    for what, colour in {
+        role.Window: theme.window,
+        role.WindowText: theme.text,
+        role.Base: theme.field,
+        role.AlternateBase: theme.panel,
+        role.Text: theme.text,
+        role.PlaceholderText: theme.dim,
+        role.Button: theme.field,
+        role.ButtonText: theme.text,
+        role.BrightText: theme.warning,
+        role.Highlight: theme.accent,
+        role.HighlightedText: theme.window,
+        role.ToolTipBase: theme.field,
+        role.ToolTipText: theme.text,
+        role.Link: theme.accent,
+        role.Light: theme.line,
+        role.Midlight: theme.line,
+        role.Mid: theme.line,
+        role.Dark: theme.window,
+        role.Shadow: theme.window,
+    }.items():
+        palette.setColor(what, QColor(colour))
+    for what in (role.WindowText, role.Text, role.ButtonText):
+        palette.setColor(QPalette.ColorGroup.Disabled, what, QColor(theme.dim).darker(130))
+    app.setPalette(palette)
+    app.setStyleSheet(_style(theme))
+
+
+def _style(c: Colours) -> str:
+    return f"""
+QWidget {{ font-size: 10pt; }}
+QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; padding: 3px; }}
+QLineEdit, QPlainTextEdit, QTextEdit, QComboBox, QSpinBox, QDoubleSpinBox, QListView, QTreeView, QTableView {{
+  background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; padding: 3px 5px;
+  selection-background-color: {c.accent}; selection-color: {c.window}; }}
+QLineEdit:focus, QComboBox:focus, QPlainTextEdit:focus, QListView:focus {{ border-color: {c.accent}; }}
+QLineEdit:read-only {{ background: {c.panel}; }}
+*[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
+QLabel#refusal {{ color: {c.warning}; }}
+QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
+QLabel[role="value"] {{ color: {c.text}; font-weight: 600; }}
+QLabel[role="heading"] {{ color: {c.dim}; font-size: 9pt; font-weight: 600; }}
+QPushButton, QToolButton {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px;
+  padding: 4px 10px; }}
+QPushButton:hover, QToolButton:hover {{ border-color: {c.accent}; }}
+QPushButton:focus, QToolButton:focus {{ border-color: {c.accent}; }}
+QPushButton:pressed, QPushButton:checked, QToolButton:checked {{ background: {c.accent}; color: {c.window}; }}
+QPushButton:disabled, QToolButton:disabled {{ color: {c.line}; }}
+QPushButton:flat {{ background: transparent; border: none; color: {c.dim}; padding: 2px 6px; }}
+QPushButton:flat:hover, QPushButton:flat:focus {{ color: {c.accent}; }}
+QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: none; border-radius: 5px;
+  font-size: 14pt; font-weight: 800; padding: 6px 26px; letter-spacing: 2px; }}
+QPushButton#stop:hover, QPushButton#stop:focus {{ border: 2px solid {c.text}; padding: 4px 24px; }}
+QPushButton#primary {{ background: {c.accent}; color: {c.window}; border: none; font-weight: 600;
+  padding: 5px 14px; }}
+QPushButton#primary:disabled {{ background: {c.field}; color: {c.dim}; }}
+QLabel#simulated {{ background: {c.warning}; color: {c.window}; font-weight: 800; padding: 3px 10px;
+  border-radius: 4px; letter-spacing: 1px; }}
+QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}
+QGroupBox {{ border: 1px solid {c.line}; border-radius: 5px; margin-top: 10px; padding-top: 6px; }}
+QGroupBox::title {{ subcontrol-origin: margin; left: 8px; padding: 0 4px; color: {c.dim}; }}
+QTabWidget::pane {{ border: 1px solid {c.line}; }}
+QTabBar::tab {{ background: {c.panel}; color: {c.dim}; border: 1px solid {c.line}; border-bottom: none;
+  padding: 5px 12px; margin-right: 1px; }}
+QTabBar::tab:selected {{ background: {c.field}; color: {c.text}; border-top: 2px solid {c.accent}; }}
+QTabBar::tab:hover {{ color: {c.text}; }}
+QDockWidget {{ color: {c.dim}; }}
+QDockWidget::title {{ background: {c.panel}; padding: 4px 8px; }}
+QMainWindow::separator {{ background: {c.line}; width: 3px; height: 3px; }}
+QSplitter::handle {{ background: {c.line}; }}
+QProgressBar {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; text-align: center; }}
+QProgressBar::chunk {{ background: {c.accent}; border-radius: 3px; }}
+QScrollBar:vertical {{ background: {c.window}; width: 10px; }}
+QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
+QScrollBar::handle {{ background: {c.line}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
+QScrollBar::add-line, QScrollBar::sub-line {{ width: 0; height: 0; }}
+QStatusBar {{ background: {c.panel}; color: {c.dim}; }}
+QMenuBar, QMenu {{ background: {c.panel}; }}
+QMenu::item:selected, QMenuBar::item:selected {{ background: {c.accent}; color: {c.window}; }}
+"""

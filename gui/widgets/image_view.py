@@ -1,0 +1,154 @@
+"""An image to look at: colour map, levels, zoom by wheel, pan by dragging, values under the mouse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import QPointF, Signal
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from gui.theme import colours
+from gui.widgets.colour_maps import SATURATED, table
+
+Image = npt.NDArray[Any]
+
+_SIGNAL = SATURATED - 1
+
+
+class ImageView(QWidget):
+    """Shows ``(height, width)`` or ``(height, width, 3)`` images of any number type.
+
+    Integer images go through one look-up table from counts to 8-bit indices, made when levels change, so that
+    a frame costs one pass; saturated counts get an index (and colour) of their own.
+
+    Signals
+    -------
+    hovered : str
+        Place and value under the mouse in words; empty outside.
+    clicked : int, int
+        Column and row of the pixel that was clicked.
+
+    Parameters
+    ----------
+    colour_map : str, optional
+        A name of ``colour_maps.NAMES``; None means the theme's.
+    parent : QWidget, optional
+    """
+
+    hovered = Signal(str)
+    clicked = Signal(int, int)
+
+    def __init__(self, colour_map: str | None = None, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        pg.setConfigOptions(imageAxisOrder="row-major")
+        self.graphics = pg.GraphicsView(background=colours().window)
+        self.box: Any = pg.ViewBox(lockAspect=True, invertY=True, enableMenu=False)
+        self.graphics.setCentralItem(self.box)
+        self.item: Any = pg.ImageItem()
+        self.box.addItem(self.item)
+        self.image: Image | None = None
+        self._colour_map = colour_map or colours().colour_map
+        self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
+        self._table_key: tuple[Any, ...] = ()
+        self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.graphics)
+        scene = self.graphics.scene()
+        scene.sigMouseMoved.connect(self._moved)
+        scene.sigMouseClicked.connect(self._mouse_clicked)
+        self.setMinimumSize(160, 120)
+
+    @property
+    def colour_map(self) -> str:
+        """The colour map's name."""
+        return self._colour_map
+
+    def set_colour_map(self, name: str) -> None:
+        """Choose another colour map."""
+        self._colour_map = name
+        if self.image is not None:
+            self.item.setLookupTable(table(name))
+
+    def show_image(self, image: Image, low: float, high: float, full_scale: int | None = None) -> None:
+        """Show an image.
+
+        Parameters
+        ----------
+        image : ndarray
+            ``(height, width)`` or ``(height, width, 3)``. Kept by reference until the next.
+        low, high : float
+            Values shown darkest and brightest.
+        full_scale : int, optional
+            Counts from here on are drawn in the colour of saturation.
+        """
+        first = self.image is None or self.image.shape[:2] != image.shape[:2]
+        self.image = image
+        if self._indices.shape != image.shape:
+            self._indices = np.empty(image.shape, np.uint8)
+        self._fill(image, low, high, full_scale)
+        if image.ndim == 2:
+            self.item.setImage(self._indices, autoLevels=False, levels=None, lut=table(self._colour_map))
+        else:
+            rgb = self._indices
+            if full_scale is not None:
+                rgb[(image >= full_scale).any(axis=2)] = table("grey")[SATURATED]
+            self.item.setImage(rgb, autoLevels=False, levels=None, lut=None)
+        if first:
+            self.whole()
+
+    def whole(self) -> None:
+        """Show the whole image."""
+        if self.image is not None:
+            height, width = self.image.shape[:2]
+            self.box.setRange(xRange=(0, width), yRange=(0, height), padding=0.01)
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self.image = None
+        self.item.clear()
+
+    def _fill(self, image: Image, low: float, high: float, full_scale: int | None) -> None:
+        span = max(high - low, 1e-12)
+        if image.dtype in (np.uint8, np.uint16):
+            key = (image.dtype, low, high, full_scale)
+            if key != self._table_key:
+                counts = np.arange(np.iinfo(image.dtype).max + 1)
+                levels = np.clip((counts - low) * (_SIGNAL / span), 0, _SIGNAL).astype(np.uint8)
+                if full_scale is not None:
+                    levels[counts >= full_scale] = SATURATED
+                self._table, self._table_key = levels, key
+            np.take(self._table, image, out=self._indices, mode="clip")
+            return
+        scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(_SIGNAL / span)
+        np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
+        self._indices[...] = scaled
+
+    # The mouse -----------------------------------------------------------------------------------
+    def pixel_at(self, place: QPointF) -> tuple[int, int] | None:
+        """Return column and row of the pixel at a place of the scene; None outside the image."""
+        if self.image is None:
+            return None
+        point = self.box.mapSceneToView(place)
+        column, row = int(np.floor(point.x())), int(np.floor(point.y()))
+        height, width = self.image.shape[:2]
+        return (column, row) if 0 <= column < width and 0 <= row < height else None
+
+    def describe(self, column: int, row: int) -> str:
+        """Return a pixel's place and value in words."""
+        assert self.image is not None
+        value = self.image[row, column]
+        words = " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
+        return f"x {column}  y {row}  value {words}"
+
+    def _moved(self, place: QPointF) -> None:
+        pixel = self.pixel_at(place)
+        self.hovered.emit("" if pixel is None else self.describe(*pixel))
+
+    def _mouse_clicked(self, event: Any) -> None:
+        pixel = self.pixel_at(event.scenePos())
+        if pixel is not None:
+            self.clicked.emit(*pixel)

@@ -1,0 +1,180 @@
+"""A number with its unit, edited in place, refused in place."""
+
+from __future__ import annotations
+
+import math
+
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtGui import QFocusEvent, QKeyEvent
+from PySide6.QtWidgets import QLineEdit, QWidget
+
+
+class NumberEdit(QLineEdit):
+    """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
+
+    A value that is none, or outside the limits, is refused where it stands, with the reason as tool tip; what
+    was typed stays to be corrected. Nothing is ever clipped.
+
+    Signals
+    -------
+    submitted : float
+        A new number within the limits.
+    refused : str
+        Why what was typed was refused.
+
+    Parameters
+    ----------
+    unit : str
+        Shown behind the number; may be empty.
+    value : float, optional
+    minimum, maximum : float
+        Limits, inclusive.
+    integer : bool
+        Whether only whole numbers are numbers.
+    tip : str
+        The tool tip; the limits are added.
+    parent : QWidget, optional
+    """
+
+    submitted = Signal(float)
+    refused = Signal(str)
+
+    def __init__(
+        self,
+        unit: str = "",
+        value: float | None = None,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        integer: bool = False,
+        tip: str = "",
+        parent: QWidget | None = None,
+    ) -> None:
+        super().__init__(parent)
+        self.unit = unit
+        self.minimum, self.maximum = minimum, maximum
+        self._integer = integer
+        self._tip = tip
+        self._value = value
+        self.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.returnPressed.connect(self.submit)
+        self._show()
+
+    @property
+    def value(self) -> float | None:
+        """The last number that was accepted or set."""
+        return self._value
+
+    def set_value(self, value: float | None) -> None:
+        """Show a number, e.g. as a device reads back; what is being typed is left alone."""
+        self._value = value
+        if not self.isModified():
+            self._show()
+
+    def set_limits(self, minimum: float, maximum: float) -> None:
+        """Change the limits."""
+        if (minimum, maximum) != (self.minimum, self.maximum):
+            self.minimum, self.maximum = minimum, maximum
+            if not self.property("refused"):
+                self.setToolTip(self._limits_tip())
+
+    def refuse(self, why: str) -> None:
+        """Show that the number was refused (by the device), and why; it stays to be corrected."""
+        self.setModified(True)
+        self._mark(why)
+        self.refused.emit(why)
+
+    def submit(self) -> None:
+        """Take what was typed, or refuse it."""
+        if not self.isModified():
+            return
+        number, problem = self._read()
+        if problem:
+            self._mark(problem)
+            self.refused.emit(problem)
+            return
+        assert number is not None
+        changed = number != self._value
+        self._value = number
+        self._show()
+        if changed:
+            self.submitted.emit(number)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
+        """Step by Up and Down; give up what was typed by Ctrl+Z at its end as any field does."""
+        if event.key() in (Qt.Key.Key_Up, Qt.Key.Key_Down):
+            number, problem = self._read()
+            if number is not None and not problem:
+                step = (
+                    1.0
+                    if self._integer
+                    else 10 ** (math.floor(math.log10(abs(number))) - 1)
+                    if number
+                    else 0.1
+                )
+                stepped = number + (step if event.key() == Qt.Key.Key_Up else -step)
+                self.setText(self._text(stepped))
+                self.setModified(True)
+                self.submit()
+            return
+        super().keyPressEvent(event)
+
+    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
+        """Submit when the field is left."""
+        super().focusOutEvent(event)
+        self.submit()
+
+    def _step(self, number: float) -> float:
+        """Return a step in the number's second digit."""
+        if self._integer:
+            return 1.0
+        return float(10 ** (math.floor(math.log10(abs(number))) - 1)) if number else 0.1
+
+    def _read(self) -> tuple[float | None, str]:
+        text = self.text().strip()
+        if self.unit and text.endswith(self.unit):
+            text = text.removesuffix(self.unit).strip()
+        try:
+            number = float(text.replace(",", "."))
+        except ValueError:
+            return None, f"{text!r} is no number{f' of {self.unit}' if self.unit else ''}."
+        if not math.isfinite(number):
+            return None, f"{text} is no finite number."
+        if self._integer and number != int(number):
+            return None, f"{number:g} is no whole number."
+        if not self.minimum <= number <= self.maximum:
+            return None, f"{number:g} is outside {self._range()}."
+        return number, ""
+
+    def _range(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if math.isinf(self.maximum):
+            return f"{self.minimum:g}{unit} and more"
+        if math.isinf(self.minimum):
+            return f"{self.maximum:g}{unit} and less"
+        return f"{self.minimum:g} to {self.maximum:g}{unit}"
+
+    def _limits_tip(self) -> str:
+        if math.isinf(self.minimum) and math.isinf(self.maximum):
+            return self._tip
+        return f"{self._tip}\n{self._range()}".strip()
+
+    def _text(self, number: float) -> str:
+        digits = f"{number:.0f}" if self._integer else f"{number:.6g}"
+        return f"{digits} {self.unit}".strip()
+
+    def _show(self) -> None:
+        self.setText("" if self._value is None else self._text(self._value))
+        self.setModified(False)
+        self.setProperty("refused", False)
+        self.setToolTip(self._limits_tip())
+        self._restyle()
+
+    def _mark(self, why: str) -> None:
+        self.setProperty("refused", True)
+        self.setToolTip(why)
+        self._restyle()
+
+    def _restyle(self) -> None:
+        self.style().unpolish(self)
+        self.style().polish(self)

@@ -1,0 +1,116 @@
+"""The desktop program without a screen, on a small simulated bench."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+pytest.importorskip("PySide6.QtWidgets", reason="needs the extra [gui]", exc_type=ImportError)
+pytest.importorskip("pytestqt", reason="needs pytest-qt")
+
+from PySide6.QtCore import QSettings
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.session import BenchSession
+from gui.theme import apply_theme
+from instrument.config_file import parse_config
+
+WAIT_MS = 20_000
+"""For what takes a fraction of a second: the machine may be doing other things, too."""
+
+BENCH = """
+[bench]
+name = "test bench"
+data_folder = "runs"
+[camera]
+driver = "simulated"
+exposure_ms = 2.0
+frames_per_s = 60.0
+replay_frames = 2
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+leds = 89
+[slm]
+driver = "simulated"
+shape = [60, 80]
+settle_ms = 0.0
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+"""
+
+
+@pytest.fixture(scope="session")
+def qapp() -> QApplication:
+    """The application in the program's own looks."""
+    app = QApplication.instance() or QApplication(["diffuserbench"])
+    assert isinstance(app, QApplication)
+    apply_theme(app, "dark")
+    return app
+
+
+@pytest.fixture
+def bench_text() -> str:
+    """The bench.toml of the test; a module may override this."""
+    return BENCH
+
+
+@pytest.fixture
+def make_session(qtbot: QtBot, tmp_path: Path, bench_text: str) -> Iterator[Callable[[], BenchSession]]:
+    """Make sessions (not yet opened) that are closed after the test."""
+    made: list[BenchSession] = []
+
+    def make() -> BenchSession:
+        session = BenchSession(parse_config(bench_text, tmp_path / "bench.toml"))
+        made.append(session)
+        return session
+
+    yield make
+    for session in made:
+        if not session.is_closed:
+            with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+                session.close()
+        session.jobs.join(5.0)
+
+
+@pytest.fixture
+def session(qtbot: QtBot, make_session: Callable[[], BenchSession]) -> BenchSession:
+    """A session whose devices are open and whose live view runs."""
+    session = make_session()
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
+    return session
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> QSettings:
+    """A place of the test's own for the window's layout."""
+    return QSettings(str(tmp_path / "window.ini"), QSettings.Format.IniFormat)
+
+
+@pytest.fixture
+def window(qtbot: QtBot, session: BenchSession, settings: QSettings) -> Iterator[MainWindow]:
+    """The main window on an open session."""
+    window = MainWindow(session, settings)
+    window.show()
+    with qtbot.waitExposed(window):
+        pass
+    yield window
+    for panel in window._panels.values():
+        panel.shutdown()
+    if not session.is_closed:
+        with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+            session.close()
+    window._may_close = True
+    window.close()
+    window.deleteLater()

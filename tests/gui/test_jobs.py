@@ -1,0 +1,143 @@
+"""Jobs: results, progress, errors and cancelling reach the window's thread."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from PySide6.QtCore import QThread
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from drivers.errors import LimitError
+from gui.jobs import BusyError, JobContext, JobRunner, JobState
+from instrument.errors import BenchError
+
+WAIT_MS = 20_000
+
+
+@pytest.fixture
+def jobs(qapp: QApplication) -> JobRunner:
+    return JobRunner(qapp)
+
+
+def test_a_result_arrives_in_the_windows_thread(qtbot: QtBot, jobs: JobRunner) -> None:
+    here = QThread.currentThread()
+    seen: list[object] = []
+    job = jobs.compute("sum", lambda _: (sum(range(10)), threading.current_thread()))
+    job.succeeded.connect(lambda result: seen.append((result, QThread.currentThread())))
+    with qtbot.waitSignal(job.ended, timeout=WAIT_MS):
+        pass
+    ((total, thread), where), *_ = seen  # type: ignore[misc]
+    assert total == 45
+    assert thread is not threading.main_thread()
+    assert where is here
+    assert job.state is JobState.SUCCEEDED
+    assert jobs.jobs == ()
+
+
+def test_progress_keeps_only_the_newest_and_parts_all_arrive(qtbot: QtBot, jobs: JobRunner) -> None:
+    def work(context: JobContext) -> None:
+        for i in range(1000):
+            context.report(i)
+        for i in range(20):
+            context.deliver(i)
+
+    reports: list[object] = []
+    parts: list[object] = []
+    job = jobs.compute("loop", work)
+    job.progressed.connect(reports.append)
+    job.arrived.connect(parts.append)
+    with qtbot.waitSignal(job.ended, timeout=WAIT_MS):
+        pass
+    assert reports[-1] == 999
+    assert len(reports) < 1000
+    assert parts == list(range(20))
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (BenchError("the disk is full"), "the disk is full"),
+        (LimitError("stage", "x is too far."), "stage: x is too far."),
+        (ZeroDivisionError("oops"), "please report"),
+    ],
+)
+def test_an_error_becomes_words(qtbot: QtBot, jobs: JobRunner, error: Exception, words: str) -> None:
+    def work(_: JobContext) -> None:
+        raise error
+
+    job = jobs.compute("fails", work)
+    with qtbot.waitSignal(job.failed, timeout=WAIT_MS) as told:
+        pass
+    assert words in told.args[0]
+    assert job.error is error
+
+
+def test_cancelling_ends_work_that_reports(qtbot: QtBot, jobs: JobRunner) -> None:
+    def work(context: JobContext) -> None:
+        while True:
+            context.report(None)
+
+    job = jobs.compute("endless", work)
+    with qtbot.waitSignal(job.progressed, timeout=WAIT_MS):
+        pass
+    with qtbot.waitSignal(job.cancelled, timeout=WAIT_MS):
+        job.cancel()
+
+
+def test_cancelling_calls_what_the_work_asked_for(qtbot: QtBot, jobs: JobRunner) -> None:
+    gate = threading.Event()
+
+    def work(context: JobContext) -> str:
+        context.on_cancel(gate.set)
+        gate.wait(20)
+        return "ended by itself"
+
+    job = jobs.compute("blocks", work)
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    with qtbot.waitSignal(job.succeeded, timeout=WAIT_MS):
+        job.cancel()
+
+
+def test_jobs_of_one_device_take_turns_and_those_of_another_do_not_wait(
+    qtbot: QtBot, jobs: JobRunner
+) -> None:
+    gate = threading.Event()
+    order: list[str] = []
+    jobs.device("slow", lambda _: (gate.wait(20), order.append("slow")), {"stage"})
+    after = jobs.device("after", lambda _: order.append("after"), {"stage"})
+    other = jobs.device("other", lambda _: order.append("other"), {"camera"})
+    with qtbot.waitSignal(other.ended, timeout=WAIT_MS):
+        pass
+    gate.set()
+    with qtbot.waitSignal(after.ended, timeout=WAIT_MS):
+        pass
+    assert order == ["other", "slow", "after"]
+
+
+def test_an_exclusive_job_holds_every_device(qtbot: QtBot, jobs: JobRunner) -> None:
+    gate = threading.Event()
+    run = jobs.exclusive("A sweep", lambda _: gate.wait(20))
+    with pytest.raises(BusyError, match="A sweep is running"):
+        jobs.device("jog", lambda _: None, {"stage"})
+    with pytest.raises(BusyError, match="A sweep is running"):
+        jobs.exclusive("another", lambda _: None)
+    free = jobs.compute("free", lambda _: 1)
+    with qtbot.waitSignal(free.ended, timeout=WAIT_MS):
+        pass
+    assert not run.is_over
+    with qtbot.waitSignal(run.ended, timeout=WAIT_MS):
+        gate.set()
+
+
+def test_a_held_key_cannot_fill_a_queue(qtbot: QtBot, jobs: JobRunner) -> None:
+    gate = threading.Event()
+    first = jobs.device("slow", lambda _: gate.wait(20), {"stage"})
+    qtbot.waitUntil(lambda: first.state is JobState.RUNNING, timeout=WAIT_MS)
+    for _ in range(16):
+        jobs.device("jog", lambda _: None, {"stage"})
+    with pytest.raises(BusyError, match="waiting already"):
+        jobs.device("jog", lambda _: None, {"stage"})
+    gate.set()
+    qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)

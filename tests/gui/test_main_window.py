@@ -1,0 +1,180 @@
+"""The shell: devices, STOP, the log, closing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from PySide6.QtCore import QSettings, Qt
+from PySide6.QtWidgets import QApplication, QMessageBox
+from pytestqt.qtbot import QtBot
+
+from gui.jobs import JobContext, JobState
+from gui.main_window import MainWindow
+from gui.panels import PANELS
+from gui.session import BenchSession
+from gui.theme import THEMES
+
+WAIT_MS = 20_000
+
+
+def test_a_simulated_bench_says_so(window: MainWindow) -> None:
+    assert window.simulated.isVisible()
+    assert window.simulated.text() == "SIMULATED"
+    assert all(window.session.is_open(kind) for kind in ("camera", "stage", "led_array", "slm"))
+
+
+def test_every_panel_opens_and_copies_python(window: MainWindow) -> None:
+    for name, entry in PANELS.items():
+        panel = window.show_panel(name)
+        assert panel.title == entry.title
+        assert panel.isVisible(), name
+        panel.copy_button.click()
+        code = QApplication.clipboard().text()
+        compile(code, name, "exec")
+    shortcuts = [entry.shortcut for entry in PANELS.values()]
+    assert len(set(shortcuts)) == len(shortcuts)
+
+
+def test_escape_stops_a_move_and_turns_the_light_off(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+    bench = session.bench
+    assert bench.stage is not None
+    assert bench.led_array is not None
+    stage = bench.stage
+    homed = session.device_job("home", lambda _: stage.home(), {"stage"})
+    qtbot.waitUntil(lambda: homed.is_over, timeout=WAIT_MS)
+    bench.source_on()
+    far = stage.limits["x_um"][1]
+    move = session.device_job("move", lambda _: stage.move_to({"x_um": far}), {"stage"})
+    qtbot.waitUntil(lambda: stage.is_moving, timeout=WAIT_MS)
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        qtbot.keyClick(window, Qt.Key.Key_Escape)
+    qtbot.waitUntil(lambda: move.is_over, timeout=WAIT_MS)
+    assert move.state is JobState.CANCELLED
+    assert not stage.is_moving
+    assert stage.position()["x_um"] < far - 1000
+    assert bench.led_array.pattern.is_dark
+
+
+def test_the_stop_button_ends_an_exclusive_job_and_the_live_view_goes_on(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    session = window.session
+
+    def work(context: JobContext) -> None:
+        while True:
+            session.bench.snap()
+            context.report(1)
+
+    job = session.exclusive_job("A run", work)
+    with qtbot.waitSignal(job.progressed, timeout=WAIT_MS):
+        pass
+    with qtbot.waitSignals([job.ended, session.stopped], timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
+    assert job.state is JobState.CANCELLED
+    qtbot.waitUntil(lambda: session.live.is_running, timeout=WAIT_MS)
+
+
+def test_an_unplugged_camera_is_named_and_comes_back(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+    world = session.bench.shared["simulated"]
+    world.unplug("camera")  # type: ignore[attr-defined]
+    qtbot.waitUntil(lambda: session.state("camera").condition == "failed", timeout=WAIT_MS)
+    assert "unplugged" in session.state("camera").text
+    button = window.chips.reconnect_buttons["camera"]
+    assert button.isVisible()
+    assert session.is_open("stage")
+    assert "camera (simulated)" in window.panel("log").view.toPlainText()  # type: ignore[attr-defined]
+    qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: not session.jobs.jobs, timeout=WAIT_MS)
+    assert session.state("camera").condition == "failed"
+    world.plug_in("camera")  # type: ignore[attr-defined]
+    qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
+    assert session.is_open("camera")
+    assert not button.isVisible()
+
+
+def test_one_device_that_cannot_be_opened_leaves_the_others_at_work(
+    qtbot: QtBot, make_session: Callable[[], BenchSession]
+) -> None:
+    session = make_session()
+    session.bench.shared["simulated"].unplug("led_array")  # type: ignore[attr-defined]
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    assert session.state("led_array").condition == "failed"
+    assert session.is_open("slm")
+    qtbot.waitUntil(lambda: session.live.newest() is not None, timeout=WAIT_MS)
+
+
+def test_closing_while_something_runs_asks_and_then_ends_safely(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+
+    def work(context: JobContext) -> None:
+        session.bench.source_on()
+        while True:
+            session.bench.snap()
+            context.report(1)
+
+    job = session.exclusive_job("A sweep", work)
+    with qtbot.waitSignal(job.progressed, timeout=WAIT_MS):
+        pass
+    window.close()
+    box = window.question
+    assert isinstance(box, QMessageBox)
+    assert "A sweep" in box.text()
+    go_on = next(b for b in box.buttons() if b.text() == "Go on")
+    qtbot.mouseClick(go_on, Qt.MouseButton.LeftButton)
+    assert not job.is_over
+    assert window.isVisible()
+    window.close()
+    assert window.question is not None
+    stop = next(b for b in window.question.buttons() if b.text() == "Stop and close")
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        qtbot.mouseClick(stop, Qt.MouseButton.LeftButton)
+    assert job.is_over
+    assert not window.isVisible()
+    assert not any(device.is_open for device in session.bench.devices.values())
+
+
+def test_the_layout_is_kept(
+    qtbot: QtBot, window: MainWindow, settings: QSettings, make_session: Callable[[], BenchSession]
+) -> None:
+    window._docks["log"].hide()
+    with qtbot.waitSignal(window.session.closed, timeout=WAIT_MS):
+        window.close()
+    again = MainWindow(make_session(), settings)
+    qtbot.addWidget(again, before_close_func=lambda w: setattr(w, "_may_close", True))
+    assert again._docks["log"].isHidden()
+
+
+def test_the_log_filters_by_level_and_words(window: MainWindow) -> None:
+    panel = window.panel("log")
+    session = window.session
+    session.log("debug", "a detail")
+    session.log("warning", "a warning of the stage")
+    view = panel.view  # type: ignore[attr-defined]
+    assert "a detail" not in view.toPlainText()
+    panel.level.setCurrentIndex(0)  # type: ignore[attr-defined]
+    assert "a detail" in view.toPlainText()
+    panel.words.setText("STAGE")  # type: ignore[attr-defined]
+    assert "a warning of the stage" in view.toPlainText()
+    assert "a detail" not in view.toPlainText()
+
+
+@pytest.mark.parametrize("name", sorted(THEMES))
+def test_a_theme_can_be_chosen(window: MainWindow, settings: QSettings, name: str) -> None:
+    window.set_theme(name)
+    assert settings.value("theme") == name
+    window.set_theme("dark")
+
+
+def test_the_red_theme_emits_no_green_or_blue_to_speak_of() -> None:
+    theme = THEMES["red"]
+    for field in theme.__slots__:
+        value = getattr(theme, field)
+        for colour in (value,) if isinstance(value, str) else value:
+            if colour.startswith("#"):
+                red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+                assert max(green, blue) <= 0.55 * red, (field, colour)
