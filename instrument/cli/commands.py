@@ -55,6 +55,9 @@ COMMANDS: Mapping[str, Command] = {
         ANALYSIS, "what a calibration's optics can do: one page and JSON", "instrument.cli.analyze"
     ),
     "compare": Command(ANALYSIS, "two calibrations: what moved, is a new one due", "instrument.cli.compare"),
+    "stability": Command(
+        ANALYSIS, "map where methods fail, against pairs of stresses", "instrument.cli.stability"
+    ),
     "refocus": Command(ANALYSIS, "bring a calibrated PSF to another depth", "instrument.cli.refocus"),
     "hologram": Command(
         DISPLAY, "compute the SLM phase that shows a picture through the mask", "instrument.cli.hologram"

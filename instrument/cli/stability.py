@@ -1,0 +1,145 @@
+"""``diffuserbench stability``: maps of where methods fail, against pairs of stresses."""
+
+from __future__ import annotations
+
+import enum
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.progress import progress_bar
+from instrument.errors import BenchError, FileError
+
+app = command_app()
+
+
+class SizeName(enum.StrEnum):
+    """The sizes of a map."""
+
+    QUICK = "quick"
+    FULL = "full"
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench stability --list",
+        "diffuserbench stability light --size quick",
+        "diffuserbench stability light erasures --method 'admm tv' --out maps",
+        "diffuserbench stability --size full --out stability",
+        "diffuserbench stability --redraw --out stability",
+    )
+)
+def stability(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="Maps; default all.", show_default=False)
+    ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            "-m",
+            metavar="NAME",
+            help="Only these methods; repeatable. Default: each map's.",
+            show_default=False,
+        ),
+    ] = None,
+    size: Annotated[
+        SizeName, typer.Option("--size", help="quick: coarse, small pictures; full: hours.")
+    ] = SizeName.QUICK,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where maps are kept and gone on with.")
+    ] = Path("stability"),
+    list_maps: Annotated[bool, typer.Option("--list", help="Only list maps and their methods.")] = False,
+    redraw: Annotated[bool, typer.Option("--redraw", help="Only draw what stability.json holds.")] = False,
+    shipped: Annotated[
+        bool, typer.Option("--shipped", help="With --redraw: the maps that come with the program.")
+    ] = False,
+) -> None:
+    """Map where methods fail: the error against pairs of stresses, with the failure boundary drawn.
+
+    For each map a PNG, and stability.json with all of them. Ctrl-C keeps what is done; the same command goes
+    on from there. What counts as failure, and what each map says, is in docs/stability.md.
+    """
+    from recon.stability.catalogue import MAPS, map_named
+    from recon.stability.run import cells_of, run_map
+
+    chosen = [map_named(name) for name in names] if names else list(MAPS.values())
+    if list_maps:
+        for stress in chosen:
+            typer.echo(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
+            typer.echo(f"{'':<20}methods: {'; '.join(stress.methods)}")
+        return
+    if redraw:
+        _redraw(out, [s.name for s in chosen] if names else None, shipped=shipped)
+        return
+    if shipped:
+        raise BenchError("--shipped goes with --redraw.")
+    wanted = {s.name: _methods(s.methods, method) for s in chosen}
+    chosen = [s for s in chosen if wanted[s.name]]
+    if not chosen:
+        known = sorted({m for s in (map_named(n) for n in wanted) for m in s.methods})
+        raise BenchError(f"No map has the method {', '.join(method or [])}. Methods: {'; '.join(known)}.")
+    _make(out)
+    from instrument.stability_file import RESULT, CellLog, map_record, write_stability
+
+    log = CellLog(out)
+    jobs = {s.name: cells_of(s, size.value, wanted[s.name]) for s in chosen}
+    pictures = [out / f"{s.name}.png" for s in chosen]
+    with saying_what_is_left(out / RESULT, *pictures), progress_bar() as bar:
+        task = bar.add_task("stability", total=sum(map(len, jobs.values())), note="")
+        for stress, picture in zip(chosen, pictures, strict=True):
+            asked = set(jobs[stress.name])
+            made = [c for c in log.of(stress, size.value) if (c.method, c.ix, c.iy) in asked]
+            bar.update(task, advance=len(made), note=stress.name)
+            for cell in run_map(stress, size.value, methods=wanted[stress.name], known=made):
+                log.add(stress, size.value, cell)
+                bar.update(task, advance=1, note=f"{stress.name}: {cell.method}")
+            record = map_record(stress, size.value, log.of(stress, size.value))
+            write_stability(out, {stress.name: record}, " ".join(["diffuserbench", *sys.argv[1:]]))
+            _draw(record, picture)
+            _tell(stress.name, record)
+    typer.echo(f"Wrote {', '.join(map(str, (out / RESULT, *pictures)))}")
+
+
+def _methods(offered: tuple[str, ...], asked: list[str] | None) -> list[str]:
+    return list(offered) if asked is None else [m for m in offered if m in asked]
+
+
+def _make(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise FileError(folder, "is a file; a folder is expected.", "Name another with --out.")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _draw(record: dict[str, object], picture: Path) -> None:
+    from instrument.atomic import whole_file
+    from instrument.figures import save_figure
+    from instrument.stability_figure import map_figure
+
+    with whole_file(picture) as temporary:
+        save_figure(map_figure(record), temporary)
+
+
+def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
+    from instrument.stability_file import RESULT, read_stability
+    from recon.stability.shipped import shipped_file
+
+    maps = read_stability(shipped_file() if shipped else out / RESULT)["maps"]
+    if missing := [n for n in names or () if n not in maps]:
+        raise BenchError(f"Not made yet: {', '.join(missing)}. Leave --redraw out to make them.")
+    _make(out)
+    for name in names or maps:
+        _draw(maps[name], out / f"{name}.png")
+        typer.echo(f"Drew {out / f'{name}.png'}")
+
+
+def _tell(name: str, record: dict[str, object]) -> None:
+    methods = record["methods"]
+    assert isinstance(methods, dict)
+    for method, result in methods.items():
+        failed = [f for row in result["failure"] for f in row]
+        share = sum(f is not None for f in failed)
+        typer.echo(f"{name:<20}{method:<24}{share:3d} of {len(failed)} cells fail, {result['seconds']:.0f} s")

@@ -1,0 +1,166 @@
+"""What "failed" means, in one place: each criterion gives a severity, and from 1 on it is a failure.
+
+=============  ==========================================================================================
+criterion      severity
+=============  ==========================================================================================
+trivial        error over that of the trivial reconstruction: the measurement's back-projection ``A^H b``
+               with the best scale and offset that the truth itself would choose
+resolution     0.5 over the correlation with the truth on the ring of frequencies whose period is twice the
+               resolved distance (the resolution has fallen below half of nominal)
+spots          share of true points (away from others) without a peak within 1.5 pixels, and of peaks without
+               a point, over 10 %
+dip            0.2 over the least dip between neighbouring points (two-point resolution)
+convergence    change of the last iteration over ten times the tolerance, where a limit ended the run
+picture        ``10^((20 - PSNR) / 20)``: a hologram's error over a tenth of its picture's white
+precision      difference of float32 from float64 over 1 % of the solution
+=============  ==========================================================================================
+
+Severities are continuous, so that a boundary can be drawn between the cells of a coarse map.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon import metrics
+from recon.solvers.stopping import IterationRecord, StopReason
+
+Image = npt.NDArray[Any]
+
+WORST = 99.0
+"""Severities are cut here: an infinite one is no number for a file."""
+RING_CORRELATION = 0.5
+RING_WIDTH = 0.2
+"""Half width of the ring, relative to its frequency."""
+LOST_SHARE = 0.1
+REACH_PX = 1.5
+APART_PX = 5.0
+"""Nearer points need not be told apart to be found."""
+PEAK_SHARE = 0.25
+"""A peak counts from this share of the median height at the true points."""
+DIP = 0.2
+PSNR_DB = 20.0
+PRECISION = 0.01
+
+
+class Failure(enum.StrEnum):
+    """In which way a reconstruction failed."""
+
+    TRIVIAL = "no better than the trivial reconstruction"
+    RESOLUTION = "resolution below half of nominal"
+    SPOTS = "points lost or made up"
+    DIP = "neighbouring points not told apart"
+    CONVERGENCE = "not converged"
+    PICTURE = "picture below 20 dB"
+    PRECISION = "float32 differs from float64"
+
+
+Severities = Mapping[Failure, float]
+
+
+def worst(severities: Severities) -> tuple[float, Failure | None]:
+    """Return the largest severity, and its criterion where it is a failure (1 or more)."""
+    if not severities:
+        raise ValueError("A cell needs at least one criterion.")
+    kind = max(severities, key=lambda k: severities[k])
+    value = bounded(severities[kind])
+    return value, kind if value >= 1 else None
+
+
+def bounded(severity: float) -> float:
+    """Return the severity within 0 and :data:`WORST`; NaN is the worst."""
+    return WORST if not severity <= WORST else max(float(severity), 0.0)
+
+
+def trivial_error(back_projection: Image, truth: Image) -> float:
+    """Return the NRMSE of the trivial reconstruction: ``a A^H b + c`` with the best ``a`` and ``c``.
+
+    Parameters
+    ----------
+    back_projection, truth : ndarray
+        Of one shape, any number of dimensions.
+    """
+    seen, wanted = (np.asarray(v, np.float64).ravel() for v in (back_projection, truth))
+    columns = np.stack([seen, np.ones_like(seen)], axis=1)
+    fitted = columns @ np.linalg.lstsq(columns, wanted, rcond=None)[0]
+    return float(np.linalg.norm(fitted - wanted) / np.linalg.norm(wanted))
+
+
+def relative_error(found: Image, truth: Image) -> float:
+    """Return the NRMSE after the best scale, for any number of dimensions."""
+    a, b = (np.asarray(v, np.float64).reshape(len(v), -1) for v in (found, truth))
+    return metrics.nrmse(a, b, fit_scale=True)
+
+
+def ring_correlation(found: Image, truth: Image, period_px: float) -> float:
+    """Return the correlation of two images (height, width) on a ring of spatial frequencies."""
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in truth.shape))
+    a, b = (np.fft.rfft2(window * (v - v.mean())) for v in (found, truth))
+    y, x = np.fft.fftfreq(truth.shape[0])[:, None], np.fft.rfftfreq(truth.shape[1])
+    ring = np.abs(np.hypot(y, x) * period_px - 1) <= RING_WIDTH
+    norm = float(np.sqrt(np.sum(np.abs(a[ring]) ** 2) * np.sum(np.abs(b[ring]) ** 2)))
+    return float(np.sum(a[ring] * b[ring].conj()).real) / norm if norm > 0 else 0.0
+
+
+def resolution_severity(found: Image, truth: Image, resolved_px: float) -> float:
+    """Severity of lost resolution; ``resolved_px`` is the distance that the optics resolve."""
+    return bounded(RING_CORRELATION / max(ring_correlation(found, truth, 2 * resolved_px), 1e-3))
+
+
+def spot_severity(found: Image, places: npt.NDArray[np.float64], reach_planes: float = REACH_PX) -> float:
+    """Severity of points lost or made up.
+
+    Parameters
+    ----------
+    found : ndarray, (n_z, height, width)
+    places : ndarray, (n, 3)
+        True points: plane, row, column. Those off the grid do not count.
+    reach_planes : float
+        Planes by which a peak may be off: the axial resolution, where that is more than the lateral reach.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    # A point between pixels is shared by up to four: smooth before peaks are looked for.
+    smooth = gaussian_filter(np.asarray(found, np.float64), 0.7)
+    peaks = (smooth == maximum_filter(smooth, 3)) & (smooth > 0)
+    at = np.argwhere(peaks)
+    if not len(at):
+        return bounded(1 / LOST_SHARE)
+    heights = smooth[tuple(at.T)]
+    inside = ((places > -0.5) & (places < np.array(found.shape) - 0.5)).all(axis=1)
+    scale = np.array([REACH_PX / reach_planes, 1, 1])
+    distance = (np.abs(places[:, None, :] - at[None]) * scale).max(axis=2)
+    alone = inside & _apart(places)
+    if not alone.any():
+        return 0.0
+    nearest = np.where(distance <= REACH_PX, heights[None], 0).max(axis=1)
+    least = PEAK_SHARE * float(np.median(nearest[alone]))
+    if least <= 0:
+        return bounded(1 / LOST_SHARE)
+    lost = float(np.mean(nearest[alone] < least))
+    high = heights >= least
+    made_up = float(np.mean(distance[:, high].min(axis=0) > 2 * REACH_PX)) if high.any() else 1.0
+    return bounded(max(lost, made_up) / LOST_SHARE)
+
+
+def _apart(places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Points without another one near to them across."""
+    across = np.abs(places[:, None, 1:] - places[None, :, 1:]).max(axis=2)
+    np.fill_diagonal(across, np.inf)
+    return np.asarray(across.min(axis=1) > APART_PX) if len(places) > 1 else np.ones(len(places), bool)
+
+
+def convergence_severity(
+    history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float
+) -> float:
+    """Severity of a run that was ended by a limit; 0 for one that settled or took one step."""
+    if reason is StopReason.NOT_FINITE:
+        return WORST
+    if not history or reason is not StopReason.ITERATIONS or tolerance <= 0:
+        return 0.0
+    return bounded(history[-1].change / (10 * tolerance))

@@ -1,0 +1,66 @@
+"""Maps, their cells and boundaries, with a trial that costs nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.stability.catalogue import MAPS, map_named
+from recon.stability.failure import Failure
+from recon.stability.map import Axis, Cell, StressMap, Trial, as_text, boundary, severity_grid
+from recon.stability.run import run_map
+
+X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
+Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))
+
+
+def fake(_method: str, x: float, y: float, _seed: int, _size: str) -> Trial:
+    severity = 30 * y / x
+    return Trial(severity / 10, {Failure.TRIVIAL: severity}, {"snr": x / y})
+
+
+MAP = StressMap("fake", "Fake", "None.", X, Y, ("one", "two"), fake, draws=3)
+
+
+def test_every_cell_is_made_once_and_known_ones_are_left_out() -> None:
+    cells = list(run_map(MAP, "full"))
+    assert len({(c.method, c.ix, c.iy) for c in cells}) == len(cells) == 24
+    assert list(run_map(MAP, "full", known=cells)) == []
+    assert len(list(run_map(MAP, "full", methods=["two"], known=cells[:3]))) in (11, 10)
+    assert len(list(run_map(MAP, "quick"))) == 8
+
+
+def test_a_cell_survives_its_file() -> None:
+    for cell in run_map(MAP, "quick"):
+        assert Cell.from_json(cell.as_json()) == cell
+
+
+def test_the_boundary_is_interpolated_where_the_severity_crosses_one() -> None:
+    cells = list(run_map(MAP, "full"))
+    grid = severity_grid(cells, "one", (3, 4))
+    # Severity 30 y / x is 1 at x = 30 y, exactly so on logarithmic axes.
+    assert boundary(X.values, Y.values, grid, logarithmic=True) == [
+        (pytest.approx(30 * y), y) for y in Y.values
+    ]
+    text = as_text(X, Y, (X.values, Y.values), grid)
+    assert text.count("#") == int(np.count_nonzero(grid >= 1)) + 1  # one in the legend
+
+
+def test_a_row_that_never_crosses_has_no_boundary_and_an_odd_cell_does_not_move_it() -> None:
+    all_well = np.full((1, 4), 0.1)
+    assert boundary(X.values, (1.0,), all_well, logarithmic=True) == []
+    odd = np.array([[9.0, 0.9, 9.0, 9.0, 9.0, 0.5, 0.5, 0.5]])
+    [(at, _)] = boundary(tuple(range(8)), (1.0,), odd, logarithmic=False)
+    assert 4 < at < 5
+
+
+def test_the_catalogue_is_in_order() -> None:
+    for name, stress in MAPS.items():
+        assert name == stress.name
+        for axis in (stress.x, stress.y):
+            for values in (axis.values, axis.quick):
+                assert list(values) == sorted(set(values)), (name, axis.key)
+                assert not axis.logarithmic or values[0] > 0
+    with pytest.raises(InputError, match="no map"):
+        map_named("nothing")
