@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from instrument.volume_views import in_colour_of_depth
 from recon.volume.result import VolumeReconstruction
 
 _SLICES = 4
@@ -25,7 +24,7 @@ def volume_figure(result: VolumeReconstruction, *, simulated: bool = False) -> F
     white = _white(front)
     axes[0, 0].imshow(front, cmap="gray", vmin=0, vmax=white)
     axes[0, 0].set(title="brightest over depth", xlabel="x (pixels)", ylabel="y (pixels)")
-    axes[0, 1].imshow(in_colour_of_depth(volume, white))
+    axes[0, 1].imshow(in_colour_of_depth(front, volume.argmax(axis=0), len(volume), white))
     axes[0, 1].set(title="depth as colour: blue first, red last", xlabel="x (pixels)")
     axes[0, 2].imshow(top, cmap="magma", aspect="auto", vmin=0, vmax=_white(top), interpolation="nearest")
     axes[0, 2].set(title="brightest over y", xlabel="x (pixels)", ylabel="depth plane")
@@ -47,16 +46,6 @@ def volume_figure(result: VolumeReconstruction, *, simulated: bool = False) -> F
     axes[1, 3].set(title="data residual (noise = 1 a pixel)", xlabel="iteration")
     axes[1, 3].legend()
     return figure
-
-
-def in_colour_of_depth(volume: npt.NDArray[np.float32], white: float) -> npt.NDArray[np.float64]:
-    """Return the brightest voxels over depth, (height, width, 3), their hue by the depth they lie at."""
-    from matplotlib import colormaps
-
-    deepest = max(len(volume) - 1, 1)
-    hue = colormaps["turbo"](0.1 + 0.8 * volume.argmax(axis=0) / deepest)[..., :3]
-    result: npt.NDArray[Any] = np.clip(hue * (volume.max(axis=0) / white)[..., None], 0, 1)
-    return result
 
 
 def _white(image: npt.NDArray[np.float32]) -> float:
