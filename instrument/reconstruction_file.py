@@ -113,10 +113,16 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
 
 def preview(image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float]:
     """Return 8-bit pixels, linear from zero to the white level, and that level in the image's units."""
+    white = white_level(image)
+    return np.clip(image * (255.0 / white) + 0.5, 0, 255).astype(np.uint8), white
+
+
+def white_level(image: npt.NDArray[np.floating]) -> float:
+    """Return the value that a preview shows as white: nearly the brightest, and above zero."""
     white = float(np.percentile(image, WHITE_PERCENTILE))
     if white <= 0:
         white = float(image.max()) if image.max() > 0 else 1.0
-    return np.clip(image * (255.0 / white) + 0.5, 0, 255).astype(np.uint8), white
+    return white
 
 
 def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:

@@ -33,5 +33,12 @@ class PanelEntry(NamedTuple):
 
 PANELS: Mapping[str, PanelEntry] = {
     "live": PanelEntry("Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running"),
+    "reconstructions": PanelEntry(
+        "Reconstructions",
+        "gui.panels.reconstructions:ReconstructionsPanel",
+        "centre",
+        "Ctrl+6",
+        "Pictures and volumes: look, reconstruct, export",
+    ),
     "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
 }

@@ -1,4 +1,4 @@
-"""``diffuserbench export``: a run's frames for other programs."""
+"""``diffuserbench export``: a run's frames, or a reconstruction, for other programs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples
-from instrument.cli.progress import progress_bar
+from instrument.cli.progress import one_task, progress_bar
+from instrument.errors import BenchError
 from instrument.export import export as export_run
+from instrument.result_export import export_result
 from instrument.store import Run
+from instrument.stored_result import open_result
+from instrument.volume_zarr import is_zarr_name
 
 app = command_app()
 
@@ -20,15 +24,19 @@ app = command_app()
         "diffuserbench export RUN psfs.ome.tif --label psf",
         "diffuserbench export RUN video.mp4",
         "diffuserbench export RUN frames/ --frames 0:100",
+        "diffuserbench export volume.tif volume.ome.zarr",
     )
 )
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="The run's folder.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN|RESULT", help="The run's folder; or a reconstruction's file.")
+    ],
     target: Annotated[
         Path,
         typer.Argument(
             metavar="TARGET",
-            help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files.",
+            help="File ending in .ome.tif, .tif, .h5, .npy or .mp4, or a folder for PNG files. "
+            "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr.",
         ),
     ],
     label: Annotated[
@@ -45,10 +53,15 @@ def export(
         typer.Option("--fps", min=0.1, help="Frames a second of an MP4.", show_default=False),
     ] = None,
 ) -> None:
-    """Write a run's stored frames for other programs; the run stays as it is.
+    """Write a run's stored frames, or a reconstruction, for other programs; what is there stays as it is.
 
     Frames that are not there (gaps of a recording, steps not done) are left out, and said.
     """
+    if _is_result(run):
+        if (label, frames, frames_per_s) != (None, None, None):
+            raise BenchError("--label, --frames and --fps are for runs; leave them out for a reconstruction.")
+        _export_result(run, target)
+        return
     found = Run.open(run)
     wanted = set(range(found.n_frames)[_slice(frames)])
     if label is not None:
@@ -66,6 +79,21 @@ def export(
     typer.echo(f"Wrote {len(indices)} frames: {target}")
     if absent := len(wanted) - len(indices):
         typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a path is a picture's or volume's: a file, or a Zarr folder, which no run is."""
+    return path.is_file() or is_zarr_name(path)
+
+
+def _export_result(path: Path, target: Path) -> None:
+    result = open_result(path)
+    try:
+        with one_task("Planes") as advance:
+            export_result(result, target, advance=advance)
+    finally:
+        result.close()
+    typer.echo(f"Wrote {target}")
 
 
 def _slice(text: str | None) -> slice:

@@ -1,14 +1,17 @@
 """Results are read back as they were written, and volumes without reading what is not looked at."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 
+from instrument.cli import main
 from instrument.errors import FileError
 from instrument.images import write_image
+from instrument.result_list import find_results, free_name
 from instrument.stored_result import open_result, record_file
 from instrument.volume_source import open_volume, volume_in_memory
 from instrument.volume_views import in_colour_of_depth, project
@@ -161,3 +164,37 @@ def test_what_is_no_result_is_refused_in_words(tmp_path):
     np.save(tmp_path / "five.npy", np.zeros((1, 2, 3, 4, 5)))
     with pytest.raises(FileError, match=r"\(1, 2, 3, 4, 5\)"):
         open_volume(tmp_path / "five.npy")
+
+
+def test_export_command_takes_results_too(tmp_path, volume, capsys):
+    np.save(tmp_path / "v.npy", volume)
+    assert main(["export", str(tmp_path / "v.npy"), str(tmp_path / "v.ome.zarr")]) == 0
+    assert main(["export", str(tmp_path / "v.ome.zarr"), str(tmp_path / "v.tif")]) == 0
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "v.tif"), volume)
+    colour = np.stack([volume, 2 * volume, 3 * volume], axis=-1)
+    np.save(tmp_path / "c.npy", colour)
+    assert main(["export", str(tmp_path / "c.npy"), str(tmp_path / "c.tif")]) == 0
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "c.tif"), np.moveaxis(colour, -1, 1))
+    assert main(["export", str(tmp_path / "v.tif"), str(tmp_path / "v.jpg")]) == 2
+    assert main(["export", str(tmp_path / "v.tif"), str(tmp_path / "c.tif")]) == 2
+    assert main(["export", str(tmp_path / "v.tif"), str(tmp_path / "n.npy"), "--label", "psf"]) == 2
+    said = capsys.readouterr().err
+    assert "a volume is exported as .tif" in said
+    assert "exists already" in said
+    assert "are for runs" in said
+
+
+def test_results_of_a_folder_are_listed_newest_first(tmp_path):
+    for number, place in enumerate(("a", "runs/b")):
+        folder = tmp_path / place
+        folder.mkdir(parents=True)
+        write_image(folder / "r.tif", np.zeros((4, 4), np.float32))
+        record = {"program": "diffuserbench 1", "grid": {}, "prior": "tv", "inputs": {}}
+        (folder / "r.json").write_text(json.dumps(record))
+        os.utime(folder / "r.json", (1e9 + number, 1e9 + number))
+    (tmp_path / "other.json").write_text('{"program": "diffuserbench 1"}')
+    (tmp_path / "gone.json").write_text((tmp_path / "a" / "r.json").read_text())
+    assert find_results(tmp_path) == [tmp_path / "runs/b/r.json", tmp_path / "a/r.json"]
+    assert find_results(tmp_path / "absent") == []
+    assert free_name(tmp_path / "a", "r", ".tif").name == "r-2.tif"
+    assert free_name(tmp_path / "a", "new", ".tif").name == "new.tif"

@@ -1,0 +1,346 @@
+"""Reconstructions: those that are there, to be looked at and exported, and a form for new ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import (
+    QFileDialog,
+    QHBoxLayout,
+    QLabel,
+    QListWidget,
+    QListWidgetItem,
+    QPushButton,
+    QSplitter,
+    QStackedWidget,
+    QTabWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.jobs import Job, JobContext
+from gui.panel import Panel
+from gui.python_lines import expression
+from gui.reconstruction_work import SoFar, reconstruct_job
+from gui.session import BenchSession
+from gui.views.convergence import ConvergenceView
+from gui.views.facts import FactsView
+from gui.views.picture_view import PictureView, as_shown
+from gui.views.reconstruct_form import ReconstructForm
+from gui.views.volume_view import VolumeView
+from gui.widgets.colour_maps import table
+from instrument.errors import BenchError
+from instrument.images import write_image
+from instrument.reconstruction_request import VolumeRequest
+from instrument.result_export import export_result
+from instrument.result_list import find_results, free_name
+from instrument.stored_result import StoredResult, open_result
+
+
+class ReconstructionsPanel(Panel):
+    """Results in the data folder, a viewer for pictures and volumes, and the form."""
+
+    title = "Reconstructions"
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(session, parent)
+        self.result: StoredResult | None = None
+        self.job: Job | None = None
+        self._opening: Job | None = None
+        self._first_picture = True
+        self._suggested: Path | None = None
+        self.list = QListWidget()
+        self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
+        self.list.itemActivated.connect(self._open_item)
+        self.list.itemClicked.connect(self._open_item)
+        self.open_button = QPushButton("Open…")
+        self.open_button.setToolTip("Open any picture or volume: TIFF, OME-Zarr, .npy, or a record")
+        self.open_button.clicked.connect(self._choose)
+        self.refresh_button = QPushButton("Refresh")
+        self.refresh_button.setToolTip("Look into the data folder again")
+        self.refresh_button.clicked.connect(self.refresh)
+        self.export_button = QPushButton("Export…")
+        self.export_button.setToolTip("Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)")
+        self.export_button.clicked.connect(self._choose_export)
+        self.export_button.setEnabled(False)
+        self.form = ReconstructForm()
+        self.form.asked.connect(self.reconstruct)
+        self.form.stopped.connect(self._stop)
+        self.form.refused.connect(self.refused)
+        self.picture = PictureView()
+        self.volume = VolumeView(self.jobs)
+        self.volume.failed.connect(lambda why: self.refused(None, why))
+        self.facts = FactsView()
+        self.convergence = ConvergenceView()
+        self.heading = QLabel()
+        self.heading.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self._empty = QLabel("Open a result on the left, or reconstruct one.")
+        self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self._empty.setProperty("role", "dim")
+        self.viewers = QStackedWidget()
+        for widget in (self._empty, self.picture, self.volume):
+            self.viewers.addWidget(widget)
+        self._arrange()
+        session.run_finished.connect(lambda _: self.refresh())
+        self._suggest_out()
+        self.form.image.editingFinished.connect(self._suggest_out)
+        self.form.kind.currentTextChanged.connect(lambda _: self._suggest_out())
+        self.refresh()
+
+    def _arrange(self) -> None:
+        results = QWidget()
+        box = QVBoxLayout(results)
+        box.setContentsMargins(0, 6, 0, 0)
+        box.addWidget(self.list, 1)
+        row = QHBoxLayout()
+        for button in (self.open_button, self.refresh_button, self.export_button):
+            row.addWidget(button)
+        box.addLayout(row)
+        self.tabs = QTabWidget()
+        self.tabs.setDocumentMode(True)
+        self.tabs.addTab(results, "Results")
+        self.tabs.addTab(self.form, "Reconstruct")
+        below = QSplitter(Qt.Orientation.Horizontal)
+        below.addWidget(self.facts)
+        below.addWidget(self.convergence)
+        right = QSplitter(Qt.Orientation.Vertical)
+        top = QWidget()
+        column = QVBoxLayout(top)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.addWidget(self.heading)
+        column.addWidget(self.viewers, 1)
+        right.addWidget(top)
+        right.addWidget(below)
+        right.setStretchFactor(0, 3)
+        right.setStretchFactor(1, 1)
+        right.setSizes([520, 190])
+        whole = QSplitter(Qt.Orientation.Horizontal)
+        whole.addWidget(self.tabs)
+        whole.addWidget(right)
+        whole.setStretchFactor(1, 1)
+        whole.setSizes([300, 900])
+        layout = QVBoxLayout(self.body)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(whole)
+
+    # Results -------------------------------------------------------------------------------------
+    def refresh(self) -> None:
+        """List the results in the data folder."""
+        folder = self.session.runs_folder
+        job = self.tells(self.jobs.compute("Looking for results", lambda _: find_results(folder)))
+        job.succeeded.connect(self._list)
+
+    def _list(self, records: list[Path]) -> None:
+        self.list.clear()
+        for record in records:
+            item = QListWidgetItem(f"{record.stem}\n{record.parent.name}")
+            item.setToolTip(str(record))
+            item.setData(Qt.ItemDataRole.UserRole, record)
+            self.list.addItem(item)
+
+    def _open_item(self, item: QListWidgetItem) -> None:
+        self.open(item.data(Qt.ItemDataRole.UserRole))
+
+    def _choose(self) -> None:
+        chosen, _ = QFileDialog.getOpenFileName(
+            self, "Open a result", str(self.session.runs_folder), "Results (*.tif *.tiff *.npy *.json)"
+        )
+        if chosen:
+            self.open(Path(chosen))
+
+    def open(self, path: Path) -> Job:
+        """Open a result, in a job; it is shown when it is there, or the last line says why not."""
+        job = self.tells(self.jobs.compute(f"Opening {path.name}", lambda _: open_result(path)))
+        self._opening = job
+        job.succeeded.connect(lambda result: self._opened(job, result))
+        return job
+
+    def _opened(self, job: Job, result: StoredResult) -> None:
+        if job is not self._opening:
+            result.close()  # another was asked for since
+            return
+        self.show_result(result)
+
+    def show_result(self, result: StoredResult) -> None:
+        """Show a result; the one before is closed."""
+        self.accepted()
+        self._close_result()
+        self.result = result
+        self.heading.setText(f"<b>{result.path.name}</b>")
+        self.heading.setToolTip(str(result.path))
+        self.facts.show_facts(result.facts(), result.warnings, simulated=result.simulated)
+        self.convergence.show_histories(result.histories, result.noise_norm)
+        self.export_button.setEnabled(True)
+        if result.volume is not None:
+            self.viewers.setCurrentWidget(self.volume)
+            self.volume.open(result.volume, result.planes_um)
+        else:
+            assert result.image is not None
+            self.viewers.setCurrentWidget(self.picture)
+            self.picture.show_picture(result.image, pitch_um=result.pitch_um)
+
+    def _close_result(self) -> None:
+        self.volume.release()
+        self.result = None
+        self.export_button.setEnabled(False)
+
+    # Export --------------------------------------------------------------------------------------
+    def _choose_export(self) -> None:
+        if self.result is None:
+            return
+        values = "*.tif *.npy" if self.result.volume is None else "*.tif *.ome.zarr *.npy"
+        chosen, _ = QFileDialog.getSaveFileName(
+            self, "Export", str(self.result.path.parent), f"All values ({values});;What is shown (*.png)"
+        )
+        if chosen:
+            self.export_to(Path(chosen), overwrite=True)
+
+    def export_to(self, target: Path, *, overwrite: bool = False) -> Job | None:
+        """Write what is shown (``.png``: one file for each view), or all values, as the name asks for."""
+        result = self.result
+        if result is None:
+            return None
+        if target.suffix.lower() == ".png":
+            shown = {
+                (target if len(self._shown()) == 1 else target.with_name(f"{target.stem}-{name}.png")): pixels
+                for name, pixels in self._shown().items()
+            }
+
+            def draw(_context: JobContext) -> list[Path]:
+                for path, pixels in shown.items():
+                    if path.exists() and not overwrite:
+                        raise BenchError(f"{path}: exists already and was left as it is.")
+                    write_image(path, pixels)
+                return list(shown)
+
+            job = self.jobs.compute(f"Exporting {target.name}", draw)
+        else:
+            turned = self.picture.turned_deg
+
+            def write(context: JobContext) -> list[Path]:
+                def advance(done: int, total: int) -> None:
+                    context.report(done / total)
+
+                export_result(result, target, rotate_deg=turned, overwrite=overwrite, advance=advance)
+                return [target]
+
+            job = self.jobs.compute(f"Exporting {target.name}", write)
+        self.tells(job).succeeded.connect(
+            lambda files: self.session.log("info", f"Wrote {', '.join(map(str, files))}")
+        )
+        return job
+
+    def _shown(self) -> dict[str, npt.NDArray[np.uint8]]:
+        """Return the views in their colours, 8 bit."""
+        view = self.picture if self.viewers.currentWidget() is self.picture else self.volume
+        low, high = view.levels.levels
+        colours = table(view.levels.colour_map, mark_saturation=False)
+        if isinstance(view, PictureView):
+            return {"picture": as_shown(view.shown, low, high, colours)}
+        return {
+            name: (
+                np.clip(255 * image, 0, 255).astype(np.uint8)
+                if name == "depth"
+                else as_shown(image, low, high, colours)
+            )
+            for name, image in view.images.items()
+        }
+
+    # Reconstructing ------------------------------------------------------------------------------
+    def _suggest_out(self) -> None:
+        """Name the result after the photograph, where nothing is written yet; a name that was typed stays."""
+        field = self.form.out
+        if field.isModified():
+            return
+        folder = self.session.runs_folder / "reconstructions"
+        stem = Path(self.form.image.text()).stem or "reconstruction"
+        self._suggested = free_name(folder, stem, ".tif")
+        field.setText(str(self._suggested))
+
+    def reconstruct(self) -> Job | None:
+        """Do what the form asks for; the picture so far is shown as it comes."""
+        try:
+            request, outputs = self.form.request(), self.form.outputs()
+        except BenchError as error:
+            self.refused(None, str(error))
+            return None
+        self.accepted()
+
+        if outputs.image == self._suggested:
+            outputs.image.parent.mkdir(parents=True, exist_ok=True)
+        volume = isinstance(request, VolumeRequest)
+        job = self.tells(
+            self.jobs.compute(
+                f"Reconstructing {request.image.name}",
+                lambda context: reconstruct_job(request, outputs, context),
+            )
+        )
+        self.job = job
+        self.form.set_running(True)
+        self.form.show_progress(0.0, "Reading …")
+        self._close_result()
+        self._opening, self._first_picture = None, True
+        self.heading.setText(f"<b>{request.image.name}</b>: in the making")
+        job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
+        job.succeeded.connect(self._reconstructed)
+        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
+        job.ended.connect(lambda: self.form.set_running(False))
+        return job
+
+    def _stop(self) -> None:
+        if self.job is not None:
+            self.job.cancel()
+            self.form.note.setText("Stopping after this iteration …")
+
+    def _progressed(self, so_far: SoFar, *, volume: bool) -> None:
+        self.form.show_progress(so_far.share, so_far.note)
+        prepared = so_far.prepared
+        if so_far.image is None:
+            self.facts.show_facts(
+                list(prepared.notes.items()), prepared.warnings, simulated=prepared.simulated
+            )
+            return
+        keep, self._first_picture = not self._first_picture, False
+        if volume:
+            self.viewers.setCurrentWidget(self.volume)
+            self.volume.show_front(so_far.image, keep_levels=keep)
+        else:
+            self.viewers.setCurrentWidget(self.picture)
+            self.picture.show_picture(so_far.image, keep_levels=keep)
+        self.convergence.show_histories((so_far.history,), None)
+
+    def _reconstructed(self, path: Path) -> None:
+        self.form.show_progress(1.0, f"Wrote {path.name}")
+        self.session.log("info", f"Reconstructed: {path}")
+        self.form.out.setModified(False)
+        self._suggest_out()
+        self.open(path)
+        self.refresh()
+
+    # The panel -----------------------------------------------------------------------------------
+    def as_python(self) -> str:
+        """Return lines that make the reconstruction of the form, or open the result that is shown."""
+        if self.tabs.currentWidget() is self.form:
+            try:
+                return self.form.as_python()
+            except BenchError as error:
+                return f"# The form is not complete: {' '.join(str(error).split())}\n"
+        path = self.result.path if self.result is not None else Path("RESULT.tif")
+        lines = [
+            "from pathlib import Path",
+            "",
+            "from instrument.stored_result import open_result",
+            "",
+            f"result = open_result({expression(path)})",
+            "print(result.facts(), result.warnings)",
+        ]
+        return "\n".join([*lines, ""])
+
+    def shutdown(self) -> None:
+        """Close the volume that is shown and end the work."""
+        if self.job is not None:
+            self.job.cancel()
+        self._close_result()

@@ -1,0 +1,1 @@
+"""Widgets that show results: pictures, volumes, holograms, charts. They know no bench."""

@@ -1,0 +1,344 @@
+"""The form of a reconstruction: what is typed becomes a request, the same that the command line makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from PySide6.QtCore import Signal
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QComboBox,
+    QFormLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QScrollArea,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.python_lines import expression
+from gui.views.entry import Entry, PathEntry, existing_path, number
+from instrument.errors import BenchError
+from instrument.preparation import Crop
+from instrument.reconstruction_file import Outputs
+from instrument.reconstruction_request import (
+    PICTURE_ITERATIONS,
+    VOLUME_ITERATIONS,
+    PictureRequest,
+    Settings,
+    VolumeRequest,
+    known_model,
+)
+from instrument.reconstruction_words import parse_binning, parse_dark, parse_erasures, parse_noise
+from recon.methods import method_names
+from recon.picture import PRIORS
+from recon.volume.channel import PRIORS as VOLUME_PRIORS
+from recon.volume.model import MODELS
+
+CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
+_IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
+_AUTOMATIC = "automatic"
+
+
+class ReconstructForm(QWidget):
+    """Fields of a reconstruction, its progress, and the buttons that start and end it.
+
+    Signals
+    -------
+    asked
+        Reconstruct now: the fields are understood.
+    stopped
+        End the work and keep what there is.
+    refused : object, str
+        A field and why it is refused.
+    """
+
+    asked = Signal()
+    stopped = Signal()
+    refused = Signal(object, str)
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.kind = QComboBox()
+        self.kind.addItems([CALIBRATION, PSF, VOLUME])
+        self.kind.setToolTip("What to reconstruct, and from what the PSFs come")
+        self.image = Entry(existing_path, tip="The photograph: TIFF, PNG or NumPy, raw counts")
+        self.psfs = Entry(existing_path, tip="A calibration's folder, or a run that holds one")
+        self.method = QComboBox()
+        self.method.addItems(method_names())
+        self.method.setToolTip("admm: best; admm-sensor: dense scenes; fista: plain; wiener: one shot")
+        self.model = QComboBox()
+        self.model.addItems(MODELS)
+        self.model.setToolTip("Camera model; auto: the smallest that explains the PSFs")
+        self.prior = QComboBox()
+        self.prior.setToolTip("What the scene is like; automatic: tv (for wiener: none)")
+        self.z_mm = Entry(
+            number("The distance", "mm", above_zero=True),
+            tip="Distance of the scene in mm; needed where the calibration has several depths",
+            placeholder="the calibrated one (mm)",
+        )
+        self.iterations = Entry(
+            number("The number of iterations", "", above_zero=True, whole=True),
+            tip="At most so many iterations",
+        )
+        self.time_s = Entry(
+            number("The time", "s", above_zero=True),
+            tip="At most so many seconds",
+            placeholder="no limit (s)",
+        )
+        self.tau = Entry(
+            number("tau", ""), tip="Weight of the prior, relative to the data", placeholder="from the noise"
+        )
+        self.noise = Entry(
+            lambda text: parse_noise(text or None),
+            tip="Camera noise: standard deviation in counts, or read noise in counts and counts per electron",
+            placeholder="estimated (counts)",
+        )
+        self.dark = Entry(parse_dark, "auto", tip="auto, an offset in counts, or the file of a dark frame")
+        self.crop = Entry(
+            lambda text: Crop.parse(text) if text else None,
+            tip="Window in pixels: TOP,LEFT,HEIGHT,WIDTH, or HEIGHTxWIDTH in the middle",
+            placeholder="whole image (pixels)",
+        )
+        self.binning = Entry(
+            parse_binning, "auto", tip="Average N x N pixels; auto: to at most 0.5 megapixel"
+        )
+        self.erasures = Entry(
+            parse_erasures,
+            "saturated",
+            tip="Pixels left out: none, saturated, a share (0.5), or a mask's file",
+        )
+        self.background = QCheckBox("estimate a smooth background")
+        self.background.setChecked(True)
+        self.background.setToolTip("Stray light that the model cannot explain otherwise ends up as haze")
+        self.out = Entry(self._understand_out, tip="Where the result is written; .png and .json go beside it")
+        self.start = QPushButton("Reconstruct")
+        self.start.setObjectName("primary")
+        self.start.setToolTip("Reconstruct with these settings (Ctrl+Return)")
+        self.start.setShortcut("Ctrl+Return")
+        self.start.clicked.connect(self._start)
+        self.stop = QPushButton("Stop and keep")
+        self.stop.setToolTip("End after the iteration in progress; what there is then is kept")
+        self.stop.setEnabled(False)
+        self.stop.clicked.connect(self.stopped)
+        self.progress = QProgressBar()
+        self.progress.setRange(0, 1000)
+        self.progress.setTextVisible(False)
+        self.note = QLabel()
+        self.note.setWordWrap(True)
+        self.note.setProperty("role", "dim")
+        self._arrange()
+        self.kind.currentTextChanged.connect(self._kind_changed)
+        self.method.currentTextChanged.connect(self._method_changed)
+        for entry in self._entries():
+            entry.refused.connect(lambda why, field=entry: self.refused.emit(field, why))
+        self._kind_changed()
+
+    def _arrange(self) -> None:
+        self._rows = QFormLayout()
+        self._rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.ExpandingFieldsGrow)
+        self._rows.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
+        self._rows.setVerticalSpacing(4)
+        self._psfs_row = PathEntry(self.psfs, "folder")
+        for name, widget in (
+            ("What", self.kind),
+            ("Photograph", PathEntry(self.image, "open", _IMAGES)),
+            ("PSFs", self._psfs_row),
+            ("Distance", self.z_mm),
+            ("Method", self.method),
+            ("Model", self.model),
+            ("Prior", self.prior),
+            ("Iterations", self.iterations),
+            ("Time", self.time_s),
+            ("tau", self.tau),
+            ("Noise", self.noise),
+            ("Dark", self.dark),
+            ("Crop", self.crop),
+            ("Binning", self.binning),
+            ("Erasures", self.erasures),
+            ("Background", self.background),
+            ("Result", PathEntry(self.out, "save", "Results (*.tif *.ome.zarr)")),
+        ):
+            self._rows.addRow(name, widget)
+        inside = QWidget()
+        inside.setLayout(self._rows)
+        scroll = QScrollArea()
+        scroll.setWidget(inside)
+        scroll.setWidgetResizable(True)
+        scroll.setFrameShape(QScrollArea.Shape.NoFrame)
+        buttons = QHBoxLayout()
+        buttons.addWidget(self.start, 1)
+        buttons.addWidget(self.stop)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(scroll, 1)
+        layout.addWidget(self.note)
+        layout.addWidget(self.progress)
+        layout.addLayout(buttons)
+
+    # What is asked for ---------------------------------------------------------------------------
+    def request(self) -> PictureRequest | VolumeRequest:
+        """Return what the fields ask for.
+
+        Raises
+        ------
+        BenchError
+            When a field is not understood; the text says which and why.
+        """
+        prior = self.prior.currentText()
+        settings = Settings(
+            model=known_model(self.model.currentText()),
+            dark=self.dark.value(),
+            crop=self.crop.value(),
+            binning=self.binning.value(),
+            erasures=self.erasures.value(),
+            noise=self.noise.value(),
+            prior=None if prior == _AUTOMATIC else prior,
+            tau=self.tau.value(),
+            iterations=None if self._is_one_shot else self.iterations.value(),
+            time_s=None if self._is_one_shot else self.time_s.value(),
+        )
+        image, psfs = self.image.value(), self.psfs.value()
+        kind = self.kind.currentText()
+        if kind == VOLUME:
+            return VolumeRequest(
+                image=image, psfs=psfs, estimate_background=self.background.isChecked(), settings=settings
+            )
+        z_mm = self.z_mm.value()
+        return PictureRequest(
+            image=image,
+            psf=psfs if kind == PSF else None,
+            calibration=psfs if kind == CALIBRATION else None,
+            z_um=None if z_mm is None else 1e3 * z_mm,
+            method=self.method.currentText(),
+            settings=settings,
+        )
+
+    def outputs(self) -> Outputs:
+        """Return where the result goes.
+
+        Raises
+        ------
+        FileError
+            When the name does not end as it must.
+        """
+        outputs: Outputs = self.out.value()
+        return outputs
+
+    def as_python(self) -> str:
+        """Return lines that make this reconstruction.
+
+        Raises
+        ------
+        BenchError
+            When a field is not understood.
+        """
+        request, outputs = self.request(), self.outputs()
+        volume = isinstance(request, VolumeRequest)
+        module, write = (
+            ("volume_file", "write_volume") if volume else ("reconstruction_file", "write_reconstruction")
+        )
+        imports = {
+            "from instrument.reconstruction_file import Outputs" + ("" if volume else f", {write}"),
+            f"from instrument.reconstruction_request import {type(request).__name__}, Settings",
+        }
+        if volume:
+            imports.add(f"from instrument.{module} import {write}")
+        if request.settings.crop is not None:
+            imports.add("from instrument.preparation import Crop")
+        if type(request.settings.noise).__name__ == "NoiseModel":
+            imports.add("from recon.noise import NoiseModel")
+        named = f"Outputs.named({expression(outputs.image)}{', volume=True' if volume else ''})"
+        return "\n".join(
+            [
+                "from pathlib import Path",
+                "",
+                *sorted(imports),
+                "",
+                f"request = {expression(request)}",
+                "job = request.prepare()",
+                "result = request.solve(job)",
+                f"{write}({named}, result, job)",
+                "",
+            ]
+        )
+
+    # While it runs -------------------------------------------------------------------------------
+    def set_running(self, running: bool) -> None:
+        """Let it be started, or stopped."""
+        self.start.setEnabled(not running)
+        self.stop.setEnabled(running)
+        if not running:
+            self.progress.setValue(0)
+
+    def show_progress(self, share: float, note: str) -> None:
+        """Show how much is done, 0 to 1, and a few words."""
+        self.progress.setValue(round(1000 * share))
+        self.note.setText(note)
+
+    # Inside --------------------------------------------------------------------------------------
+    @property
+    def _is_one_shot(self) -> bool:
+        return self.kind.currentText() != VOLUME and self.method.currentText() == "wiener"
+
+    def _entries(self) -> list[Entry]:
+        return [
+            self.image,
+            self.psfs,
+            self.z_mm,
+            self.iterations,
+            self.time_s,
+            self.tau,
+            self.noise,
+            self.dark,
+            self.crop,
+            self.binning,
+            self.erasures,
+            self.out,
+        ]
+
+    def _understand_out(self, text: str) -> Outputs:
+        if not text:
+            raise BenchError("The result needs a name that ends in .tif (volumes: or .ome.zarr).")
+        return Outputs.named(Path(text).expanduser(), volume=self.kind.currentText() == VOLUME)
+
+    def _kind_changed(self, _text: str = "") -> None:
+        kind = self.kind.currentText()
+        volume = kind == VOLUME
+        self._psfs_row._browse = "open" if kind == PSF else "folder"
+        self.psfs.setToolTip(
+            {
+                CALIBRATION: "A calibration's folder, or a run that holds one",
+                PSF: "An image of the PSF, from the photograph's camera",
+                VOLUME: "A calibration, a stack or a folder of PSFs, one a depth",
+            }[kind]
+        )
+        self.prior.clear()
+        self.prior.addItems([_AUTOMATIC, *(VOLUME_PRIORS if volume else PRIORS)])
+        count = VOLUME_ITERATIONS if volume else PICTURE_ITERATIONS
+        self.iterations.setPlaceholderText(f"at most {count}; none with a time")
+        for widget, shown in (
+            (self.method, not volume),
+            (self.z_mm, not volume),
+            (self.background, volume),
+        ):
+            self._rows.setRowVisible(widget, shown)
+        self._method_changed()
+
+    def _method_changed(self, _text: str = "") -> None:
+        for entry in (self.iterations, self.time_s):
+            entry.setEnabled(not self._is_one_shot)
+
+    def _start(self) -> None:
+        """Refuse the first field that is not understood, else ask for the work."""
+        for entry in self._entries():
+            if self._applies(entry) and not entry.check():
+                entry.setFocus()
+                return
+        self.asked.emit()
+
+    def _applies(self, entry: Any) -> bool:
+        return bool(entry.isEnabled()) and not (entry is self.z_mm and self.kind.currentText() == VOLUME)

@@ -1,0 +1,245 @@
+"""Reconstructions by mouse and keys: the form, the work, the viewers, export, and the lines of Python."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from gui.panels.reconstructions import ReconstructionsPanel
+from gui.session import BenchSession
+from gui.views.reconstruct_form import PSF, VOLUME
+from instrument.images import read_image, write_image
+from instrument.stored_result import open_result
+
+WAIT_MS = 20_000
+SIZE, DEPTHS = 32, 4
+
+
+def psf(z: int) -> np.ndarray:
+    """Spots of random lenslets, further apart the nearer the plane."""
+    lenses = np.random.default_rng(0).uniform(-9, 9, (12, 2))
+    image = np.zeros((SIZE, SIZE), np.float32)
+    rows, columns = np.round(lenses * (1 + 0.15 * z) + SIZE // 2).astype(int).T
+    np.add.at(image, (rows, columns), 200)
+    return image
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    folder = tmp_path / "input"
+    (folder / "psfs").mkdir(parents=True)
+    for z in range(DEPTHS):
+        tifffile.imwrite(folder / "psfs" / f"psf{z}.tif", psf(z))
+    photograph = 3 * np.roll(psf(2), (4, -3), (0, 1)) + 100
+    photograph += np.random.default_rng(1).normal(0, 2, photograph.shape)
+    tifffile.imwrite(folder / "photo.tif", photograph.astype(np.uint16))
+    write_image(folder / "psf.tif", (psf(2) + 100).astype(np.uint16))
+    return folder
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
+    session: BenchSession = make_session()  # its devices stay closed: none is needed
+    panel = ReconstructionsPanel(session)
+    panel.resize(1000, 700)
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    return panel
+
+
+def fill(panel: ReconstructionsPanel, kind: str, files: Path, psfs: str) -> None:
+    form = panel.form
+    panel.tabs.setCurrentWidget(form)
+    form.kind.setCurrentText(kind)
+    for field, text in (
+        (form.image, files / "photo.tif"),
+        (form.psfs, files / psfs),
+        (form.iterations, "5"),
+        (form.dark, "100"),
+    ):
+        field.setText(str(text))
+        field.editingFinished.emit()
+
+
+def run(qtbot: QtBot, panel: ReconstructionsPanel) -> None:
+    qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
+    assert panel.job is not None, panel._note.text()
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+
+
+def test_a_picture_by_mouse_is_written_and_shown(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    run(qtbot, panel)
+    written = panel.session.runs_folder / "reconstructions" / "photo.tif"
+    assert panel.result.path == written
+    assert panel.viewers.currentWidget() is panel.picture
+    np.testing.assert_array_equal(panel.picture.picture, read_image(written).pixels)
+    assert json.loads(written.with_suffix(".json").read_text())["iterations"] == 5
+    assert "Photograph" in panel.facts.toPlainText()
+    assert "residual / noise" in panel.convergence.curves
+    assert "change" in panel.convergence.curves
+    qtbot.waitUntil(lambda: panel.list.count() == 1, timeout=WAIT_MS)
+    # The next one does not fall on top of it.
+    assert panel.form.out.text().endswith("photo-2.tif")
+
+
+def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
+    fill(panel, VOLUME, files, "psfs")
+    panel.form.prior.setCurrentText("l1")
+    run(qtbot, panel)
+    view = panel.volume
+    assert panel.viewers.currentWidget() is view
+    qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
+    voxels = tifffile.imread(panel.result.path)
+    np.testing.assert_array_equal(view.projections.front, voxels.max(axis=0))
+    brightest = np.unravel_index(voxels.argmax(), voxels.shape)
+    qtbot.mouseClick(view.slices_button, Qt.MouseButton.LeftButton)
+    view.front.clicked.emit(int(brightest[2]), int(brightest[1]))
+    view.slider.setFocus()
+    view.slider.setValue(0)
+    for _ in range(int(brightest[0])):
+        qtbot.keyClick(view.slider, Qt.Key.Key_Right)
+    assert view.point == tuple(brightest)
+    qtbot.waitUntil(
+        lambda: {a: s.index for a, s in view.slices.items()} == dict(zip("zyx", brightest, strict=True)),
+        timeout=WAIT_MS,
+    )
+    np.testing.assert_array_equal(view.slices["z"].pixels, voxels[brightest[0]])
+    np.testing.assert_array_equal(view.slices["y"].pixels, voxels[:, brightest[1]])
+    np.testing.assert_array_equal(view.slices["x"].pixels, voxels[:, :, brightest[2]])
+    assert "one PSF a depth" in panel.facts.toPlainText()
+
+
+def test_stopping_keeps_what_there_is(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    panel.form.iterations.setText("1000000")
+    panel.form.prior.setCurrentText("tv-haar")
+    panel.form.method.setCurrentText("fista")
+    qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
+    with qtbot.waitSignal(panel.job.progressed, timeout=WAIT_MS):
+        pass
+    qtbot.mouseClick(panel.form.stop, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    record = json.loads(panel.result.path.with_suffix(".json").read_text())
+    assert record["stop_reason"] in ("cancelled", "the change per iteration fell below the tolerance")
+    assert not panel.form.stop.isEnabled()
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "reason"),
+    [
+        ("image", "absent.tif", "no such file"),
+        ("iterations", "0", "above 0"),
+        ("iterations", "2.5", "whole number"),
+        ("tau", "-1", "0 or more"),
+        ("binning", "many", "--bin"),
+        ("crop", "12", "--crop"),
+        ("noise", "loud", "--noise"),
+        ("dark", "nan", "finite"),
+        ("out", "result.jpg", ".tif"),
+    ],
+)
+def test_a_wrong_entry_is_refused_at_its_field(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, field, text, reason
+) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    entry = getattr(panel.form, field)
+    entry.setFocus()
+    entry.clear()
+    qtbot.keyClicks(entry, text)
+    qtbot.keyClick(entry, Qt.Key.Key_Return)
+    assert entry.property("refused")
+    assert reason in entry.toolTip()
+    assert reason in panel._note.toolTip()
+    qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
+    assert panel.job is None
+
+
+def test_a_mistake_that_only_the_work_finds_is_told(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
+    write_image(files / "small.tif", np.arange(100, dtype=np.uint16).reshape(10, 10))
+    fill(panel, PSF, files, "small.tif")
+    qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "both must have one shape" in panel._note.toolTip(), timeout=WAIT_MS)
+    assert panel.form.start.isEnabled()
+
+
+@pytest.mark.parametrize("kind", [PSF, VOLUME])
+def test_the_copied_lines_make_the_same_result(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path, kind
+) -> None:
+    fill(panel, kind, files, "psf.tif" if kind == PSF else "psfs")
+    panel.form.crop.setText("28x30")
+    panel.form.noise.setText("2,0.5")
+    panel.form.out.setText(str(tmp_path / "by-script.tif"))
+    qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
+    exec(QApplication.clipboard().text(), {})
+    panel.form.out.setText(str(tmp_path / "by-mouse.tif"))
+    run(qtbot, panel)
+    np.testing.assert_allclose(
+        tifffile.imread(tmp_path / "by-script.tif"), tifffile.imread(tmp_path / "by-mouse.tif"), rtol=1e-4
+    )
+    panel.tabs.setCurrentIndex(0)
+    names: dict = {}
+    exec(panel.as_python(), names)
+    assert names["result"].path == tmp_path / "by-mouse.tif"
+    names["result"].close()
+
+
+def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
+    picture = np.random.default_rng(0).random((20, 30), np.float32)
+    write_image(tmp_path / "p.tif", picture)
+    voxels = np.random.default_rng(0).random((4, 20, 30), np.float32)
+    np.save(tmp_path / "v.npy", voxels)
+
+    def export(name: str) -> None:
+        job = panel.export_to(tmp_path / name)
+        with qtbot.waitSignal(job.succeeded, timeout=WAIT_MS):
+            pass
+
+    panel.open(tmp_path / "p.tif")
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    qtbot.mouseClick(panel.picture.turn, Qt.MouseButton.LeftButton)
+    export("out.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.rot90(picture))
+    export("out.png")
+    assert read_image(tmp_path / "out.png").pixels.shape == (30, 20, 3)
+    panel.open(tmp_path / "v.npy")
+    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
+    export("out.tif")
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), voxels)
+    export("out.ome.zarr")
+    copy = open_result(tmp_path / "out.ome.zarr")
+    np.testing.assert_array_equal(copy.volume.plane(2), voxels[2])
+    export("view.png")
+    names = sorted(p.name for p in tmp_path.glob("view-*.png"))
+    assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
+    job = panel.export_to(tmp_path / "out.tif")
+    with qtbot.waitSignal(job.failed, timeout=WAIT_MS):
+        pass
+    assert "exists already" in panel._note.toolTip()
+
+
+def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
+    write_image(tmp_path / "p.tif", np.linspace(0, 10, 400, dtype=np.float32).reshape(20, 20))
+    panel.open(tmp_path / "p.tif")
+    qtbot.waitUntil(lambda: panel.result is not None, timeout=WAIT_MS)
+    bar = panel.picture.levels
+    assert bar.levels == (0.0, pytest.approx(10, rel=0.01))
+    bar.high.selectAll()
+    qtbot.keyClicks(bar.high, "5")
+    qtbot.keyClick(bar.high, Qt.Key.Key_Return)
+    assert bar.levels == (0.0, 5.0)
+    bar.low.selectAll()
+    qtbot.keyClicks(bar.low, "7")
+    qtbot.keyClick(bar.low, Qt.Key.Key_Return)
+    assert bar.levels == (0.0, 5.0)
+    assert bar.low.property("refused")
+    qtbot.mouseClick(bar.auto, Qt.MouseButton.LeftButton)
+    assert bar.levels[1] == pytest.approx(10, rel=0.01)
