@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from calibration_routines.display_io import DisplayBench
-from calibration_routines.spot_camera import SpotCamera
+from calibration_routines.spot_camera import SpotCamera, SpotLook
 from instrument.errors import BenchError
 from recon.holography import Display
 from recon.holography.pose_fit import PoseProbe
@@ -77,6 +77,8 @@ class AlignmentSession:
     settings : AlignmentSettings
     progress : callable, optional
         ``progress(words, frames_taken)``.
+    on_look : callable, optional
+        Called with every picture of spots.
     """
 
     def __init__(
@@ -85,11 +87,12 @@ class AlignmentSession:
         display: Display,
         settings: AlignmentSettings,
         progress: Progress | None = None,
+        on_look: Callable[[SpotLook], object] | None = None,
     ) -> None:
         self.io = io
         self.display = replace(display, displacement=None)
         self.settings = settings
-        self.spots = SpotCamera(io, self.display, before_frame=self._enough)
+        self.spots = SpotCamera(io, self.display, before_frame=self._enough, on_look=on_look)
         self.probe = PoseProbe(self.spots.maker)
         self.log: list[str] = []
         self.efficiencies: list[tuple[int, float]] = []

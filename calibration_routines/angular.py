@@ -22,7 +22,7 @@ from calibration_routines.angular_response import AngularResponse, Curve, save_r
 from calibration_routines.axial_analysis import DarkModel, replace_hot
 from calibration_routines.axial_exposure import SweepExposures, expose_sweep
 from calibration_routines.drift import Drift, judge_drift
-from calibration_routines.errors import CalibrationError
+from calibration_routines.errors import CalibrationError, RunEndedError
 from calibration_routines.sweep_plan import (
     DARK,
     PSF,
@@ -34,7 +34,8 @@ from calibration_routines.sweep_plan import (
 )
 from instrument.acquire import acquire
 from instrument.bench import Bench
-from instrument.errors import BenchError
+from instrument.errors import BenchError, SettingsError
+from instrument.run_control import RunControl
 from instrument.runner import Progress
 from instrument.store import Run, RunCondition
 from recon.registration import Registration, aligned, expected_shift, register
@@ -79,22 +80,34 @@ class AngularSweep:
     def __post_init__(self) -> None:
         problems = []
         if not 0 < self.z_um < np.inf:
-            problems.append(
+            words = (
                 f"the source stands in front of the diffuser, at a finite z > 0, not {self.z_um / 1e3:g} mm"
             )
+            problems.append(("z_um", words))
         if not 0 < self.step_deg <= self.largest_deg < 80:
             problems.append(
-                f"0 < step <= largest angle < 80 degrees, not {self.step_deg:g} and {self.largest_deg:g}"
+                (
+                    "step_deg" if 0 < self.largest_deg < 80 else "largest_deg",
+                    f"0 < step <= largest angle < 80 degrees, not {self.step_deg:g} and {self.largest_deg:g}",
+                )
             )
         elif self.largest_deg / self.step_deg > MOST_STEPS:
             problems.append(
-                f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than {MOST_STEPS}: "
-                "choose larger steps"
+                (
+                    "step_deg",
+                    f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than "
+                    f"{MOST_STEPS}: choose larger steps",
+                )
             )
         if self.emission not in _POWER:
-            problems.append(f"emission is pinhole or bead, not {self.emission!r}")
+            problems.append(("emission", f"emission is pinhole or bead, not {self.emission!r}"))
+        problems += [
+            (name, f"{name} must be at least 1, not {getattr(self, name)}")
+            for name in ("average", "dark_frames")
+            if getattr(self, name) < 1
+        ]
         if problems:
-            raise BenchError("; ".join(problems) + ".")
+            raise SettingsError(problems)
 
     @property
     def angles_deg(self) -> tuple[float, ...]:
@@ -148,6 +161,7 @@ def measure_angular_response(
     *,
     on_progress: Progress | None = None,
     on_exposures: Callable[[SweepExposures], None] | None = None,
+    control: RunControl | None = None,
 ) -> tuple[AngularResponse, Path]:
     """Move the source, measure the response, save it in the run's folder as ``angular_response.json``.
 
@@ -159,6 +173,8 @@ def measure_angular_response(
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     on_progress, on_exposures : callable, optional
+    control : RunControl, optional
+        To pause, abort or stop the run from another thread.
 
     Returns
     -------
@@ -181,12 +197,13 @@ def measure_angular_response(
             "[geometry] of bench.toml."
         )
     check_sweep(bench, points, where)
-    exposures = expose_sweep(bench, points)
+    exposures = expose_sweep(bench, points, control=control)
     if on_exposures is not None:
         on_exposures(exposures)
-    run = acquire(bench, sweep_plan(points, exposures.exposures_ms), where, on_progress=on_progress)
+    plan = sweep_plan(points, exposures.exposures_ms)
+    run = acquire(bench, plan, where, on_progress=on_progress, control=control)
     if run.condition is not RunCondition.COMPLETED:
-        raise CalibrationError(f"The run ended early ({run.condition}); what was taken is in {run.path}.")
+        raise RunEndedError("The run", run)
     drift = _drift(run, points)
     images = _images(run, points, drift)
     response = analyse_angular(

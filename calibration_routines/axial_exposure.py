@@ -10,6 +10,7 @@ from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, au
 from calibration_routines.errors import CalibrationError, TooDarkError
 from calibration_routines.sweep_plan import Position, Sweep, axis_point, depths_um
 from instrument.bench import Bench
+from instrument.run_control import RunControl
 
 _MOST_BOOST = 10.0  # exposure off the axis over that on it: beyond, a wrong guess would cost too much time
 _CAUTION = 0.7  # of the logarithm: farther out than was asked, a brighter spot may lie on the sensor
@@ -37,7 +38,7 @@ class SweepExposures:
         )
 
 
-def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
+def expose_sweep(bench: Bench, sweep: Sweep, *, control: RunControl | None = None) -> SweepExposures:
     """Find the exposure of every point: asked at up to three depths, interpolated between them.
 
     Light through the aperture falls off as a power of distance, so exposure against z is nearly a straight
@@ -48,6 +49,8 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
     ------
     CalibrationError
         When a PSF saturates at the shortest exposure, stays too dark at the longest, or flickers.
+    EndedEarlyError
+        When it was ended through ``control``.
     """
     depths = depths_um(sweep)
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
@@ -56,11 +59,13 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
     try:
         bench.scene_off()
         for z_um in asked:
+            if control is not None:
+                control.check()
             axis = axis_point(sweep, z_um)
             if not sweep.by_hand:
                 bench.place_source(*axis)
             found.append((z_um, expose_source(bench, target=sweep.target)))
-            slopes.append(_slope(bench, sweep, axis, found[-1][1].exposure_ms))
+            slopes.append(_slope(bench, sweep, axis, found[-1][1].exposure_ms, control))
     finally:
         bench.source_off()
     longest = bench.camera.exposure_limits_ms[1]
@@ -74,9 +79,13 @@ def expose_sweep(bench: Bench, sweep: Sweep) -> SweepExposures:
     return SweepExposures(tuple(exposures), tuple(found))
 
 
-def _slope(bench: Bench, sweep: Sweep, axis: Position, on_axis_ms: float) -> float:
+def _slope(
+    bench: Bench, sweep: Sweep, axis: Position, on_axis_ms: float, control: RunControl | None
+) -> float:
     """Return how the logarithm of the exposure grows with the squared tangent; 0 where no place tells."""
     for beside in _beside(sweep, axis):
+        if control is not None:
+            control.check()
         bench.place_source(*beside)
         try:
             dimmer = expose_source(bench, target=sweep.target)

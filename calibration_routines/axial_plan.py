@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from calibration_routines.sweep_plan import Position, settings_problems
-from instrument.errors import BenchError
+from instrument.errors import BenchError, SettingsError
 from instrument.plan import Span
 from recon.types import Geometry
 
@@ -64,26 +64,28 @@ class AxialSweep:
     kind: ClassVar[str] = "axial"
 
     def __post_init__(self) -> None:
-        problems: list[str] = []
+        problems: list[tuple[str, str]] = []
         if not 0 < self.z_min_um <= self.z_max_um < np.inf:
-            problems.append(
+            words = (
                 f"planes must lie in front of the diffuser, nearest first: 0 < z min <= z max, "
                 f"not {self.z_min_um / 1e3:g} and {self.z_max_um / 1e3:g} mm"
             )
+            problems.append(("z_max_um" if 0 < self.z_min_um < np.inf else "z_min_um", words))
         elif self.planes < 1 or (self.planes == 1) != (self.z_min_um == self.z_max_um):
-            problems.append(
+            words = (
                 f"the number of planes is {self.planes}: one plane needs z min = z max, "
                 "more need z min < z max"
             )
+            problems.append(("planes", words))
         if not np.isfinite((self.x_um, self.y_um)).all():
-            problems.append(
-                f"x and y must be finite numbers, not {self.x_um / 1e3:g} and {self.y_um / 1e3:g} mm"
-            )
+            words = f"x and y must be finite numbers, not {self.x_um / 1e3:g} and {self.y_um / 1e3:g} mm"
+            problems.append(("y_um" if np.isfinite(self.x_um) else "x_um", words))
         if self.by_hand and self.planes > 1:
-            problems.append(f"{self.planes} planes need a stage; by hand one PSF is taken at a time")
+            words = f"{self.planes} planes need a stage; by hand one PSF is taken at a time"
+            problems.append(("by_hand", words))
         problems += settings_problems(self)
         if problems:
-            raise BenchError("; ".join(problems) + ".")
+            raise SettingsError(problems)
 
     @property
     def z_um(self) -> tuple[float, ...]:

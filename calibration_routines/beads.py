@@ -16,7 +16,9 @@ from calibration_routines.axial_analysis import binned
 from calibration_routines.errors import CalibrationError
 from calibration_routines.photograph import expose_scene, photograph
 from instrument.bench import Bench
-from instrument.errors import BenchError, OperatorNeededError
+from instrument.errors import BenchError, OperatorNeededError, SettingsError
+from instrument.run_control import RunControl
+from instrument.runner import Progress as RunProgress
 from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
 from recon.types import Calibration, Geometry
 
@@ -60,12 +62,15 @@ class BeadSlides:
     solver: BlindSettings = field(default_factory=BlindSettings)
 
     def __post_init__(self) -> None:
+        problems = []
         if not 0 < self.z_um < np.inf:
-            raise BenchError(
-                f"The slide lies in front of the diffuser: z above 0, not {self.z_um / 1e3:g} mm."
+            problems.append(
+                ("z_um", f"the slide lies in front of the diffuser: z above 0, not {self.z_um / 1e3:g} mm")
             )
         if self.images < 2:
-            raise BenchError(f"{self.images} photograph: at least 2 are needed, 9 are usual.")
+            problems.append(("images", f"{self.images} photograph: at least 2 are needed, 9 are usual"))
+        if problems:
+            raise SettingsError(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +88,13 @@ def photograph_slides(
     *,
     ask: Ask | None = None,
     progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
+    control: RunControl | None = None,
 ) -> Floats:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
+
+    ``progress`` is called with words and the share done before each photograph, ``on_progress`` with the
+    run's status after each of its frames; ``control`` pauses, aborts or stops from another thread.
 
     Returns
     -------
@@ -107,6 +117,8 @@ def photograph_slides(
     exposure_ms: float | None = None
     images = []
     for number in range(slides.images):
+        if control is not None:
+            control.check()
         if progress is not None:
             progress(f"photograph {number + 1}", number / slides.images)
         if changer is not None:
@@ -117,7 +129,14 @@ def photograph_slides(
             # Slides differ in brightness where beads overlap: leave room.
             exposure_ms = expose_scene(bench, target=0.5).exposure_ms
         taken = photograph(
-            bench, exposure_ms, folder, average=slides.average, dark_frames=4, binning=slides.binning
+            bench,
+            exposure_ms,
+            folder,
+            average=slides.average,
+            dark_frames=4,
+            binning=slides.binning,
+            on_progress=on_progress,
+            control=control,
         )
         if taken.saturated_pixels > 0:
             raise CalibrationError(

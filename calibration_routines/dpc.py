@@ -18,13 +18,14 @@ import numpy.typing as npt
 
 from calibration_routines.auto_exposure import AutoExposure, auto_expose, hot_pixels
 from calibration_routines.axial_analysis import DarkModel, replace_hot
-from calibration_routines.errors import CalibrationError
+from calibration_routines.errors import CalibrationError, RunEndedError
 from drivers.led_array import LedArray
 from instrument.acquire import abilities_of, acquire
 from instrument.atomic import whole_file, write_text
 from instrument.bench import Bench
-from instrument.errors import BenchError
+from instrument.errors import BenchError, SettingsError
 from instrument.plan import OFF, Light, Part, Plan, check
+from instrument.run_control import RunControl
 from instrument.runner import Progress
 from instrument.store import Run, RunCondition
 from recon.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
@@ -68,17 +69,20 @@ class DpcSetup:
     def __post_init__(self) -> None:
         problems = []
         if not 0 < self.objective_na < 0.95:
-            problems.append(f"the objective's NA lies between 0 and 0.95, not {self.objective_na:g}")
+            problems.append(
+                ("objective_na", f"the objective's NA lies between 0 and 0.95, not {self.objective_na:g}")
+            )
         if not self.magnification > 0:
-            problems.append(f"the magnification is above 0, not {self.magnification:g}")
+            problems.append(("magnification", f"the magnification is above 0, not {self.magnification:g}"))
         if not 1 < self.index < 4:
-            problems.append(f"the index lies between 1 and 4, not {self.index:g}")
+            problems.append(("index", f"the index lies between 1 and 4, not {self.index:g}"))
         if self.band not in BANDS:
-            problems.append(f"the LEDs are red, green or blue, not {self.band!r}")
+            problems.append(("band", f"the LEDs are red, green or blue, not {self.band!r}"))
         if min(self.average, self.dark_frames) < 1:
-            problems.append("average and dark frames are at least 1")
+            name = "average" if self.average < 1 else "dark_frames"
+            problems.append((name, "average and dark frames are at least 1"))
         if problems:
-            raise BenchError("; ".join(problems) + ".")
+            raise SettingsError(problems)
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,7 @@ def measure_diffuser(
     folder: Path | str | None = None,
     *,
     on_progress: Progress | None = None,
+    control: RunControl | None = None,
 ) -> tuple[DiffuserSurface, Path]:
     """Photograph the four halves and compute the surface; saved in the run's folder.
 
@@ -176,9 +181,10 @@ def measure_diffuser(
     optics = dpc_optics(bench, setup)
     check(dpc_plan(array, setup, bench.camera.exposure_ms), abilities_of(bench, where))
     exposure = _expose(bench, array, setup)
-    run = acquire(bench, dpc_plan(array, setup, exposure.exposure_ms), where, on_progress=on_progress)
+    plan = dpc_plan(array, setup, exposure.exposure_ms)
+    run = acquire(bench, plan, where, on_progress=on_progress, control=control)
     if run.condition is not RunCondition.COMPLETED:
-        raise CalibrationError(f"The run ended early ({run.condition}); what was taken is in {run.path}.")
+        raise RunEndedError("The run", run)
     phase = phase_from_halves(_halves(run), optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (setup.index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)

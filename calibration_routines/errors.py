@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from instrument.errors import BenchError
+from instrument.store import Run
 
 
 class CalibrationError(BenchError):
@@ -13,3 +14,23 @@ class CalibrationError(BenchError):
 
 class TooDarkError(CalibrationError):
     """Hardly any light reaches the camera, even at its longest exposure."""
+
+
+class RunEndedError(CalibrationError):
+    """The run behind a calibration was ended before its last frame; its frames are kept.
+
+    Parameters
+    ----------
+    what : str
+        Begins the sentence: ``"The sweep"``.
+    run : Run
+    remedy : str
+        What to do about it.
+    """
+
+    def __init__(self, what: str, run: Run, remedy: str = "") -> None:
+        self.run = run
+        super().__init__(
+            f"{what} ended early ({run.condition}); what was taken is in {run.path}."
+            + (f" {remedy}" if remedy else "")
+        )

@@ -17,6 +17,7 @@ nothing moves at first: each picture holds many spots, each computed for another
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +35,7 @@ from calibration_routines.mask_refinement import Measured, measure_sections, ref
 from calibration_routines.mask_search import search_pose
 from calibration_routines.mask_stage import MaskStage
 from calibration_routines.placement_cost import PlacementCost
+from calibration_routines.spot_camera import SpotLook
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
@@ -107,7 +109,9 @@ class MaskAlignment:
         What is known of the display; its displacement is not used.
     settings : AlignmentSettings
     progress : callable, optional
-        ``progress(words, frames_taken)``.
+        ``progress(words, frames_taken)``; may raise to end the alignment.
+    on_look : callable, optional
+        Called with every picture of spots.
     """
 
     def __init__(
@@ -117,10 +121,11 @@ class MaskAlignment:
         settings: AlignmentSettings | None = None,
         *,
         progress: Progress | None = None,
+        on_look: Callable[[SpotLook], object] | None = None,
     ) -> None:
         self.io = io
         self.settings = settings or AlignmentSettings()
-        self.session = AlignmentSession(io, display, self.settings, progress)
+        self.session = AlignmentSession(io, display, self.settings, progress, on_look)
         self._cost = PlacementCost(self.session.display)
         self._repeatability_db = float("nan")
         self._directions: dict[str, int] = {}

@@ -11,10 +11,11 @@ import numpy.typing as npt
 from calibration_routines.auto_exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
 from calibration_routines.axial_analysis import DarkModel, channels_first, replace_hot
 from calibration_routines.background import block_mean
-from calibration_routines.errors import CalibrationError
+from calibration_routines.errors import CalibrationError, RunEndedError
 from instrument.acquire import acquire
 from instrument.bench import Bench
 from instrument.plan import OFF, Part, Plan
+from instrument.run_control import RunControl
 from instrument.runner import Progress
 from instrument.store import Run, RunCondition
 
@@ -74,6 +75,7 @@ def photograph(
     dark_frames: int = 4,
     binning: int = 1,
     on_progress: Progress | None = None,
+    control: RunControl | None = None,
 ) -> Photograph:
     """Photograph the scene into a run; ends with everything dark.
 
@@ -90,6 +92,8 @@ def photograph(
     binning : int
         Software binning, on top of the camera's; the same as the calibration's.
     on_progress : callable, optional
+    control : RunControl, optional
+        To pause, abort or stop the run from another thread.
 
     Raises
     ------
@@ -107,9 +111,9 @@ def photograph(
             Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=dark_frames),
         ),
     )
-    run = acquire(bench, plan, folder, on_progress=on_progress)
+    run = acquire(bench, plan, folder, on_progress=on_progress, control=control)
     if run.condition is not RunCondition.COMPLETED:
-        raise CalibrationError(f"The run ended early ({run.condition}); what was taken is in {run.path}.")
+        raise RunEndedError("The run", run)
     frames = run.images("scene")
     full_scale = (1 << run.metadata(0).significant_bits) - 1
     dark = DarkModel((exposure_ms,), (run.images("dark"),), full_scale)

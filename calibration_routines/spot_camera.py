@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import ceil
 from typing import Any
 
@@ -20,6 +21,29 @@ from recon.holography.spots import Spot, SpotMaker, spread_spots
 Array = npt.NDArray[Any]
 
 
+@dataclass(frozen=True, slots=True)
+class SpotLook:
+    """One picture of spots: each a hypothesis, and how bright it turned out.
+
+    Attributes
+    ----------
+    frame : ndarray, float64, (height, width)
+        Camera counts a millisecond, background subtracted.
+    rows, columns : ndarray, float64, (n,)
+        Where the spots are looked for, camera pixels.
+    spots : tuple of Spot
+        Places in the field of view, and the poses they were computed for.
+    brightness : ndarray, float64, (n,)
+        In units of an ideal spot.
+    """
+
+    frame: Array
+    rows: Array
+    columns: Array
+    spots: tuple[Spot, ...]
+    brightness: Array
+
+
 class SpotCamera:
     """The bench as something that says how bright spots are.
 
@@ -32,18 +56,26 @@ class SpotCamera:
     display : Display
     before_frame : callable, optional
         Called before every photograph; raises to end the work.
+    on_look : callable, optional
+        Called with every picture of spots.
     """
 
     camera: CameraMap
     mean_per_ms: float
 
     def __init__(
-        self, io: DisplayBench, display: Display, *, before_frame: Callable[[], object] | None = None
+        self,
+        io: DisplayBench,
+        display: Display,
+        *,
+        before_frame: Callable[[], object] | None = None,
+        on_look: Callable[[SpotLook], object] | None = None,
     ) -> None:
         self.io = io
         self.display = display
         self.maker = SpotMaker(display)
         self._before_frame = before_frame
+        self._on_look = on_look
         self._seed = 0
         self._brightness_known = False
         camera = io.bench.camera
@@ -163,12 +195,14 @@ class SpotCamera:
         frame = self.io.photograph(0.66 * full / (max(peak, 30.0) * self.mean_per_ms))
         y = np.array([spot.row / shape[0] for spot in spots])
         x = np.array([spot.column / shape[1] for spot in spots])
-        found, around = _read_spots(frame / self.mean_per_ms, *self.camera.pixels(y, x), window)
+        rows, columns = self.camera.pixels(y, x)
+        found, around = _read_spots(frame / self.mean_per_ms, rows, columns, window)
         # From camera pixels to the brightness at the peak: a spot's area is one bin of the mask's spectrum.
         captured = self._captured(window, lobes)
-        return found / (self._spot_area() * captured * (np.sinc(y) * np.sinc(x)) ** 2), float(
-            np.median(around)
-        )
+        brightness = found / (self._spot_area() * captured * (np.sinc(y) * np.sinc(x)) ** 2)
+        if self._on_look is not None:
+            self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal))
+        return brightness, float(np.median(around))
 
     def _ask(self) -> None:
         if self._before_frame is not None:

@@ -27,7 +27,7 @@ from calibration_routines.axial_analysis import (
 )
 from calibration_routines.axial_exposure import SweepExposures, expose_sweep
 from calibration_routines.drift import Drift, judge_drift
-from calibration_routines.errors import CalibrationError
+from calibration_routines.errors import RunEndedError
 from calibration_routines.feature_size import optical_binning
 from calibration_routines.psf_quality import PsfQuality, place_of
 from calibration_routines.stage_fit import StageFit
@@ -62,6 +62,7 @@ from instrument.calibration_file import save_calibration
 from instrument.errors import BenchError
 from instrument.photograph import Snapshot
 from instrument.plan import Step
+from instrument.run_control import EndedEarlyError
 from instrument.runner import Progress, Runner
 from instrument.store import Run, RunCondition
 from recon.types import Calibration, Geometry
@@ -237,7 +238,7 @@ def _finished(
     """Make the calibration of a complete run; an interruption says that all frames of it are kept."""
     try:
         return _judged(run, record, bench, on_progress, on_analysis, on_runner)
-    except (KeyboardInterrupt, SystemExit) as interruption:
+    except (KeyboardInterrupt, SystemExit, EndedEarlyError) as interruption:
         interruption.add_note(
             f"All frames of the sweep are kept. For its calibration: diffuserbench resume {run.path}"
         )
@@ -339,10 +340,7 @@ def _stored(run: Run, index: int) -> Snapshot:
 
 def _complete(run: Run) -> Run:
     if run.condition is not RunCondition.COMPLETED:
-        raise CalibrationError(
-            f"The sweep ended early ({run.condition}); what was taken is in {run.path}. "
-            f"Go on with: diffuserbench resume {run.path}"
-        )
+        raise RunEndedError("The sweep", run, f"Go on with: diffuserbench resume {run.path}")
     return run
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
-from instrument.errors import BenchError
+from instrument.errors import SettingsError
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check
 
 Position = tuple[float, float, float]
@@ -86,21 +86,21 @@ class PointSweep:
     def __post_init__(self) -> None:
         problems = settings_problems(self)
         if not self.points_um:
-            problems.append("a sweep needs at least one point")
+            problems.append(("points_um", "a sweep needs at least one point"))
         if len(set(self.points_um)) != len(self.points_um):
-            problems.append("a point is listed twice")
+            problems.append(("points_um", "a point is listed twice"))
         if not np.isfinite(self.points_um).all():
-            problems.append("every coordinate of a point must be a finite number")
+            problems.append(("points_um", "every coordinate of a point must be a finite number"))
         if any(z <= 0 for _, _, z in self.points_um):
-            problems.append("every point must lie in front of the diffuser, z > 0")
+            problems.append(("points_um", "every point must lie in front of the diffuser, z > 0"))
         if problems:
-            raise BenchError("; ".join(problems) + ".")
+            raise SettingsError(problems)
 
 
-def settings_problems(sweep: Sweep) -> list[str]:
-    """Return what is wrong with a sweep's settings, in words."""
+def settings_problems(sweep: Sweep) -> list[tuple[str, str]]:
+    """Return what is wrong with a sweep's settings: their names, and words."""
     problems = [
-        f"{name} must be at least {least}, not {getattr(sweep, name)}"
+        (name, f"{name} must be at least {least}, not {getattr(sweep, name)}")
         for name, least in (
             ("average", 1),
             ("dark_frames", 1),
@@ -112,7 +112,9 @@ def settings_problems(sweep: Sweep) -> list[str]:
         if getattr(sweep, name) < least
     ]
     if not 0.05 <= sweep.target <= 0.9:
-        problems.append(f"target must lie between 0.05 and 0.9 of full scale, not {sweep.target:g}")
+        problems.append(
+            ("target", f"target must lie between 0.05 and 0.9 of full scale, not {sweep.target:g}")
+        )
     return problems
 
 
@@ -121,7 +123,7 @@ def check_image_settings(sweep: Sweep, frame_shape: Sequence[int]) -> None:
 
     Raises
     ------
-    BenchError
+    SettingsError
         Naming the largest values that fit.
     """
     height, width = frame_shape[:2]
@@ -129,18 +131,20 @@ def check_image_settings(sweep: Sweep, frame_shape: Sequence[int]) -> None:
     problems = []
     if min(height, width) // binning < LEAST_SIDE_PX:
         most = max(1, min(height, width) // LEAST_SIDE_PX)
-        problems.append(
+        words = (
             f"binning {binning} leaves {height // binning} x {width // binning} pixels of the camera's "
             f"{height} x {width}, fewer than {LEAST_SIDE_PX} on a side: choose {most} at most"
         )
+        problems.append(("binning", words))
     elif sweep.dct_order > min(height, width) // binning:
-        problems.append(
+        words = (
             f"{sweep.dct_order} DCT coefficients along each axis (dct) are more than the image's "
             f"{height // binning} x {width // binning} pixels have: choose "
             f"{min(height, width) // binning} at most; Kuo 2020, Sec. 6.4 removes 10"
         )
+        problems.append(("dct_order", words))
     if problems:
-        raise BenchError("; ".join(problems) + ".")
+        raise SettingsError(problems)
 
 
 def depths_um(sweep: Sweep) -> tuple[float, ...]:
@@ -208,7 +212,7 @@ def check_sweep(bench: Bench, sweep: Sweep, folder: Path | None = None) -> Plan:
     ------
     PlanError
         Naming every step that cannot be done.
-    BenchError
+    SettingsError
         When binning or DCT order do not fit the camera's frames.
     """
     check_image_settings(sweep, bench.camera.frame_shape)

@@ -9,6 +9,7 @@ from pathlib import Path
 from instrument.bench import Bench
 from instrument.camera_settings import camera_settings
 from instrument.plan import BenchAbilities, Plan, check
+from instrument.run_control import RunControl
 from instrument.runner import Progress, Runner
 from instrument.store import BenchRecord, Run, RunWriter
 
@@ -20,6 +21,7 @@ def acquire(
     *,
     on_progress: Progress | None = None,
     calibrations: Sequence[str] = (),
+    control: RunControl | None = None,
 ) -> Run:
     """Check a plan, carry it out and return the run.
 
@@ -34,6 +36,8 @@ def acquire(
         Called with a :class:`~instrument.runner.RunStatus` after every step.
     calibrations : sequence of str
         Identifiers of the calibrations in use, kept with the run.
+    control : RunControl, optional
+        To pause, abort or stop the run from another thread.
 
     Raises
     ------
@@ -42,7 +46,9 @@ def acquire(
     DeviceError, RunError
         When a device or the disk fails; the bench is safe and the run is marked as failed.
     """
-    return prepare(bench, plan, folder, on_progress=on_progress, calibrations=calibrations).execute()
+    return prepare(
+        bench, plan, folder, on_progress=on_progress, calibrations=calibrations, control=control
+    ).execute()
 
 
 def prepare(
@@ -52,14 +58,20 @@ def prepare(
     *,
     on_progress: Progress | None = None,
     calibrations: Sequence[str] = (),
+    control: RunControl | None = None,
 ) -> Runner:
     """Check a plan, make the run's folder and return the runner, for those who want to pause or stop it."""
+    if control is not None:
+        control.check()
     folder = Path(folder) if folder is not None else bench.config.data_folder
     check(plan, abilities_of(bench, folder))
     writer = RunWriter.create(
         folder, label=plan.label, bench=record_of(bench), plan=plan, calibrations=calibrations
     )
-    return Runner(bench, plan, writer, on_progress=on_progress)
+    runner = Runner(bench, plan, writer, on_progress=on_progress)
+    if control is not None:
+        control.follow(runner)
+    return runner
 
 
 def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:

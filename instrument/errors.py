@@ -43,6 +43,21 @@ class FileError(BenchError):
         super().__init__(f"{path}: {problem}" + (f" {remedy}" if remedy else ""))
 
 
+class SettingsError(BenchError):
+    """Settings that make no sense: every mistake at once, each with the name of its setting.
+
+    Parameters
+    ----------
+    problems : sequence of (str, str)
+        The setting's name as the code has it (``"z_min_um"``), and what is wrong in words, without a full
+        stop.
+    """
+
+    def __init__(self, problems: Sequence[tuple[str, str]]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("; ".join(text for _, text in self.problems) + ".")
+
+
 class OperatorNeededError(BenchError):
     """A step needs a person's hand (a lamp, a screen) and nobody can be asked."""
 

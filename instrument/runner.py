@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -66,6 +66,8 @@ class RunStatus:
         Of the newest frame.
     reason : FinishReason or None
         Why it ended, once it has.
+    newest : Snapshot or None
+        The photograph that was stored last.
     """
 
     state: RunState
@@ -78,6 +80,7 @@ class RunStatus:
     dropped: int = 0
     saturated_fraction: float = 0.0
     reason: FinishReason | None = None
+    newest: Snapshot | None = field(default=None, compare=False, repr=False)
 
 
 Progress = Callable[[RunStatus], None]
@@ -345,6 +348,7 @@ class Runner:
             seconds_left=seconds / done_here * (len(self._todo) - done_here),
             dropped=now.dropped + snapshot.metadata.dropped_before,
             saturated_fraction=snapshot.metadata.saturated_fraction,
+            newest=snapshot,
         )
 
     def _report(self, **changes: object) -> None:

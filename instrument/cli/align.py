@@ -5,19 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from calibration_routines.display_io import DisplayBench
-from calibration_routines.mask_alignment import AlignmentReport, AlignmentSettings, MaskAlignment
-from instrument.alignment_file import Alignment, save_alignment
-from instrument.bench import Bench
+from calibration_routines.display_procedures import AlignmentProcedure, refuse_existing
+from calibration_routines.mask_alignment import AlignmentSettings
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.cli.progress import progress_bar
-from instrument.display_setup import bench_display
-from instrument.errors import BenchError, FileError
-from instrument.slm_correction import load_slm_correction
-from recon.holography.pose import NAMES
+from instrument.cli.sweeping import Told
+from instrument.errors import BenchError
 
 app = command_app("Align the holographic display.")
 
@@ -59,89 +53,31 @@ def mask(
     distance, rotation and clear tilts until a move promises less than that. What stays is measured section
     by section. Give the file to hologram --alignment.
     """
-    division = _division(sections)
+    settings = AlignmentSettings(
+        reach=reach, depth_um=depth_um, moves=moves, max_frames=max_frames, division=_division(sections)
+    )
+    procedure = AlignmentProcedure(
+        settings=settings, slm_calibration=slm_calibration, out=out, overwrite=force
+    )
     figure = out.with_suffix(".png")
     for file in (out, figure):
-        if file.exists() and not force:
-            raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
-    correction = load_slm_correction(slm_calibration) if slm_calibration else None
+        refuse_existing(file, overwrite=force)
     with open_and_say(bench) as opened:
-        if opened.slm is None:
-            raise BenchError(f"{opened.label} has no [slm].")
-        stage = opened.stage
-        if stage is not None and moves and not stage.is_homed:
+        procedure.outlook(opened)
+        with _AlignmentTold() as told:
+            done = procedure.carry_out(opened, listener=told)
+    for line in (*done.verdict, f"Wrote {out}, {figure}"):
+        typer.echo(line)
+
+
+class _AlignmentTold(Told):
+    """Says on stderr that the stage is homed, which takes a while and moves it."""
+
+    def step(self, words: str) -> None:
+        """Begin a bar of its own."""
+        if words.startswith("homing"):
             typer.echo("Homing the stage.", err=True)
-            stage.home()
-        display = bench_display(opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um))
-        io = DisplayBench(opened, opened.config.display.slm_binning, correction)
-        settings = AlignmentSettings(
-            reach=reach, depth_um=depth_um, moves=moves, max_frames=max_frames, division=division
-        )
-        with progress_bar() as bar:
-            task = bar.add_task("align mask", total=max_frames, note="")
-            report = MaskAlignment(
-                io, display, settings, progress=lambda words, n: bar.update(task, completed=n, note=words)
-            ).run()
-        alignment = _alignment(report, opened, display.mask.shape)
-        facts = {
-            "bench": opened.label,
-            "frames": report.frames,
-            "found_at": dict(zip(NAMES, map(float, report.found_at.vector()), strict=True)),
-            "psnr_lost_db": report.psnr_lost_db,
-            "repeatability_db": None if np.isnan(report.repeatability_db) else report.repeatability_db,
-            "axis_directions": report.directions,
-            "camera_residual_px": report.camera.residual_px,
-            "log": report.log,
-        }
-        save_alignment(out, alignment, facts)
-        from instrument.alignment_figure import write_alignment_figure  # matplotlib, only where it is drawn
-
-        write_alignment_figure(
-            figure,
-            report.pose.displacement(display.mask.shape),
-            report.rest,
-            display.mask.shape,
-            report.efficiencies,
-            "Mask alignment",
-            simulated=alignment.simulated,
-        )
-    _tell(report, alignment)
-    typer.echo(f"Wrote {out}, {figure}")
-
-
-def _alignment(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, int]) -> Alignment:
-    return Alignment(
-        report.pose,
-        dict(zip(NAMES, map(float, report.error), strict=True)),
-        report.rest,
-        report.efficiency,
-        bench.stage.commanded_position() if bench.stage else {},
-        mask_shape,
-        bool(bench.simulated_kinds),
-    )
-
-
-def _tell(report: AlignmentReport, alignment: Alignment) -> None:
-    mark = " (SIMULATED)" if alignment.simulated else ""
-    typer.echo(
-        f"Aligned with {report.frames} frames{mark}: spots at {100 * report.efficiency:.0f} % of the ideal"
-    )
-    for name, value, error in zip(NAMES, report.pose.vector(), report.error, strict=True):
-        if name != "cubic":  # part of the smooth rest
-            typer.echo(f"  {name:<12}{value:+10.4f} +- {error:.4f}")
-    size = np.hypot(report.rest[..., 0], report.rest[..., 1])
-    typer.echo(f"  smooth rest {np.sqrt(np.mean(size**2)):.2f} mask pixels rms, {size.max():.2f} at most")
-    typer.echo(
-        f"  what remains costs a hologram about {report.psnr_lost_db:.2f} dB"
-        + (
-            ""
-            if np.isnan(report.repeatability_db)
-            else f"; stage repeatable to {report.repeatability_db:.2f} dB"
-        )
-    )
-    reversed_axes = [name for name, direction in report.directions.items() if direction < 0]
-    if reversed_axes:
-        typer.echo(f"  these axes go against their names: {', '.join(reversed_axes)}")
+        super().step(words)
 
 
 def _division(text: str) -> tuple[int, int]:

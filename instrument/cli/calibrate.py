@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from calibration_routines import AxialSweep, GridSweep, PointSweep, axial_planes, grid_sweep
-from calibration_routines.angular_response import load_response
-from instrument.bench import Bench
+from calibration_routines.sweep_request import AxialRequest, LateralRequest, VolumeRequest
 from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.numbers import finite, positive
-from instrument.cli.sweeping import take_sweep
+from instrument.cli.sweeping import say_and_take
 from instrument.errors import BenchError
-from instrument.plan import Span
-from recon.optics.fall_off import FallOff, gaussian_fall_off
 
 app = command_app("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
-_MAX_PLANES = 256
 
 ZMin = Annotated[
     float, typer.Option("--z-min", metavar="MM", callback=finite, help="Nearest plane, from the diffuser.")
@@ -156,16 +150,13 @@ def axial(
     Finds the exposures without saturating, takes dark frames, sweeps, judges every PSF in words, takes bad
     planes again, and saves the calibration in the run's folder. Ends with the light off.
     """
-    console = Console()
-    far = z_min if z_max is None else z_max
     with open_and_say(bench) as opened:
-        reasons: tuple[str, ...] = ()
-        if planes is None and z_min < far and z_min > 0:
-            planes, reasons = _planes(opened, z_min, far, lenslet, wavelength)
-        sweep = AxialSweep(
+        request = AxialRequest(
             z_min_um=1e3 * z_min,
-            z_max_um=1e3 * far,
-            planes=1 if planes is None else planes,
+            z_max_um=_micrometres(z_max),
+            planes=planes,
+            lenslet_um=lenslet,
+            wavelength_nm=wavelength,
             x_um=1e3 * x,
             y_um=1e3 * y,
             average=average,
@@ -176,7 +167,7 @@ def axial(
             by_hand=by_hand,
             reference_every=reference_every,
         )
-        take_sweep(console, opened, sweep, out, reasons=reasons, dry_run=dry_run)
+        say_and_take(Console(), opened, request, out, dry_run=dry_run)
 
 
 @app.command(
@@ -214,21 +205,24 @@ def lateral(
     auto. Each pattern's shift is measured and held against the stage; a reference point is visited again and
     again to tell whether the source drifts.
     """
-    blank = _point_sweep("lateral", average, dark_frames, target, dct, binning, reference_every)
-    half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
-    fall_off = _fall_off(response, fall_off_deg)
+    request = LateralRequest(
+        z_um=1e3 * z,
+        half_field_x_um=_micrometres(half_field_x),
+        half_field_y_um=_micrometres(half_field_y),
+        spacing_um=_micrometres(spacing),
+        response=response,
+        fall_off_deg=fall_off_deg,
+        x_um=1e3 * x,
+        y_um=1e3 * y,
+        average=average,
+        dark_frames=dark_frames,
+        target=target,
+        dct_order=dct,
+        binning=_binning(binning),
+        reference_every=reference_every,
+    )
     with open_and_say(bench) as opened:
-        grid = grid_sweep(
-            opened,
-            (1e3 * z,),
-            response=fall_off,
-            half_field_um=half_field,
-            spacing_um=spacing_um,
-            x_um=1e3 * x,
-            y_um=1e3 * y,
-        )
-        sweep = replace(blank, points_um=grid.points_um)
-        take_sweep(Console(), opened, sweep, out, reasons=_said(grid), dry_run=dry_run)
+        say_and_take(Console(), opened, request, out, dry_run=dry_run)
 
 
 @app.command(
@@ -265,90 +259,32 @@ def volume(
 
     As lateral, plane after plane. The number of planes and of points follows from the optics unless given.
     """
-    blank = _point_sweep("volume", average, dark_frames, target, dct, binning, reference_every)
-    half_field, spacing_um = _half_field(half_field_x, half_field_y), _micrometres(spacing)
-    fall_off = _fall_off(response, fall_off_deg)
-    with open_and_say(bench) as opened:
-        reasons: tuple[str, ...] = ()
-        if planes is None:
-            planes, reasons = _planes(opened, z_min, z_max, lenslet, wavelength)
-        if not (0 < z_min < z_max and planes >= 2):
-            raise BenchError(
-                f"A volume has two planes or more, 0 < z min < z max; not {planes} between {z_min:g} and "
-                f"{z_max:g} mm."
-            )
-        depths = Span(start=1e3 * z_min, stop=1e3 * z_max, number=planes, spacing="dioptric").values()
-        grid = grid_sweep(
-            opened,
-            depths,
-            response=fall_off,
-            half_field_um=half_field,
-            spacing_um=spacing_um,
-            x_um=1e3 * x,
-            y_um=1e3 * y,
-        )
-        sweep = replace(blank, points_um=grid.points_um)
-        take_sweep(Console(), opened, sweep, out, reasons=(*reasons, *_said(grid)), dry_run=dry_run)
-
-
-def _point_sweep(
-    kind: str, average: int, dark_frames: int, target: float, dct: int, binning: str, every: int
-) -> PointSweep:
-    """Return the settings of a sweep whose points are planned later: mistakes show before the bench opens."""
-    return PointSweep(
-        points_um=((0.0, 0.0, 1.0),),
-        kind=kind,
+    request = VolumeRequest(
+        z_min_um=1e3 * z_min,
+        z_max_um=1e3 * z_max,
+        planes=planes,
+        lenslet_um=lenslet,
+        wavelength_nm=wavelength,
+        half_field_x_um=_micrometres(half_field_x),
+        half_field_y_um=_micrometres(half_field_y),
+        spacing_um=_micrometres(spacing),
+        response=response,
+        fall_off_deg=fall_off_deg,
+        x_um=1e3 * x,
+        y_um=1e3 * y,
         average=average,
         dark_frames=dark_frames,
         target=target,
         dct_order=dct,
         binning=_binning(binning),
-        reference_every=every,
+        reference_every=reference_every,
     )
+    with open_and_say(bench) as opened:
+        say_and_take(Console(), opened, request, out, dry_run=dry_run)
 
 
-def _planes(
-    bench: Bench, z_min_mm: float, z_max_mm: float, lenslet_um: float | None, wavelength_nm: float | None
-) -> tuple[int, tuple[str, ...]]:
-    needed = axial_planes(
-        1e3 * z_min_mm, 1e3 * z_max_mm, bench.geometry, lenslet_um=lenslet_um, wavelength_nm=wavelength_nm
-    )
-    number = int(needed.value)
-    if number > _MAX_PLANES:
-        raise BenchError(
-            f"From {z_min_mm:g} to {z_max_mm:g} mm these optics need {number} planes, more than "
-            f"{_MAX_PLANES}. Narrow the range, or say --planes."
-        )
-    return number, (f"{needed.reason}. Choose another number with --planes.",)
-
-
-def _said(grid: GridSweep) -> tuple[str, ...]:
-    sizes = dict.fromkeys(f"{rows} x {columns}" for rows, columns in grid.shapes)
-    return (*grid.reasons, f"Grid: {' to '.join(sizes)} points (y x x) at each depth")
-
-
-def _fall_off(file: Path | None, sigma_deg: float | None) -> FallOff | None:
-    if file is not None and sigma_deg is not None:
-        raise BenchError("Give --response or --fall-off-deg, not both.")
-    if file is not None:
-        return load_response(file).fall_off()
-    if sigma_deg is None:
-        return None
-    if not 0 < sigma_deg < 90:
-        raise BenchError(f"--fall-off-deg must lie between 0 and 90 degrees, not {sigma_deg:g}.")
-    return gaussian_fall_off(sigma_deg)
-
-
-def _half_field(x_mm: float | None, y_mm: float | None) -> tuple[float, float] | None:
-    if x_mm is None and y_mm is None:
-        return None
-    if x_mm is None or y_mm is None:
-        raise BenchError("Give both --half-field-x and --half-field-y, or neither.")
-    return 1e3 * y_mm, 1e3 * x_mm
-
-
-def _micrometres(spacing_mm: float | None) -> float | None:
-    return None if spacing_mm is None else 1e3 * spacing_mm
+def _micrometres(length_mm: float | None) -> float | None:
+    return None if length_mm is None else 1e3 * length_mm
 
 
 def _binning(text: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +9,12 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines.angular import AngularSweep, Emission, farthest_um, measure_angular_response
-from calibration_routines.angular_response import CUT_OFF, AngularResponse
-from calibration_routines.calibration_figures import response_figure
-from calibration_routines.sweep_plan import check_sweep
-from instrument.acquire import abilities_of
+from calibration_routines import SweepExposures
+from calibration_routines.optics_procedures import AngularProcedure
+from calibration_routines.sweep_words import exposure_lines
 from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.numbers import finite
-from instrument.cli.progress import one_task
-from instrument.cli.sweeping import describe_exposures
-from instrument.errors import BenchError
-from instrument.figures import save_figure
-from instrument.plan import estimate
+from instrument.cli.sweeping import Told, print_lines
 
 EPILOG = examples(
     "diffuserbench calibrate angular --dry-run",
@@ -69,58 +62,41 @@ def angular(
     Writes angular_response.json (for calibrate lateral and volume) and a picture into the run's folder.
     """
     console = Console()
-    kind: Emission = "bead" if emission == "bead" else "pinhole"
-    if kind != emission:
-        raise BenchError(f"--emission is pinhole or bead, not {emission!r}.")
-    # Mistakes show before the bench opens; the distance may follow from its stage.
-    blank = AngularSweep(1.0 if z is None else 1e3 * z, largest, step, kind, average, dark_frames)
-    blank.points()
+    procedure = AngularProcedure(
+        z_um=None if z is None else 1e3 * z,
+        largest_deg=largest,
+        step_deg=step,
+        emission=emission,
+        average=average,
+        dark_frames=dark_frames,
+    )
     with open_and_say(bench) as opened:
-        z_um = farthest_um(opened, largest) if z is None else 1e3 * z
-        sweep = replace(blank, z_um=z_um)
-        points = sweep.points()
-        cost = estimate(check_sweep(opened, points, out), abilities_of(opened, out))
+        outlook = procedure.outlook(opened, out)
+        print_lines(console, outlook.reasons)
+        assert outlook.cost is not None  # of a plan
         console.print(
-            f"Plan: {len(points.points_um)} places at z = {z_um / 1e3:.4g} mm, up to +-{largest:g} degrees "
-            f"along x and y, {cost.frames} frames, {cost.seconds:.0f} s of exposure and motion. "
-            + ("" if z is not None else "The farthest from which the stage spans the angles."),
-            soft_wrap=True,
+            f"Plan: {outlook.cost.frames} frames, {outlook.cost.seconds:.0f} s of exposure and motion."
         )
         if dry_run:
             console.print("Dry run: nothing moved.")
             return
-        if opened.stage is not None:
-            with one_task("Homing the stage"):
-                opened.stage.home()
-        with one_task("Moving the source") as advance:
-            response, file = measure_angular_response(
-                opened,
-                sweep,
-                out,
-                on_progress=lambda status: advance(status.done, status.total),
-                on_exposures=lambda exposures: describe_exposures(console, exposures),
-            )
-    picture = file.with_suffix(".png")
-    save_figure(response_figure(response), picture)
-    _describe(console, response)
+        with _AngularTold(console) as told:
+            done = procedure.carry_out(opened, out, listener=told)
+    file, picture = done.files
+    print_lines(console, done.verdict)
     console.print(f"Response     {escape(str(file))}", soft_wrap=True)
     console.print(f"Picture      {escape(str(picture))}", soft_wrap=True)
 
 
-def _describe(console: Console, response: AngularResponse) -> None:
-    for name, curve in (("x", response.along_x), ("y", response.along_y)):
-        sides = curve.cut_offs_deg()
-        words = []
-        for sign, angle in zip("-+", sides, strict=True):
-            end = curve.angles_deg[0 if sign == "-" else -1]
-            value = curve.response[0 if sign == "-" else -1]
-            words.append(
-                f"{sign}{angle:.1f} degrees"
-                if angle is not None
-                else f"not reached on the {sign} side ({value:.0%} at {end:+.1f} degrees)"
-            )
-        console.print(
-            f"Cut-off along {name} ({CUT_OFF:.0%} of the axis): {' and '.join(words)}", soft_wrap=True
-        )
-    for finding in response.findings:
-        console.print(f"Quality: {escape(finding)}", soft_wrap=True)
+class _AngularTold(Told):
+    """Prints the exposures before the source moves."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def exposures(self, found: SweepExposures) -> None:
+        """Print them."""
+        self.pause()
+        print_lines(self._console, exposure_lines(found))
+        self.step("moving the source")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -10,17 +11,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from calibration_routines.beads import (
-    BeadCalibration,
-    BeadSlides,
-    bench_geometry,
-    calibrate_beads,
-    mean_images,
-    photograph_slides,
-)
+from calibration_routines.beads import BeadCalibration, BeadSlides, calibrate_beads, mean_images
+from calibration_routines.optics_procedures import BeadProcedure, bead_lines
 from instrument.calibration_file import save_calibration
 from instrument.cli.app import BenchOption, examples, open_and_say, operator
 from instrument.cli.progress import one_task
+from instrument.cli.sweeping import Told
 from instrument.errors import BenchError, FileError
 from instrument.images import read_image
 from recon.blind import BlindSettings
@@ -94,25 +90,26 @@ def beads(
             reach=reach,
         ),
     )
-    if files:
-        done = _from_files(files, slides, dark, pixel_um, distance_mm)
-    else:
+    if not files:
+        procedure = BeadProcedure(slides=slides, out=out, overwrite=force, ask=operator())
         with open_and_say(bench) as opened:
-            geometry = bench_geometry(opened, slides)
-            with one_task("bead slides") as advance:
-                taken = photograph_slides(
-                    opened, slides, ask=operator(), progress=lambda _what, share: advance(share, 1.0)
-                )
-            facts = {"bench": opened.label, "simulated": bool(opened.simulated_kinds)}
-        done = _solved(taken, slides, geometry, facts)
+            simulated = bool(opened.simulated_kinds)
+            with Told() as told:
+                finished = procedure.carry_out(opened, listener=told)
+        _tell(finished.verdict, simulated)
+        typer.echo(f"Wrote {finished.calibration}: {psfs} PSFs at z = {z:g} mm")
+        return
+    done = _from_files(files, slides, dark, pixel_um, distance_mm)
     path = save_calibration(done.calibration, out, overwrite=force)
-    quality = done.calibration.quality
-    if done.calibration.provenance.get("simulated"):
+    _tell(bead_lines(done), bool(done.calibration.provenance.get("simulated")))
+    typer.echo(f"Wrote {path}: {psfs} PSFs at z = {z:g} mm")
+
+
+def _tell(lines: Sequence[str], simulated: bool) -> None:
+    if simulated:
         typer.echo("SIMULATED: the photographs come from the simulated bench")
-    typer.echo(f"Beads found: {', '.join(map(str, quality['beads_found']))}")
-    misfits = ", ".join(f"{m:.3f}" for m in done.result.misfits)
-    typer.echo(f"Misfit by rank: {misfits}; kept rank {done.result.rank} ({done.result.stopped})")
-    typer.echo(f"Wrote {path}: {len(done.result.psfs)} PSFs at z = {z:g} mm")
+    for line in lines:
+        typer.echo(line)
 
 
 def _from_files(
@@ -122,23 +119,15 @@ def _from_files(
     taken = mean_images([image.pixels for image in read]) - np.float32(dark)
     if slides.binning > 1:
         raise BenchError("--binning is for photographs taken on the bench: bin the files beforehand.")
-    return _solved(
-        taken,
-        replace(slides, images=max(len(files), 2)),
-        Geometry(pixel_pitch_um=pixel_um, diffuser_distance_mm=distance_mm),
-        {"files": [str(path) for path in files], "simulated": any(i.is_simulated for i in read)},
-    )
-
-
-def _solved(
-    taken: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
-    slides: BeadSlides,
-    geometry: Geometry,
-    facts: dict[str, object],
-) -> BeadCalibration:
+    facts = {"files": [str(path) for path in files], "simulated": any(i.is_simulated for i in read)}
+    geometry = Geometry(pixel_pitch_um=pixel_um, diffuser_distance_mm=distance_mm)
     with one_task("blind deconvolution") as advance:
         return calibrate_beads(
-            taken, slides, geometry, provenance=facts, progress=lambda _what, share: advance(share, 1.0)
+            taken,
+            replace(slides, images=max(len(files), 2)),
+            geometry,
+            provenance=facts,
+            progress=lambda _what, share: advance(share, 1.0),
         )
 
 

@@ -14,10 +14,11 @@ from rich.markup import escape
 from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
 from calibration_routines.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo_settings import DemoSettings
+from calibration_routines.sweep_words import exposure_lines, quality_lines
 from instrument.bench import Bench
 from instrument.cli.app import command_app, examples
 from instrument.cli.progress import one_task
-from instrument.cli.sweeping import describe_exposures, describe_plan, describe_quality
+from instrument.cli.sweeping import describe_plan, print_lines
 
 app = command_app()
 
@@ -59,12 +60,12 @@ class _Terminal:
         self._say(f"Everything goes to {folder}")
 
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
-        describe_exposures(self._console, exposures)
+        print_lines(self._console, exposure_lines(exposures))
         plan = sweep_plan(settings.sweep, exposures.exposures_ms)
         describe_plan(self._console, bench, settings.sweep, plan, None)
 
     def on_sweep(self, done: SweepCalibration) -> None:
-        describe_quality(self._console, done)
+        print_lines(self._console, quality_lines(done))
 
     def verdict(self, result: DemoResult) -> None:
         self._console.print("\nSeconds")

@@ -10,11 +10,12 @@ from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
 from calibration_routines.sweep import FOLDER
+from calibration_routines.sweep_words import event_lines
 from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import one_task, progress_bar
 from instrument.cli.running import carry_out, home_if_needed
-from instrument.cli.sweeping import describe_result, say_event
+from instrument.cli.sweeping import describe_result, print_lines
 from instrument.resume import prepare_resume
 from instrument.store import FinishReason, Run, RunCondition, RunWriter
 from instrument.store.layout import BENCH_TOML
@@ -53,7 +54,7 @@ def resume(
         typer.echo(f"Found {findings}", err=True)
         if is_sweep(run):
             console = Console(stderr=True)
-            watch_resumed(opened, runner, lambda event: say_event(console, event))
+            watch_resumed(opened, runner, lambda event: print_lines(console, event_lines(event)))
         done = carry_out(opened, runner)
         if is_sweep(run) and done.condition is RunCondition.COMPLETED:
             _finish(run, opened)

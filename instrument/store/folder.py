@@ -7,6 +7,7 @@ import fcntl
 import hashlib
 import os
 import re
+from datetime import datetime
 from pathlib import Path
 
 from instrument.atomic import write_bytes
@@ -39,12 +40,17 @@ def lock_run(path: Path) -> int:
     return handle
 
 
-def free_name(parent: Path, name: str) -> Path:
-    """Return a path for a new run, with a number when its name is taken."""
-    path, number = parent / name, 1
+def dated_name(label: str) -> str:
+    """Return a name for something made now: local date, time and what it is."""
+    return f"{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}_{slug(label)}"
+
+
+def free_name(parent: Path, name: str, suffix: str = "") -> Path:
+    """Return a path for a new run or file, with a number before the suffix when its name is taken."""
+    path, number = parent / f"{name}{suffix}", 1
     while path.exists() or (parent / f".{path.name}.draft").exists():
         number += 1
-        path = parent / f"{name}-{number}"
+        path = parent / f"{name}-{number}{suffix}"
     return path
 
 

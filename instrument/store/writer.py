@@ -18,7 +18,7 @@ from drivers.frame import FrameMetadata
 from instrument.atomic import sync_folder, write_bytes
 from instrument.plan import Plan
 from instrument.store.durable import AppendOnlyLog, write_json
-from instrument.store.folder import disk_remedy, free_name, lock_run, plan_with_copies, slug
+from instrument.store.folder import dated_name, disk_remedy, free_name, lock_run, plan_with_copies
 from instrument.store.frame_array import FrameArray
 from instrument.store.frame_record import FrameRecord, Gap
 from instrument.store.layout import (
@@ -113,7 +113,7 @@ class RunWriter:
         now = datetime.now(UTC)
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            path = free_name(parent, f"{now.astimezone():%Y-%m-%d_%H-%M-%S}_{slug(label)}")
+            path = free_name(parent, dated_name(label))
             draft = parent / f".{path.name}.draft"
             draft.mkdir()
             try:

@@ -1,0 +1,268 @@
+"""Procedures besides the sweeps for the camera: angular response, the diffuser's surface, bead slides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
+from calibration_routines.angular_response import CUT_OFF, AngularResponse
+from calibration_routines.beads import (
+    Ask,
+    BeadCalibration,
+    BeadSlides,
+    bench_geometry,
+    calibrate_beads,
+    photograph_slides,
+    window_of,
+)
+from calibration_routines.calibration_figures import response_figure, surface_figure
+from calibration_routines.dpc import DiffuserSurface, DpcSetup, dpc_optics, dpc_plan, measure_diffuser
+from calibration_routines.procedure import (
+    Listener,
+    Outcome,
+    Outlook,
+    home_if_needed,
+    outlook_of,
+    under_control,
+)
+from calibration_routines.sweep_plan import check_sweep
+from instrument.acquire import abilities_of
+from instrument.bench import Bench
+from instrument.calibration_file import save_calibration
+from instrument.errors import BenchError, FileError
+from instrument.figures import save_figure
+from instrument.plan import check
+from instrument.run_control import RunControl
+from instrument.store.folder import dated_name, free_name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AngularProcedure:
+    """Measure the sensor's angular response; see :class:`AngularSweep`.
+
+    ``z_um`` None: the farthest distance from which the stage spans the angles.
+    """
+
+    z_um: float | None = None
+    largest_deg: float = 45.0
+    step_deg: float = 3.0
+    emission: str = "pinhole"
+    average: int = 4
+    dark_frames: int = 4
+
+    def __post_init__(self) -> None:
+        self._sweep(1.0 if self.z_um is None else self.z_um).points()
+
+    def sweep(self, bench: Bench) -> AngularSweep:
+        """Return what is measured, the distance filled in."""
+        return self._sweep(farthest_um(bench, self.largest_deg) if self.z_um is None else self.z_um)
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold every place against the stage's limits."""
+        sweep = self.sweep(bench)
+        points = sweep.points()
+        plan = check_sweep(bench, points, folder or bench.config.data_folder)
+        reason = (
+            f"{len(points.points_um)} places at z = {sweep.z_um / 1e3:.4g} mm, up to "
+            f"+-{self.largest_deg:g} degrees along x and y"
+        )
+        farthest = "" if self.z_um is not None else ", the farthest from which the stage spans the angles"
+        return outlook_of(bench, plan, folder, [reason + farthest])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Home, move the source, and save the response with its picture in the run's folder."""
+        heard, sweep = listener or Listener(), self.sweep(bench)
+        check_sweep(bench, sweep.points(), folder)
+        with under_control(bench, control) as control:
+            home_if_needed(bench, heard)
+            heard.step("moving the source")
+            response, file = measure_angular_response(
+                bench,
+                sweep,
+                folder,
+                on_progress=heard.frame,
+                on_exposures=heard.exposures,
+                control=control,
+            )
+        picture = file.with_suffix(".png")
+        save_figure(response_figure(response), picture)
+        return Outcome(
+            verdict=tuple(response_lines(response)),
+            good=not response.findings,
+            runs=(file.parent,),
+            files=(file, picture),
+            result=response,
+        )
+
+    def _sweep(self, z_um: float) -> AngularSweep:
+        return AngularSweep(
+            z_um,
+            self.largest_deg,
+            self.step_deg,
+            self.emission,  # type: ignore[arg-type]  # any other text is refused there in words
+            self.average,
+            self.dark_frames,
+        )
+
+
+def response_lines(response: AngularResponse) -> list[str]:
+    """Return the cut-offs and the quality of a response in sentences."""
+    lines = []
+    for name, curve in (("x", response.along_x), ("y", response.along_y)):
+        words = []
+        for sign, angle in zip("-+", curve.cut_offs_deg(), strict=True):
+            end = curve.angles_deg[0 if sign == "-" else -1]
+            value = curve.response[0 if sign == "-" else -1]
+            words.append(
+                f"{sign}{angle:.1f} degrees"
+                if angle is not None
+                else f"not reached on the {sign} side ({value:.0%} at {end:+.1f} degrees)"
+            )
+        lines.append(f"Cut-off along {name} ({CUT_OFF:.0%} of the axis): {' and '.join(words)}")
+    return lines + [f"Quality: {finding}" for finding in response.findings]
+
+
+@dataclass(frozen=True, slots=True)
+class DpcProcedure:
+    """Measure the diffuser's surface by differential phase contrast."""
+
+    setup: DpcSetup
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold the half circles against the LED array and the objective."""
+        if bench.led_array is None:
+            raise BenchError(f"{bench.label} has no [led_array].")
+        folder = folder or bench.config.data_folder
+        optics = dpc_optics(bench, self.setup)
+        plan = dpc_plan(bench.led_array, self.setup, bench.camera.exposure_ms)
+        check(plan, abilities_of(bench, folder))
+        lit = len(plan.parts[1].light[0].leds)
+        reason = (
+            f"4 half circles of {lit} LEDs up to NA {optics.illumination_na:.3g} (the objective's "
+            f"{self.setup.objective_na:g}, and beyond, so that deflected light is not only lost). "
+            f"Pixels are {optics.pitch_um:.3g} um in the sample, at {optics.wavelength_nm:g} nm."
+        )
+        return outlook_of(bench, plan, folder, [reason])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph the halves and save the surface with its picture in the run's folder."""
+        heard = listener or Listener()
+        with under_control(bench, control) as control:
+            heard.step("half circles")
+            surface, file = measure_diffuser(
+                bench, self.setup, folder, on_progress=heard.frame, control=control
+            )
+        picture = file.with_suffix(".png")
+        save_figure(surface_figure(surface), picture)
+        return Outcome(
+            verdict=(surface_line(surface),),
+            good=True,
+            runs=(file.parent,),
+            files=(file, picture),
+            result=surface,
+        )
+
+
+def surface_line(surface: DiffuserSurface) -> str:
+    """Return a surface's figures of merit in a line."""
+    figures = surface.figures
+    return (
+        f"Height       {figures['height_rms_um']:.3g} um rms; slope {figures['slope_mean_deg']:.3g} degrees "
+        f"on average; deflection half width {figures['deflection_hwhm_deg']:.3g}, largest "
+        f"{figures['deflection_largest_deg']:.3g} degrees"
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BeadProcedure:
+    """Photograph bead slides and recover PSFs from them, without a stage.
+
+    Attributes
+    ----------
+    slides : BeadSlides
+    out : Path, optional
+        The calibration's folder; None: a dated name beside the runs.
+    overwrite : bool
+        Replace a calibration that exists.
+    ask : callable, optional
+        Asks the operator to move the slide; the simulated bench does it itself.
+    """
+
+    slides: BeadSlides
+    out: Path | None = None
+    overwrite: bool = False
+    ask: Ask | None = None
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Refuse what cannot be solved because the optics are not known, or saved."""
+        self._refuse_existing()
+        slides = self.slides
+        geometry = bench_geometry(bench, slides)
+        height, width = slides.window_px or window_of(geometry, slides.z_um)
+        rows, columns = slides.solver.grid
+        frames = slides.images * (slides.average + 4)
+        return Outlook(
+            (
+                f"{slides.images} photographs of {slides.average} frames, each with 4 dark frames: {frames} "
+                "frames; the slide is moved in between",
+                f"{rows} x {columns} PSFs of {height} x {width} pixels",
+            )
+        )
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph, solve, and save the calibration."""
+        heard = listener or Listener()
+        self._refuse_existing()
+        geometry = bench_geometry(bench, self.slides)
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
+        with under_control(bench, control) as control:
+            heard.step("photographing bead slides")
+            taken = photograph_slides(
+                bench, self.slides, folder, ask=self.ask, on_progress=heard.frame, control=control
+            )
+            heard.step("blind deconvolution")
+
+            def solving(_words: str, done: float) -> None:
+                control.check()
+                heard.share(done, 1.0)
+
+            solved = calibrate_beads(taken, self.slides, geometry, provenance=facts, progress=solving)
+        out = self.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
+        path = save_calibration(solved.calibration, out, overwrite=self.overwrite)
+        return Outcome(verdict=tuple(bead_lines(solved)), good=True, calibration=path, result=solved)
+
+    def _refuse_existing(self) -> None:
+        if self.out is not None and self.out.exists() and not self.overwrite:
+            raise FileError(self.out, "exists already.", "Choose another name, or replace it with --force.")
+
+
+def bead_lines(done: BeadCalibration) -> list[str]:
+    """Return what the bead images gave, in lines."""
+    result = done.result
+    misfits = ", ".join(f"{m:.3f}" for m in result.misfits)
+    return [
+        f"Beads found: {', '.join(map(str, done.calibration.quality['beads_found']))}",
+        f"Misfit by rank: {misfits}; kept rank {result.rank} ({result.stopped})",
+    ]

@@ -1,0 +1,128 @@
+"""Plans, and runs that go on, as procedures: what ``run`` and ``resume`` do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from calibration_routines.errors import RunEndedError
+from calibration_routines.procedure import Listener, Outcome, Outlook, outlook_of, under_control
+from calibration_routines.sweep import FOLDER, finish_sweep, watch_resumed
+from calibration_routines.sweep_procedure import analysing, sweep_outcome
+from calibration_routines.sweep_record import is_sweep
+from instrument.acquire import abilities_of, prepare
+from instrument.bench import Bench
+from instrument.plan import Plan, check, estimate
+from instrument.resume import prepare_resume
+from instrument.run_control import RunControl
+from instrument.store import Run, RunCondition
+
+
+@dataclass(frozen=True, slots=True)
+class PlanProcedure:
+    """Carry out a plan."""
+
+    plan: Plan
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold the plan against the bench's limits and the disk."""
+        folder = folder or bench.config.data_folder
+        check(self.plan, replace(abilities_of(bench, folder), stage_homed=True))
+        return outlook_of(bench, self.plan, folder)
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Home where the plan moves, and take the frames."""
+        heard = listener or Listener()
+        self.outlook(bench, folder)
+        with under_control(bench, control) as control:
+            _home_for(bench, self.plan, heard)
+            heard.step(self.plan.label)
+            run = prepare(bench, self.plan, folder, on_progress=heard.frame, control=control).execute()
+        return run_outcome(run)
+
+
+@dataclass(frozen=True, slots=True)
+class ResumeProcedure:
+    """Go on with a run that did not end, and make the calibration of a sweep that is complete then."""
+
+    run: Path
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Say what is left to do, by the run's log; its frames are read when it goes on."""
+        found = Run.open(self.run)
+        abilities = replace(abilities_of(bench, self.run), stage_homed=True)
+        if found.plan is None:
+            return Outlook(("A recording cannot go on.",))
+        todo = found.missing()
+        words = f"{found.condition}: {len(found.records)} of {found.n_frames} frames are stored"
+        if not todo:
+            return Outlook((words,))
+        check(found.plan, abilities, todo=todo, start=found.start)
+        cost = estimate(found.plan, abilities, todo=todo, start=found.start)
+        return replace(outlook_of(bench, found.plan, self.run, [words]), cost=cost)
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Verify what is stored, take the rest, and finish a sweep."""
+        heard = listener or Listener()
+        with under_control(bench, control) as control:
+            found = Run.open(self.run)
+            if found.plan is not None and found.missing():
+                _home_for(bench, found.plan, heard)
+                heard.step("verifying the frames")
+                runner, findings = prepare_resume(
+                    bench, self.run, on_verify=heard.share, on_progress=heard.frame
+                )
+                heard.said(f"Found {findings}")
+                if is_sweep(self.run):
+                    watch_resumed(bench, runner, heard.event)
+                heard.step(found.label)
+                control.follow(runner)
+                found = runner.execute()
+            if is_sweep(self.run) and not (self.run / FOLDER).exists():
+                if found.condition is not RunCondition.COMPLETED:
+                    raise RunEndedError("The sweep", found, "It can be resumed.")
+                done = finish_sweep(
+                    self.run,
+                    bench,
+                    on_progress=heard.frame,
+                    on_analysis=analysing(heard, control),
+                    on_runner=control.follow,
+                )
+                return sweep_outcome(done)
+        return run_outcome(found)
+
+
+def run_outcome(run: Run) -> Outcome:
+    """Return what a run leaves, in words: frames, drops, saturation."""
+    words = [f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
+    dropped = sum(record.metadata.dropped_before for record in run.records.values())
+    saturated = [i for i, record in run.records.items() if record.metadata.saturated_fraction > 0]
+    if dropped:
+        words.append(f"The camera dropped {dropped} frames between these.")
+    if saturated:
+        words.append(f"{len(saturated)} frames have saturated pixels, the first is frame {saturated[0]}.")
+    complete = run.condition is RunCondition.COMPLETED
+    return Outcome(
+        verdict=tuple(words), good=complete and not dropped and not saturated, runs=(run.path,), result=run
+    )
+
+
+def _home_for(bench: Bench, plan: Plan, heard: Listener) -> None:
+    moves = any(part.positions is not None for part in plan.parts)
+    if moves and bench.stage is not None and not bench.stage.is_homed:
+        heard.step("homing the stage")
+        bench.stage.home()

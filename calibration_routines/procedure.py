@@ -1,0 +1,171 @@
+"""A procedure from an open bench to its saved result, as command line, window and scripts call it alike.
+
+A procedure is frozen data: what a person asked for. ``outlook`` says what it will do and cost, nothing moves;
+``carry_out`` does all of it (homing, exposures, frames, analysis, files) and ends with the light off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from calibration_routines.axial_exposure import SweepExposures
+from calibration_routines.spot_camera import SpotLook
+from calibration_routines.sweep_watch import SweepEvent
+from instrument.acquire import abilities_of
+from instrument.bench import Bench
+from instrument.plan import Plan, PlanEstimate, estimate
+from instrument.run_control import RunControl
+from instrument.runner import RunStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What a procedure will do, as far as that is known before it starts.
+
+    Attributes
+    ----------
+    reasons : tuple of str
+        What its numbers come from, in words.
+    plan : Plan or None
+        Of its frames, with the camera's present exposure; None where the next frame depends on the last one.
+    cost : PlanEstimate or None
+        Of the plan.
+    path : tuple of mapping
+        Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits.
+    """
+
+    reasons: tuple[str, ...] = ()
+    plan: Plan | None = None
+    cost: PlanEstimate | None = None
+    path: tuple[dict[str, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a procedure leaves.
+
+    Attributes
+    ----------
+    verdict : tuple of str
+        What was measured and how good it is, in sentences.
+    good : bool
+        Whether nothing was found wrong.
+    runs : tuple of Path
+        Folders of its runs.
+    calibration : Path or None
+        What a reconstruction or a hologram is given.
+    files : tuple of Path
+        What else was written: results, pictures.
+    result : object
+        What the routine returned: ``SweepCalibration``, ``AngularResponse``, ``DiffuserSurface``,
+        ``BeadCalibration``, ``SlmCalibration``, ``AlignmentReport`` or ``Run``.
+    """
+
+    verdict: tuple[str, ...]
+    good: bool
+    runs: tuple[Path, ...] = ()
+    calibration: Path | None = None
+    files: tuple[Path, ...] = ()
+    result: object = None
+
+
+class Listener:
+    """Hears how a procedure goes on, in the thread that carries it out; override what is of interest."""
+
+    def step(self, words: str) -> None:
+        """Hear that another step begins: ``"finding exposures"``."""
+
+    def share(self, done: float, total: float) -> None:
+        """Hear how much of the step is done, where it does not take the frames of a plan."""
+
+    def said(self, words: str) -> None:
+        """Hear what was found on the way, for a log."""
+
+    def exposures(self, found: SweepExposures) -> None:
+        """Hear which exposures a sweep will have."""
+
+    def frame(self, status: RunStatus) -> None:
+        """Hear that a frame of a run is on the disk, or that the run's state changed."""
+
+    def event(self, event: SweepEvent) -> None:
+        """Hear how good a PSF, or the source, is as soon as it is known."""
+
+    def look(self, look: SpotLook) -> None:
+        """Hear what a picture of spots showed: a frame of a mask alignment."""
+
+
+class Procedure(Protocol):
+    """What windows and scripts carry out."""
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Check everything that can be checked before something moves.
+
+        Parameters
+        ----------
+        bench : Bench
+            Open.
+        folder : Path, optional
+            Where runs go; the bench's data folder by default.
+
+        Raises
+        ------
+        SettingsError, PlanError, BenchError
+            When it cannot be done as asked.
+        """
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Do it; the light is off and nothing moves when this returns or raises.
+
+        Raises
+        ------
+        EndedEarlyError, RunEndedError
+            When it was aborted or stopped; what was taken is kept.
+        BenchError, DeviceError
+            When it cannot be done or a device fails.
+        """
+
+
+def outlook_of(
+    bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = (), *, by_hand: bool = False
+) -> Outlook:
+    """Return the outlook of a plan that was checked; with ``by_hand`` it goes nowhere."""
+    abilities = abilities_of(bench, folder or bench.config.data_folder)
+    return Outlook(tuple(reasons), plan, estimate(plan, abilities), () if by_hand else path_of(plan))
+
+
+def path_of(plan: Plan) -> tuple[dict[str, float], ...]:
+    """Return the places that a plan visits, one after the other; empty where nothing moves."""
+    places: list[dict[str, float]] = []
+    for step in plan.steps():
+        place = dict(step.stage)
+        if step.source_um is not None:
+            place = dict(zip(("x_um", "y_um", "z_um"), step.source_um, strict=True))
+        if place and (not places or places[-1] != place):
+            places.append(place)
+    return tuple(places)
+
+
+@contextmanager
+def under_control(bench: Bench, control: RunControl | None) -> Iterator[RunControl]:
+    """Give the control of a procedure that is carried out in the block, a new one where nobody has one."""
+    control = control or RunControl()
+    with control.procedure(bench):
+        yield control
+
+
+def home_if_needed(bench: Bench, listener: Listener) -> None:
+    """Home a stage that has no reference yet."""
+    if bench.stage is not None and not bench.stage.is_homed:
+        listener.step("homing the stage")
+        bench.stage.home()

@@ -1,0 +1,232 @@
+"""Procedures from the request to the result, and how they are paused, aborted and stopped."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration_routines import CalibrationError
+from calibration_routines.axial_exposure import SweepExposures
+from calibration_routines.errors import RunEndedError
+from calibration_routines.optics_procedures import AngularProcedure
+from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
+from calibration_routines.procedure import Listener, Outcome
+from calibration_routines.sweep_procedure import SweepProcedure
+from calibration_routines.sweep_request import AxialRequest, LateralRequest, VolumeRequest
+from instrument.bench import Bench, open_bench
+from instrument.config_file import parse_config
+from instrument.errors import SettingsError
+from instrument.plan import Part, Plan, PlanError
+from instrument.run_control import EndedEarlyError, RunControl
+from instrument.runner import RunState, RunStatus
+from instrument.store import FinishReason, Run, RunCondition
+
+TINY = """
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = {time_scale}
+"""
+AXIAL = SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=150e3, planes=4, average=2, dark_frames=2))
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with open_bench(parse_config(TINY.format(time_scale=0), None)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def slow_bench() -> Iterator[Bench]:
+    with open_bench(parse_config(TINY.format(time_scale=0.3), None)) as opened:
+        yield opened
+
+
+class Heard(Listener):
+    def __init__(self, on_frame: Callable[[RunStatus], None] = lambda _: None) -> None:
+        self.steps: list[str] = []
+        self.found: SweepExposures | None = None
+        self._on_frame = on_frame
+
+    def step(self, words: str) -> None:
+        self.steps.append(words)
+
+    def exposures(self, found: SweepExposures) -> None:
+        self.found = found
+
+    def frame(self, status: RunStatus) -> None:
+        self._on_frame(status)
+
+
+def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Bench, tmp_path: Path) -> None:
+    before = bench.source_position_um
+    outlook = AXIAL.outlook(bench, tmp_path)
+    assert bench.source_position_um == before
+    assert list(tmp_path.iterdir()) == []
+    assert sorted({round(place["z_um"]) for place in outlook.path}) == [60000, 75000, 100000, 150000]
+    assert outlook.path[0] == outlook.path[-1]  # the reference
+    heard = Heard()
+    done = AXIAL.carry_out(bench, tmp_path, listener=heard)
+    assert heard.steps == ["homing the stage", "finding exposures", "sweeping", "analysing"]
+    assert heard.found is not None
+    assert outlook.cost is not None
+    assert Run.open(done.runs[0]).n_frames == outlook.cost.frames
+    assert done.good, done.verdict
+    assert done.calibration is not None
+    assert (done.calibration / "calibration.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: AxialRequest(z_min_um=-1.0), "z_min_um"),
+        (lambda: AxialRequest(z_min_um=2e5, z_max_um=1e5), "z_max_um"),
+        (lambda: AxialRequest(z_min_um=1e5, average=0), "average"),
+        (lambda: AxialRequest(z_min_um=1e5, x_um=np.inf), "x_um"),
+        (lambda: AxialRequest(z_min_um=1e5, binning=500), "binning"),
+        (lambda: AxialRequest(z_min_um=50.0, z_max_um=15e4), "planes"),
+        (lambda: LateralRequest(z_um=0.0), "z_um"),
+        (lambda: LateralRequest(z_um=1e5, target=2.0), "target"),
+        (lambda: LateralRequest(z_um=1e5, half_field_x_um=1.0), "half_field_y_um"),
+        (lambda: LateralRequest(z_um=1e5, spacing_um=0.0), "spacing_um"),
+        (lambda: LateralRequest(z_um=1e5, fall_off_deg=95.0), "fall_off_deg"),
+        (lambda: LateralRequest(z_um=1e5, fall_off_deg=9.0, response=Path("x.json")), "fall_off_deg"),
+        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=9e4), "z_max_um"),
+        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=2e5, planes=1), "planes"),
+        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=2e5, reference_every=-1), "reference_every"),
+    ],
+)
+def test_a_mistake_names_its_setting(
+    bench: Bench, make: Callable[[], AxialRequest | LateralRequest | VolumeRequest], field: str
+) -> None:
+    with pytest.raises(SettingsError) as refused:
+        SweepProcedure(make()).outlook(bench)
+    assert field in [name for name, _ in refused.value.problems]
+
+
+def test_what_leaves_the_stage_is_refused_by_the_plan(bench: Bench) -> None:
+    with pytest.raises(PlanError, match="outside the stage's limits"):
+        SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=9e5, planes=3)).outlook(bench)
+
+
+def test_abort_between_two_frames_keeps_them_and_resume_makes_the_calibration(
+    bench: Bench, tmp_path: Path
+) -> None:
+    control = RunControl()
+
+    def at_five(status: RunStatus) -> None:
+        if status.done == 5:
+            control.abort()
+
+    with pytest.raises(RunEndedError) as ended:
+        AXIAL.carry_out(bench, tmp_path, control=control, listener=Heard(at_five))
+    run = ended.value.run
+    assert run.condition is RunCondition.ABORTED
+    assert len(run.records) == 5
+    resume = ResumeProcedure(run.path)
+    outlook = resume.outlook(bench)
+    assert outlook.cost is not None
+    assert outlook.cost.frames == run.n_frames - 5
+    done = resume.carry_out(bench)
+    assert done.good
+    assert done.calibration == run.path / "calibration"
+
+
+def test_pause_waits_dark_until_it_goes_on(bench: Bench, tmp_path: Path) -> None:
+    control, states = RunControl(), []
+
+    def watch(status: RunStatus) -> None:
+        states.append(status.state)
+        if status.done == 6 and status.state is RunState.RUNNING and not control.is_pausing:
+            control.pause()
+        if status.state is RunState.PAUSED:
+            assert bench.led_array is not None
+            assert bench.led_array.pattern.is_dark
+            threading.Timer(0.05, control.resume).start()
+
+    done = AXIAL.carry_out(bench, tmp_path, control=control, listener=Heard(watch))
+    assert RunState.PAUSED in states
+    assert done.good
+
+
+@pytest.mark.parametrize("step", ["homing the stage", "finding exposures", "sweeping"])
+def test_stop_ends_at_once_in_every_step(slow_bench: Bench, tmp_path: Path, step: str) -> None:
+    bench, control, reached = slow_bench, RunControl(), threading.Event()
+    outcome: list[BaseException | Outcome] = []
+
+    class Watch(Listener):
+        def step(self, words: str) -> None:
+            if words == step:
+                reached.set()
+
+    def work() -> None:
+        try:
+            outcome.append(AXIAL.carry_out(bench, tmp_path, control=control, listener=Watch()))
+        except Exception as error:  # noqa: BLE001 - looked at below
+            outcome.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    assert reached.wait(60)
+    time.sleep(0.1)
+    control.stop()
+    assert bench.led_array is not None
+    assert bench.stage is not None
+    assert bench.led_array.pattern.is_dark
+    assert not bench.stage.is_moving
+    thread.join(30)
+    assert not thread.is_alive()
+    assert control.ending is FinishReason.STOPPED
+    assert bench.led_array.pattern.is_dark
+    assert isinstance(outcome[0], Exception), outcome
+
+
+def test_abort_before_it_begins_begins_nothing(bench: Bench, tmp_path: Path) -> None:
+    control = RunControl()
+    control.abort()
+    with pytest.raises(EndedEarlyError, match="aborted"):
+        AXIAL.carry_out(bench, tmp_path, control=control)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_is_carried_out_with_the_stage_homed(bench: Bench, tmp_path: Path) -> None:
+    part = Part.model_validate(
+        {
+            "label": "psf",
+            "light": "source",
+            "positions": {"kind": "points", "points_um": [[0, 0, 8e4], [0, 0, 9e4]]},
+        }
+    )
+    procedure = PlanProcedure(Plan(label="two", parts=(part,)))
+    assert procedure.outlook(bench, tmp_path).path == (
+        {"x_um": 0.0, "y_um": 0.0, "z_um": 8e4},
+        {"x_um": 0.0, "y_um": 0.0, "z_um": 9e4},
+    )
+    done = procedure.carry_out(bench, tmp_path)
+    assert done.verdict[0] == "completed: 2 of 2 frames"
+
+
+def test_the_angular_procedure_fills_in_the_distance(bench: Bench, tmp_path: Path) -> None:
+    procedure = AngularProcedure(largest_deg=20.0, step_deg=10.0)
+    outlook = procedure.outlook(bench, tmp_path)
+    assert "the farthest from which the stage spans the angles" in outlook.reasons[0]
+    with pytest.raises(SettingsError):
+        AngularProcedure(average=0)
+    with pytest.raises(CalibrationError):  # four angles an axis, most of which leave the tiny sensor
+        procedure.carry_out(bench, tmp_path)
+    assert bench.led_array is not None
+    assert bench.led_array.pattern.is_dark
