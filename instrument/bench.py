@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from drivers.camera import Camera
 from drivers.claim import Claim
@@ -30,7 +30,10 @@ from instrument.lights import Ask, Lights, SceneSwitch
 from instrument.photograph import Snapshot, photograph
 from instrument.safety import Step, StepsFailedError, safe_steps, try_all
 from instrument.source_mount import Position, SourceMount
-from recon.types import Geometry
+from recon.types import Calibration, Geometry
+
+if TYPE_CHECKING:
+    from instrument.live import LiveView
 
 _log = logging.getLogger(__name__)
 _open_benches: weakref.WeakSet[Bench] = weakref.WeakSet()
@@ -202,6 +205,24 @@ class Bench:
                 "was lost while frames were taken; those since are not kept.",
                 "Check its cable and power, then take them again.",
             )
+
+    def live(self, calibration: Calibration | Path | str, *, n_buffers: int = 4, **settings: Any) -> LiveView:
+        """Return a live reconstruction of the camera, to be used as a context manager.
+
+        ``settings`` are those of :class:`recon.live.LiveReconstructor`: ``z_um``, ``budget_ms``, ...::
+
+            with bench.live("calibration", budget_ms=33) as live:
+                for result in live:
+                    show(result.picture.image, result.picture.quality)
+
+        Raises
+        ------
+        FileError, InputError
+            When the calibration cannot be used.
+        """
+        from instrument.live import live_view
+
+        return live_view(self.camera.stream(n_buffers), calibration, **settings)
 
     def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
         """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""

@@ -49,6 +49,12 @@ class Solver(ABC):
     def solution(self) -> Array:
         """The present iterate on the operator's domain. A view or copy: not to be written to."""
 
+    def advance(self) -> IterationRecord:
+        """Do one iteration and count it, for those who decide after each whether to go on; untimed."""
+        known = self.step()
+        self.iteration += 1
+        return replace(known, iteration=self.iteration)
+
     def compile(self) -> None:  # noqa: B027 (a solver without compiled code has nothing to do)
         """Have compiled code ready: its first use on a machine takes seconds that are no iteration's."""
 

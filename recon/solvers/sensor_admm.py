@@ -109,10 +109,8 @@ class SensorAdmm(Solver):
         self._weight = np.ascontiguousarray(structure.weight)
         self._erased = not np.all(structure.weight)
         # Imputed on erased pixels, so part of the state.
-        self._data = np.array(data, operator.dtype)
-        if self._erased:
-            for image, weight in zip(self._data, self._weight, strict=True):
-                fill_smoothly(image, weight)
+        self._data = np.empty(operator.range_shape, operator.dtype)
+        self.set_data(data)
         self._top, self._left = camera.corner
         self._camera = camera
         self._spectrum = camera.spectrum
@@ -146,9 +144,32 @@ class SensorAdmm(Solver):
         self._preconditioners = [
             CosinePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
         ]
-        splits.set_penalties(self._first_penalties(power))
+        # What the first guess of the penalties needs to know of each channel's |H|^2.
+        self._mean_power = power.mean(axis=(1, 2), dtype=np.float64)
+        self._power_at_zero = power[:, 0, 0].astype(np.float64)
+        splits.set_penalties(self._first_penalties())
         self._adapt()
         splits.sweep(0)
+
+    def set_data(self, data: Array) -> None:
+        """Go on with other data (``operator.range_shape``) from where the solver is: a video's next frame.
+
+        Object, dual variables and penalties stay: a warm start of all that an iteration builds on.
+        """
+        self._data[...] = data
+        if self._erased:
+            for image, weight in zip(self._data, self._weight, strict=True):
+                fill_smoothly(image, weight)
+
+    def restart(self, data: Array) -> None:
+        """Begin anew from zero with other data, in the memory that the solver has."""
+        self.iteration = 0
+        self.set_data(data)
+        for array in (self._y, self._tx, self._ty, self._t_w, self._e, self._E):
+            array[...] = 0
+        self._splits.set_penalties(self._first_penalties())
+        self._adapt()
+        self._splits.sweep(0)
 
     @property
     def solution(self) -> Array:
@@ -238,16 +259,17 @@ class SensorAdmm(Solver):
         for preconditioner, mu in zip(self._preconditioners, self._mu.T, strict=True):
             preconditioner.set_penalties(*mu)
 
-    def _first_penalties(self, power: Array) -> Array:
+    def _first_penalties(self) -> Array:
         """Guess penalties from the object's mean, which the data tells through the PSF's sum."""
         tv, separable = self._splits.tv, self._splits.separable
         strength = (tv.weight if tv else 0.0) or separable.weight
         mu = np.zeros_like(self._mu)
         for c, data in enumerate(self._data):
-            h = power[c % len(power)]
-            mean = float(np.linalg.norm(data)) / float(np.sqrt(data.size * h[0, 0]))
+            of_psf = c % len(self._mean_power)
+            mean = float(np.linalg.norm(data)) / float(np.sqrt(data.size * self._power_at_zero[of_psf]))
             threshold = FIRST_THRESHOLD * mean
-            penalty = strength / threshold if strength > 0 and threshold > 0 else float(np.mean(h))
+            guess = float(self._mean_power[of_psf])
+            penalty = strength / threshold if strength > 0 and threshold > 0 else guess
             mu[1, c] = FIRST_PIXEL_SHARE * penalty
             if tv and tv.weight > 0:
                 mu[0, c] = penalty

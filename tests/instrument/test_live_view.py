@@ -1,0 +1,180 @@
+"""The live view: the newest frame, nothing queued, every frame accounted for, failures told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceError
+from drivers.stream import FrameStream
+from instrument.bench import open_bench
+from instrument.config_file import parse_config
+from instrument.live import LiveView, live_view
+from recon import Calibration, InputError
+from recon.live import LivePicture, LiveReconstructor, SceneState
+from tests.mocks.free_running import FreeRunningCamera
+
+BENCH = """
+[bench]
+name = "live"
+[camera]
+driver = "simulated"
+exposure_ms = 5
+replay_frames = 4
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+"""
+
+
+class Slow(LiveReconstructor):
+    """Takes a time for each picture, and remembers what it was fed."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.fed: list[int] = []
+        self.at_once = threading.Semaphore(1)
+        self.refined = 0
+        self.settled_after = 3
+
+    def feed(self, image: np.ndarray) -> LivePicture:
+        assert self.at_once.acquire(blocking=False)
+        self.fed.append(int(image[0, 0]) % 1000)
+        self.refined = 0
+        time.sleep(self.seconds)
+        self.at_once.release()
+        return self._picture(0)
+
+    def refine(self, newer: Any = None) -> LivePicture | None:
+        self.refined += 1
+        return self._picture(self.refined) if self.refined <= self.settled_after else None
+
+    def _picture(self, total: int) -> LivePicture:
+        return LivePicture(
+            np.zeros((2, 2), np.float32), 1, "admm", 1, total, SceneState.STILL, 1, False, 1.0, 1.0
+        )
+
+
+def test_the_newest_frame_is_next_and_no_queue_grows() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.deep_ring = 1000
+    slow = Slow(0.03)
+    stream = FrameStream(camera, 3)
+    with LiveView(stream, slow) as view:
+        time.sleep(0.6)
+        status = view.status
+        assert len(stream.ring) <= 3
+    gaps = np.diff(slow.fed)
+    assert (gaps > 0).all()
+    assert np.median(gaps) > 3  # frames in between are passed over ...
+    assert status.passed_over > 3 * status.pictures  # ... and counted
+    assert slow.fed[-1] <= status.pictures + status.passed_over + 30
+    assert status.pictures >= 3
+    assert not camera.is_streaming
+    assert not view.is_running
+
+
+def test_latency_stays_bounded_while_the_camera_is_faster() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.deep_ring = 1000
+    ages: list[float] = []
+    with LiveView(FrameStream(camera, 3), Slow(0.02)) as view:
+        seen = None
+        for _ in range(15):
+            seen = view.wait_newer(seen, 5.0)
+            assert seen is not None
+            ages.append(seen.latency_ms)
+    assert np.median(ages[8:]) < 2 * np.median(ages[:8]) + 20
+
+
+def test_a_picture_is_refined_while_no_newer_frame_comes_then_the_view_rests() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.n_frames = 1
+    slow = Slow(0.0)
+    with LiveView(FrameStream(camera, 3), slow) as view:
+        results = []
+        seen = None
+        while (seen := view.wait_newer(seen, 0.5)) is not None:
+            results.append(seen)
+    assert results[-1].refined
+    assert results[-1].picture.total_iterations == 3
+    assert slow.refined == 4
+
+
+def test_iterating_shows_every_picture_and_ends_with_the_view() -> None:
+    camera = FreeRunningCamera(0.002)
+    view = LiveView(FrameStream(camera, 3), Slow(0.005))
+    for count, result in enumerate(view):
+        assert result.metadata.frame_id >= 0
+        if count == 3:
+            break
+    view.close()
+    assert not camera.is_streaming
+
+
+def test_a_running_stream_is_left_running() -> None:
+    camera = FreeRunningCamera(0.002)
+    with camera.stream(4) as stream:
+        with LiveView(stream, Slow(0.0)) as view:
+            assert view.wait_newer(None, 5.0) is not None
+        assert stream.is_running
+
+
+def test_a_camera_that_fails_is_told_to_who_waits_and_by_close() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.fail_at = 5
+    view = LiveView(FrameStream(camera, 3), Slow(0.0)).start()
+
+    def watch() -> None:
+        seen = None
+        while True:
+            seen = view.wait_newer(seen, 5.0) or seen
+
+    with pytest.raises(DeviceError, match="unplugged"):
+        watch()
+    with pytest.raises(DeviceError, match="unplugged"):
+        view.close()
+
+
+def test_frames_that_do_not_fit_end_the_view_with_the_reason() -> None:
+    camera = FreeRunningCamera(0.002)
+    calibration = Calibration(
+        np.random.default_rng(0).random((1, 1, 32, 32), np.float32), np.full((1, 3), np.nan)
+    )
+    view = live_view(FrameStream(camera, 3), calibration).start()
+    with pytest.raises(InputError, match="PSF 32 x 32"):
+        view.wait_newer(None, 5.0)
+    with pytest.raises(InputError, match="PSF 32 x 32"):
+        view.close()
+
+
+def test_an_error_inside_the_view_keeps_its_place() -> None:
+    camera = FreeRunningCamera(0.002)
+    camera.fail_at = 1
+    mine = RuntimeError("mine")
+    view = LiveView(FrameStream(camera, 3), Slow(0.0)).start()
+    view.wait_newer(None, 5.0)
+    time.sleep(0.1)
+    view.__exit__(RuntimeError, mine, None)
+    assert any("unplugged" in note for note in mine.__notes__)
+
+
+def test_a_bench_shows_its_scene_live() -> None:
+    with open_bench(parse_config(BENCH, None)) as bench:
+        bench.scene_on()
+        bench.camera.snap()  # renders what is replayed
+        shape = bench.camera.frame_shape[:2]
+        psf = np.zeros(shape, np.float32)
+        psf[tuple(n // 2 for n in shape)] = 1.0
+        calibration = replace(Calibration(psf[None, None], np.full((1, 3), np.nan)), geometry=bench.geometry)
+        with bench.live(calibration, budget_ms=50.0) as live:
+            result = live.wait_newer(None, 60.0)
+    assert result is not None
+    assert result.picture.budget_ms == 50.0
+    assert result.picture.image.ndim == len(bench.camera.frame_shape)

@@ -1,0 +1,249 @@
+"""Live pictures: as good as converged while the scene is still, coarser rather than later."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import Calibration, InputError, NoiseModel, reconstruct
+from recon.live import LiveReconstructor, SceneState, SceneWatch
+from recon.live.level import binned
+from recon.live.pace import Cost, Pace
+from recon.metrics import psnr
+
+SHAPE = (64, 96)
+NOISE = NoiseModel(read_noise=2.0, counts_per_electron=0.05)
+
+
+def spots_psf(shape: tuple[int, int] = SHAPE, count: int = 40) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    psf = np.zeros(shape)
+    for cy, cx in rng.uniform((8, 8), (shape[0] - 8, shape[1] - 8), (count, 2)):
+        psf += np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / (2 * 1.3**2))
+    return (psf / psf.sum()).astype(np.float32)
+
+
+def photograph(column: float, seed: int, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """A frame of discs, spot by spot at continuous places (no FFT, no grid), with photon and read noise."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    centres = rng.uniform((8, 8), (shape[0] - 8, shape[1] - 8), (40, 2)) - np.array(shape) // 2
+    image = np.zeros(shape)
+    for dy, dx, light in ((-6.3, -9.1, 1.0), (7.2, 4.4, 0.6), (0.4, 14.7, 0.8)):
+        for cy, cx in centres + np.array(shape) // 2:
+            image += light * np.exp(-((y - cy - dy) ** 2 + (x - cx - dx - column) ** 2) / (2 * 2.2**2))
+    noisy = np.random.default_rng(seed)
+    counts = noisy.poisson(image * 8000) * NOISE.counts_per_electron + noisy.normal(0, 2, shape)
+    return np.clip(np.round(counts + 20), 0, 4095).astype(np.uint16)
+
+
+def live(**settings: object) -> LiveReconstructor:
+    settings = {"background": 20.0, "budget_ms": 25.0, "noise": NOISE, "coarsest": 1, **settings}
+    return LiveReconstructor(spots_psf(), **settings)  # type: ignore[arg-type]
+
+
+def slow(reconstructor: LiveReconstructor, factor: float) -> None:
+    """Have the reconstructor believe that everything takes ``factor`` times as long, from now on."""
+    reconstructor._pace._ratios.extend([factor] * 7)
+
+
+def test_a_still_scene_converges_to_the_reconstruction() -> None:
+    reconstructor = live(average=1)
+    frame = photograph(0, 1)
+    first = reconstructor.feed(frame)
+    assert first.scene is SceneState.NEW
+    assert (first.binning, first.method, first.frames) == (1, "admm", 1)
+    reference = reconstruct(
+        frame, spots_psf(), method="admm-sensor", background=20.0, noise=NOISE, iterations=200, tolerance=0
+    ).image
+    picture = first
+    for _ in range(200):
+        picture = reconstructor.refine() or picture
+    assert picture.settled
+    assert picture.total_iterations > first.iterations or first.settled
+    assert reconstructor.refine() is None
+    assert psnr(picture.image, reference) > 45
+    assert "settled" in picture.quality
+
+
+def test_averaging_frames_of_a_still_scene_lessens_noise() -> None:
+    clean = reconstruct(
+        np.mean([photograph(0, seed) for seed in range(100, 140)], axis=0) - 20.0,
+        spots_psf(),
+        method="admm-sensor",
+        noise=NOISE,
+        iterations=300,
+    ).image
+    alone, averaging = live(average=1), live(average=8)
+    for seed in range(12):
+        one, many = (r.feed(photograph(0, seed)) for r in (alone, averaging))
+    assert (one.frames, many.frames) == (1, 8)
+    assert many.scene is SceneState.STILL
+    assert psnr(many.image, clean) > psnr(one.image, clean) + 1
+
+
+def test_warm_start_follows_a_moving_scene_and_a_cut_begins_anew() -> None:
+    reconstructor = live()
+    reconstructor.feed(photograph(0, 0))
+    moved = reconstructor.feed(photograph(0.5, 1))
+    assert (moved.scene, moved.frames) == (SceneState.MOVING, 1)
+    assert moved.total_iterations > moved.iterations
+    assert np.unravel_index(np.argmax(moved.image), SHAPE)[1] >= 22
+    cut = reconstructor.feed(photograph(0, 2)[:, ::-1])
+    assert cut.scene is SceneState.NEW
+    assert cut.total_iterations == cut.iterations
+
+
+def test_quality_gives_way_not_time() -> None:
+    reconstructor = live(coarsest=8, budget_ms=500.0)
+    fine = reconstructor.feed(photograph(0, 0))
+    assert fine.binning == 1
+    cost = reconstructor._pace.costs[1]
+    # Room for one iteration and a half: too few, so the pixels get coarser, after a few frames.
+    reconstructor.budget_ms = cost.fixed_ms + 1.5 * cost.step_ms
+    binnings = [reconstructor.feed(photograph(0.5 * (n % 2), n)).binning for n in range(6)]
+    assert binnings[0] == 1
+    assert max(binnings) > 1
+    # Room for nothing: the Wiener filter.
+    slow(reconstructor, 1e5)
+    for n in range(6):
+        rough = reconstructor.feed(photograph(3 * n, n))
+        slow(reconstructor, 1e5)
+    assert rough.method == "wiener"
+    assert rough.binning == 4  # of 64 rows, no coarser
+    assert rough.image.shape == (16, 24)
+    assert "Wiener filter" in rough.quality
+    assert "binned 4 x 4" in rough.quality
+
+
+def test_brightness_does_not_depend_on_binning() -> None:
+    pictures = [live(finest=b, coarsest=b).feed(photograph(0, 0)) for b in (1, 2, 4)]
+    sums = [float(p.image.sum()) * p.binning**2 for p in pictures]
+    assert sums == pytest.approx([sums[0]] * 3, rel=0.1)
+
+
+def test_refining_ends_when_a_newer_frame_is_there() -> None:
+    reconstructor = live()
+    reconstructor.feed(photograph(0, 0))
+    reconstructor._settled = False
+    refined = reconstructor.refine(lambda: True)
+    assert refined is not None
+    assert refined.iterations == 1
+
+
+def test_colour_and_frames_finer_than_the_psf() -> None:
+    psf = np.stack([spots_psf()] * 3, axis=2)
+    frame = np.stack([photograph(0, seed) for seed in range(3)], axis=2)
+    picture = LiveReconstructor(psf, background=20.0, budget_ms=25.0, coarsest=1).feed(frame)
+    assert picture.image.shape == (*SHAPE, 3)
+    assert picture.image.flags.c_contiguous
+    fine = np.kron(photograph(0, 0), np.ones((2, 2), np.uint16))
+    coarse = live().feed(photograph(0, 0))
+    assert psnr(live().feed(fine).image, coarse.image) > 60
+
+
+def test_calibration_with_background_and_depths() -> None:
+    psfs = np.stack([spots_psf(), np.roll(spots_psf(), 5, 1)])[:, None]
+    places = np.array([[0, 0, 1000.0], [0, 0, 2000.0]])
+    calibration = Calibration(psfs, places, np.full((1, *SHAPE), 20.0, np.float32))
+    with pytest.raises(InputError, match="z_um"):
+        LiveReconstructor(calibration)
+    reconstructor = LiveReconstructor(calibration, z_um=1000.0, noise=NOISE, budget_ms=25.0, coarsest=1)
+    assert reconstructor.psf_z_um == 1000.0
+    assert psnr(reconstructor.feed(photograph(0, 0)).image, live().feed(photograph(0, 0)).image) > 60
+
+
+@pytest.mark.parametrize(
+    ("frame", "says"),
+    [
+        (np.zeros((10, 10), np.uint16), "10 x 10 pixels and the PSF 64 x 96"),
+        (np.zeros((128, 96), np.uint16), "whole factor"),
+        (np.full(SHAPE, np.nan, np.float32), "not finite"),
+        (np.zeros(5, np.uint16), "must be"),
+    ],
+)
+def test_unusable_frames_are_refused(frame: np.ndarray, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        live().feed(frame)
+
+
+@pytest.mark.parametrize("settings", [{"budget_ms": 0}, {"finest": 3, "coarsest": 2}, {"average": 0}])
+def test_unusable_settings_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(settings))):
+        live(**settings)
+
+
+def test_a_change_of_format_needs_a_restart() -> None:
+    reconstructor = live()
+    reconstructor.feed(photograph(0, 0))
+    fine = np.kron(photograph(0, 0), np.ones((2, 2), np.uint16))
+    with pytest.raises(InputError, match="restart"):
+        reconstructor.feed(fine)
+    reconstructor.restart()
+    assert reconstructor.feed(fine).scene is SceneState.NEW
+
+
+# Whether the scene stands still ----------------------------------------------------------------------
+@pytest.mark.parametrize("photons", [0.3, 30, 3000])
+def test_noise_alone_is_still_whatever_its_size(photons: float) -> None:
+    light = photograph(0, 0).astype(float) / 100
+    rng = np.random.default_rng(3)
+    watch = SceneWatch()
+    states = [watch.see(rng.poisson(light * photons)[None].astype(np.float32)) for _ in range(20)]
+    assert states == [SceneState.NEW] + [SceneState.STILL] * 19
+    assert watch.count == 8
+
+
+def test_a_flickering_lamp_is_no_movement_but_a_shift_of_half_a_pixel_is() -> None:
+    watch = SceneWatch()
+    for seed, gain in enumerate((1.0, 1.1, 0.9)):
+        state = watch.see(gain * photograph(0, seed)[None].astype(np.float32))
+    assert state is SceneState.STILL
+    assert watch.see(photograph(0.5, 9)[None].astype(np.float32)) is SceneState.MOVING
+
+
+def test_a_slow_drift_is_noticed_because_frames_are_compared_with_their_mean() -> None:
+    watch = SceneWatch(average=8)
+    states = [watch.see(photograph(0.02 * n, n)[None].astype(np.float32)) for n in range(60)]
+    assert SceneState.MOVING in states
+
+
+def test_identical_frames_are_still() -> None:
+    watch = SceneWatch()
+    frame = np.zeros((1, 32, 32), np.float32)
+    assert [watch.see(frame) for _ in range(2)] == [SceneState.NEW, SceneState.STILL]
+
+
+# The pace -------------------------------------------------------------------------------------------
+def test_pace_goes_coarser_soon_and_finer_late() -> None:
+    pace = Pace([1, 2, 3, 4])
+    pace.costs = {1: Cost(2, 12, 4)}
+    assert pace.cost(2) == Cost(0.5, 3, 1)
+    assert pace.fits(1, 33)
+    for _ in range(7):
+        pace.learn(30.0, 10.0)
+    assert pace.busy == 3.0
+    assert [pace.next_level(1, 33) for _ in range(4)] == [1, 1, 2, 1]
+    for _ in range(7):
+        pace.learn(10.0, 10.0)
+    finer = [pace.next_level(2, 40) for _ in range(25)]
+    assert finer.index(1) == 19
+    assert pace.next_level(2, 27) == 2  # level 1 would fit, but with no room to spare
+
+
+def test_pace_takes_one_slow_picture_for_what_it_is() -> None:
+    pace = Pace([1])
+    pace.costs = {1: Cost(2, 12, 4)}
+    for took in (10.0, 10.0, 5000.0, 10.0):
+        pace.learn(took, 10.0)
+    assert pace.busy == 1.0
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 5])
+def test_binning_averages_blocks(factor: int) -> None:
+    image = np.random.default_rng(0).integers(0, 65536, (2, 31, 47)).astype(np.uint16)
+    height, width = (n // factor for n in image.shape[1:])
+    cut = image[:, : height * factor, : width * factor].astype(float)
+    expected = cut.reshape(2, height, factor, width, factor).mean(axis=(2, 4))
+    np.testing.assert_allclose(binned(image, factor), expected, rtol=1e-6)
