@@ -19,8 +19,8 @@ from numba import njit
 Floats = npt.NDArray[np.float64]
 Optics = Literal["random", "regular", "smooth"]
 
-LEAST_SIGMA_PX = 0.7
-"""Spots in best focus: about what a pixel and diffraction leave of a point."""
+SPOT_PX = 0.7
+"""Deviation of spots in best focus: about what a pixel and diffraction leave of a point."""
 LENSLETS, PATCHES = 49, 784
 """Facets over the aperture: lenslets as on the dissertation's diffusers, patches of a smooth one to sample
 its caustics."""
@@ -44,7 +44,7 @@ def stamp(image, y, x, sigma, light):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _cast(image, points, facets, pitch, distance, width, power, aberration, fall_off):  # type: ignore[no-untyped-def]
+def _cast(image, points, facets, pitch, distance, width, power, aberration, fall_off, spot):  # type: ignore[no-untyped-def]
     height, columns = image.shape
     for p in range(points.shape[0]):
         x, y, z, light = points[p]
@@ -57,7 +57,7 @@ def _cast(image, points, facets, pitch, distance, width, power, aberration, fall
             focus = power * (1 + aberration * oblique)
             # A uniform disc of diameter D has a deviation of D / 4 along each axis.
             blur = width / 4 * abs(1 - distance * (focus - 1 / z)) / pitch
-            sigma = np.sqrt(LEAST_SIGMA_PX**2 + blur**2)
+            sigma = np.sqrt(spot**2 + blur**2)
             reach = int(4 * sigma) + 1
             if not (-reach < row < height + reach and -reach < column < columns + reach):
                 continue
@@ -99,6 +99,8 @@ class LensletCamera:
     fall_off_deg: float = np.inf
     dispersion: float = 0.0
     """Relative change of power and deflection from green to blue, and its negative to red."""
+    spot_px: float = SPOT_PX
+    """Deviation of spots in best focus."""
 
     def light(self, points: npt.ArrayLike, channel: int = 1) -> npt.NDArray[np.float32]:
         """Return the light of points ``(x, y, z, power)``, (n, 4), micrometres, on the sensor.
@@ -120,6 +122,7 @@ class LensletCamera:
             strength * (1 / self.distance_um + 1 / self.focus_um),
             self.aberration,
             np.deg2rad(self.fall_off_deg),
+            self.spot_px,
         )
         return image.astype(np.float32)
 
@@ -146,6 +149,7 @@ def build_camera(
     aberration: float = 0.0,
     fall_off_deg: float = np.inf,
     dispersion: float = 0.0,
+    spot_px: float = SPOT_PX,
 ) -> LensletCamera:
     """Build a camera whose proportions do not depend on its number of pixels.
 
@@ -159,6 +163,8 @@ def build_camera(
         From the diffuser to the sensor, relative to the sensor's longer side.
     focus : float
         Depth of best focus, relative to that distance.
+    aberration, fall_off_deg, dispersion, spot_px
+        As :class:`LensletCamera`.
     """
     shape = (size, size) if isinstance(size, int) else size
     rng = np.random.default_rng(seed)
@@ -178,7 +184,16 @@ def build_camera(
     facets = np.column_stack([places * extent, tilts, light / count])
     lens = 0.0 if optics == "smooth" else float(extent.mean()) / side
     return LensletCamera(
-        shape, pitch_um, distance_um, facets, lens, focus * distance_um, aberration, fall_off_deg, dispersion
+        shape=shape,
+        pitch_um=pitch_um,
+        distance_um=distance_um,
+        facets=facets,
+        facet_um=lens,
+        focus_um=focus * distance_um,
+        aberration=aberration,
+        fall_off_deg=fall_off_deg,
+        dispersion=dispersion,
+        spot_px=spot_px,
     )
 
 

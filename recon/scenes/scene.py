@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.noise import NoiseModel
 from recon.scenes import content
-from recon.scenes.lenslets import LensletCamera, Optics, build_camera
+from recon.scenes.lenslets import SPOT_PX, LensletCamera, Optics, build_camera
 from recon.types import Calibration, Geometry
 
 Family = Literal["dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"]
@@ -43,7 +43,7 @@ class SceneSpec:
         Range of the depth that holds anything, from 0 (``z_far``) to 1 (``z_near``).
     optics : str
         ``"random"`` or ``"regular"`` lenslets, or a ``"smooth"`` diffuser.
-    fall_off_deg, aberration, dispersion : float
+    fall_off_deg, aberration, dispersion, spot_px : float
         As :class:`~recon.scenes.lenslets.LensletCamera`.
     channels : int
         1 or 3.
@@ -83,6 +83,7 @@ class SceneSpec:
     fall_off_deg: float = np.inf
     aberration: float = 0.0
     dispersion: float = 0.0
+    spot_px: float = SPOT_PX
     channels: int = 1
     colourful: bool = False
     photons: float = 4000.0
@@ -208,6 +209,7 @@ def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
         aberration=spec.aberration,
         fall_off_deg=spec.fall_off_deg,
         dispersion=spec.dispersion,
+        spot_px=spec.spot_px,
     )
     camera = calibrated_camera.moved((spec.drift_px, spec.drift_px), 1 + spec.drift_scale, spec.drift_deg)
     places = _places(spec, scene_rng)

@@ -1,0 +1,73 @@
+"""The scenes of the auto-model benchmark: what it was tuned on, and what it is judged by.
+
+The judged list was fixed before anything was tuned. No seed occurs in both.
+"""
+
+from __future__ import annotations
+
+from recon.scenes import SceneSpec, spec_of
+
+P, S, B, D, M = "dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"
+PRIORS = {P: "tv", S: "tv", B: "l1", D: "tv", M: "tv"}
+
+TUNING: tuple[tuple[str, SceneSpec], ...] = tuple(
+    (name, spec_of(family, seed=seed, **changes))
+    for seed, (name, family, changes) in enumerate(
+        [
+            ("t-dense-plain", P, {"grid": 3}),
+            ("t-dense-fall-off", P, {"grid": 5, "fall_off_deg": 18.0}),
+            ("t-dense-noisy", P, {"grid": 5, "fall_off_deg": 22.0, "photons": 300.0}),
+            ("t-sparse-aberrated", S, {"grid": 5, "aberration": 3.0}),
+            ("t-sparse-stray", S, {"grid": 3, "background": 0.8}),
+            ("t-sparse-soft", S, {"grid": 3, "spot_px": 2.2}),
+            ("t-beads-one-layer", B, {"size": 40, "depths": 6, "grid": 3, "layers": (0.5, 0.8)}),
+            ("t-beads-fall-off", B, {"size": 40, "depths": 6, "grid": 3, "fall_off_deg": 18.0}),
+            ("t-beads-stray", B, {"size": 40, "depths": 6, "grid": 3, "background": 0.6}),
+            ("t-volume", D, {"size": 40, "depths": 5, "grid": 3}),
+            ("t-volume-fall-off", D, {"size": 40, "depths": 5, "grid": 3, "fall_off_deg": 18.0}),
+            ("t-microscope", M, {"size": 40, "depths": 5, "grid": 3}),
+        ],
+        start=1,
+    )
+)
+
+JUDGED: tuple[tuple[str, SceneSpec], ...] = tuple(
+    (name, spec_of(family, seed=seed, **changes))
+    for seed, (name, family, changes) in enumerate(
+        [
+            # Pictures, from easy to hard.
+            ("sparse-bright", S, {"grid": 3, "photons": 2e4}),
+            ("sparse-dim", S, {"grid": 3, "photons": 250.0}),
+            ("sparse-fall-off", S, {"grid": 5, "fall_off_deg": 15.0}),
+            ("sparse-aberrated", S, {"grid": 5, "aberration": 5.0, "photons": 8000.0}),
+            ("sparse-erased", S, {"grid": 3, "erased": 0.4, "fall_off_deg": 20.0}),
+            ("sparse-stray", S, {"grid": 3, "background": 0.5, "photons": 1500.0}),
+            ("sparse-soft", S, {"grid": 3, "spot_px": 2.5, "photons": 6000.0}),
+            ("sparse-colour", S, {"size": 48, "grid": 3, "channels": 3}),
+            ("dense", P, {"grid": 3, "photons": 8000.0}),
+            ("dense-dim", P, {"grid": 5, "fall_off_deg": 16.0, "photons": 500.0}),
+            ("dense-fall-off", P, {"grid": 5, "fall_off_deg": 14.0, "photons": 1e4}),
+            ("dense-wide", P, {"grid": 5, "field": 1.3, "fall_off_deg": 24.0}),
+            ("dense-smooth-diffuser", P, {"size": 48, "grid": 3, "optics": "smooth"}),
+            # Beads in a volume.
+            ("beads", B, {"size": 40, "depths": 6, "grid": 3, "photons": 2000.0}),
+            ("beads-few", B, {"size": 48, "depths": 6, "grid": 3, "density": 0.3}),
+            ("beads-many", B, {"size": 40, "depths": 6, "grid": 3, "density": 2.5}),
+            ("beads-layer", B, {"size": 48, "depths": 8, "grid": 3, "layers": (0.1, 0.35)}),
+            ("beads-fall-off", B, {"size": 40, "depths": 6, "grid": 3, "fall_off_deg": 14.0}),
+            ("beads-dim", B, {"size": 40, "depths": 6, "grid": 3, "photons": 60.0, "fall_off_deg": 20.0}),
+            ("beads-stray", B, {"size": 40, "depths": 6, "grid": 3, "background": 1.0}),
+            # Volumes that are full of things.
+            ("volume", D, {"size": 40, "depths": 5, "grid": 3, "density": 0.7}),
+            ("volume-layer", D, {"size": 40, "depths": 6, "grid": 3, "layers": (0.55, 0.9)}),
+            ("volume-fall-off", D, {"size": 40, "depths": 5, "grid": 3, "fall_off_deg": 15.0}),
+            ("volume-dim", D, {"size": 40, "depths": 5, "grid": 3, "photons": 300.0, "density": 1.5}),
+            # Under the microscope: fall-off and stray light by default.
+            ("microscope", M, {"size": 40, "depths": 5, "grid": 3, "photons": 6000.0}),
+            ("microscope-dim", M, {"size": 40, "depths": 5, "grid": 3, "photons": 250.0}),
+            ("microscope-thin", M, {"size": 40, "depths": 6, "grid": 3, "layers": (0.3, 0.5)}),
+            ("microscope-clean", M, {"size": 40, "depths": 5, "grid": 3, "background": 0.0}),
+        ],
+        start=101,
+    )
+)
