@@ -8,7 +8,7 @@ from __future__ import annotations
 from recon.scenes import SceneSpec, spec_of
 
 P, S, B, D, M = "dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"
-PRIORS = {P: "tv", S: "tv", B: "l1", D: "tv", M: "tv"}
+FAMILY_PRIOR = {P: "tv", S: "tv", B: "l1", D: "tv", M: "tv"}
 
 TUNING: tuple[tuple[str, SceneSpec], ...] = tuple(
     (name, spec_of(family, seed=seed, **changes))

@@ -98,7 +98,7 @@ def register(
     peak = _Correlation(_fine(resized), _fine(second)).peak(window)
     # In the shrunken (or enlarged) image one pixel is ``scale`` pixels of the PSF.
     rows, columns = scale * peak.row, scale * peak.column
-    back = _moved(resized, -peak.row, -peak.column)
+    back = moved(resized, -peak.row, -peak.column)
     return Registration(rows, columns, scale, _similarity(back, second, peak), peak.prominence)
 
 
@@ -112,7 +112,7 @@ def aligned(psf: Array, registration: Registration) -> Array:
     if registration.scale != 1:
         values = scaled(values, 1 / registration.scale)
     by = -registration.rows / registration.scale, -registration.columns / registration.scale
-    return _moved(values, *by)
+    return moved(values, *by)
 
 
 def depth_scale(z_um: float, reference_z_um: float, distance_um: float) -> float:
@@ -277,15 +277,15 @@ def _fine(image: Array) -> Array:
     return fine
 
 
-def _moved(image: Array, rows: float, columns: float) -> Array:
+def moved(image: Array, rows: float, columns: float) -> Array:
     """Return ``image`` (..., height, width) moved by fractions of a pixel; zeros move in."""
     if rows == round(rows) and columns == round(columns):
         return shifted(image, round(rows), round(columns))
     from scipy import ndimage
 
     by = (0.0,) * (image.ndim - 2) + (rows, columns)
-    moved: Array = ndimage.shift(np.asarray(image, np.float32), by, order=3, mode="constant")
-    return np.maximum(moved, 0) if image.min() >= 0 else moved
+    result: Array = ndimage.shift(np.asarray(image, np.float32), by, order=3, mode="constant")
+    return np.maximum(result, 0) if image.min() >= 0 else result
 
 
 def _similarity(back: Array, reference: Array, peak: _Peak) -> float:

@@ -12,7 +12,7 @@ from recon.checks import select_psf
 from recon.errors import InputError
 from recon.operators.local_convolution import FieldOfPsfs
 from recon.operators.low_rank import principal_psfs
-from recon.registration import aligned, expected_shift, register, shifted
+from recon.registration import Registration, aligned, expected_shift, moved, register
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -62,9 +62,12 @@ class Depths:
         """Root mean square difference of the registered PSFs from the central one, relative to it."""
         differences = norms = 0.0
         for central, field in zip(self.central, self.fields, strict=True):
-            seen = np.stack([shifted(shifted(central, *p), *-p) for p in np.rint(field.points).astype(int)])
-            differences += float(np.sum((field.psfs - seen).astype(np.float64) ** 2))
-            norms += float(np.sum(seen.astype(np.float64) ** 2))
+            for psf, (rows, columns) in zip(field.psfs, field.points, strict=True):
+                # There and back between pixels as the registered one came, so that interpolation is no error.
+                seen = moved(moved(central, rows, columns), -rows, -columns)
+                shown = _shown(psf.shape[1:], rows, columns)
+                differences += float(np.sum((psf - seen)[:, shown].astype(np.float64) ** 2))
+                norms += float(np.sum(seen[:, shown].astype(np.float64) ** 2))
         return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
 
 
@@ -117,9 +120,50 @@ def _registered(
                 )
             warnings.append(f"{trouble}; it was placed by its source's position (Kuo 2020, Eq. 5.2).")
             found = replace(found, rows=near[0], columns=near[1])
-        registered.append(aligned(psf, found))
+        registered.append(_completed(aligned(psf, found), reference, found))
         points.append((found.rows, found.columns))
     return FieldOfPsfs(np.stack(registered), points), warnings
+
+
+def _shown(shape: tuple[int, ...], rows: float, columns: float) -> npt.NDArray[np.bool_]:
+    """Tell which pixels of a PSF registered from a displacement were photographed.
+
+    Registration between pixels mixes the outermost row and column with the dark beyond: they do not count.
+    """
+    inside = []
+    for n, by in zip(shape, (rows, columns), strict=True):
+        place = np.arange(n) + by
+        inside.append((place >= (by != round(by))) & (place <= n - 1 - (by != round(by))))
+    return np.asarray(inside[0][:, None] & inside[1])
+
+
+def _completed(psf: Array, reference: Array, found: Registration) -> Array:
+    """Fill in what a registered PSF's photograph did not show: the central one, as bright as the rest says.
+
+    A source at the field's edge throws part of its pattern beside the sensor. Seen from there that part is
+    never missed, but sources between it and the axis, which the local model takes from both, throw it onto
+    the sensor. How bright it is there is a line through the ratio of both PSFs where both show.
+    """
+    height, width = psf.shape[1:]
+    rows, columns = np.arange(height)[:, None], np.arange(width)
+    shown = _shown((height, width), found.rows, found.columns)
+    if shown.all() or not shown.any():
+        return psf
+    terms = np.broadcast_arrays(
+        np.ones(()), rows / height - 0.5, columns / width - 0.5, np.zeros(shown.shape)
+    )
+    completed = psf.copy()
+    for image, central in zip(completed, reference, strict=True):
+        light = image[shown].astype(np.float64)
+        basis = np.stack([t[shown] * central[shown] for t in terms[:3]])
+        power = float(basis[0] @ basis[0])
+        if power == 0:
+            continue
+        mean = max(float(basis[0] @ light) / power, 0.0)
+        coefficients = np.linalg.lstsq(basis.T, light, rcond=1e-3)[0]
+        gain = np.clip(sum(c * t for c, t in zip(coefficients, terms, strict=False)), 0, 1.5 * mean)
+        image[~shown] = (gain * central)[~shown]
+    return completed
 
 
 def _expected(calibration: Calibration, k: int, central: int) -> tuple[float, float] | None:
