@@ -22,6 +22,11 @@ from recon.threads import in_blocks
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
 
+SETTLED = 1e-3
+"""Relative residuals below which a split keeps its penalty. What one iteration changes by then depends on
+which pixel happens to leave its bound in it (seen to differ tenfold between float32 and float64), which says
+nothing about the balance."""
+
 
 class PriorSplits:
     """States of the splits for total variation plus a separable prior.
@@ -113,7 +118,7 @@ class PriorSplits:
 
         As in Wohlberg 2017, for each split on its own: ``mu sqrt(primal / dual)``, the residuals relative to
         the norms of split variable and multiplier. Unlike a fixed constant this follows exposure, size and
-        density of the scene by itself.
+        density of the scene by itself. A split whose residuals are both below ``SETTLED`` keeps its own.
         """
         k, s = self._kernels, self.channel_sums()
         splits = (
@@ -124,6 +129,7 @@ class PriorSplits:
         for mu, columns in zip(balanced, splits, strict=True):
             primal, multiplier, change, norm = s[:, columns].T
             known = (s[:, columns] > 0).all(axis=1)
+            known &= (primal > SETTLED**2 * norm) | (change > SETTLED**2 * multiplier)
             unbalance = primal[known] / change[known] * (multiplier[known] / norm[known])
             mu[known] *= unbalance**0.25  # of squared norms
         return balanced

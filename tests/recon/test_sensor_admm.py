@@ -123,7 +123,7 @@ def test_float32_follows_float64():
     prior = PRIORS["tv"]
     single, double = (run(*problem(dtype=d), prior, 500, 0).solution for d in (np.float32, np.float64))
     assert single.dtype == np.float32
-    assert np.linalg.norm(single - double) < 3e-4 * np.linalg.norm(double)
+    assert np.linalg.norm(single - double) < 1e-4 * np.linalg.norm(double)
 
 
 def test_does_not_depend_on_threads():
