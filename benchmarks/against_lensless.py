@@ -309,7 +309,7 @@ def settled_penalties(problem: Problem) -> tuple[float, ...]:
     for _ in range(SETTLED_AFTER):
         solver.step()
         solver.iteration += 1
-    return tuple(float(mu) for mu in solver.checkpoint()["_mu"].mean(axis=1))
+    return tuple(float(mu) for mu in solver.penalties.mean(axis=1))
 
 
 def pace(contenders: list[Contender], rounds: int) -> np.ndarray:

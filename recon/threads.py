@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
@@ -71,3 +71,8 @@ def in_blocks(kernel: Callable[[int, int], object], length: int, *, grain: int =
     kernel(edges[0], edges[1])
     for other in others:
         other.result()
+
+
+def over_rows(kernel: Callable[..., object], first: Sized, *args: object) -> None:
+    """Run ``kernel(start, stop, first, *args)`` over the rows of its first array, shared among threads."""
+    in_blocks(lambda start, stop: kernel(start, stop, first, *args), len(first))

@@ -1,4 +1,4 @@
-"""Compiled sweeps of :mod:`recon.solvers.admm` (imported lazily: numba).
+"""Compiled sweeps of :mod:`recon.solvers.prior_splits` (imported lazily: numba).
 
 Arrays are ``(n_channels, height, width)``. Each channel is cut into strips of rows (``edges``) that do not
 depend on the number of threads, and sums are kept per row, so that results do not depend on it either.
@@ -15,11 +15,10 @@ from numba import njit
 
 # Columns of ``sums``
 # (squared norms; CHANGE: of a split variable; MULTIPLIER: of its scaled dual variable)
-DATA, TV, L1 = 0, 1, 2
-PRIMAL_V, CHANGE_V, NORM_V, MULTIPLIER_V = 3, 4, 5, 6
-PRIMAL_U, CHANGE_U, NORM_U, MULTIPLIER_U = 7, 8, 9, 10
-PRIMAL_W, CHANGE_W, NORM_W, MULTIPLIER_W = 11, 12, 13, 14
-N_SUMS = 15
+TV, L1 = 0, 1
+PRIMAL_U, CHANGE_U, NORM_U, MULTIPLIER_U = 2, 3, 4, 5
+PRIMAL_W, CHANGE_W, NORM_W, MULTIPLIER_W = 6, 7, 8, 9
+N_SUMS = 10
 
 # Reordering sums is fine (it is the same for every strip); NaN and infinity must stay what they are.
 FAST = {"reassoc", "contract", "nsz"}
@@ -37,7 +36,7 @@ def save_strip_neighbours(
     """Save what a strip needs of its neighbours before these are overwritten.
 
     ``below[c, s]``: the row of ``y`` after strip ``s``. ``above[c, s]``: the reflected vertical difference
-    state of the row before it, as :func:`sweep` will make it.
+    state of the row before it, as :func:`sweep_priors` will make it.
     """
     n_channels, height, width = y.shape
     spare = np.empty(width, y.dtype)
@@ -94,49 +93,6 @@ def _update_differences(
     sums[CHANGE_U] += change
     sums[NORM_U] += norm
     sums[MULTIPLIER_U] += multiplier
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _update_data(
-    my: Any, t: Any, data: Any, weight: Any, left: int, on_sensor: bool, mu: Any, relax: Any, sums: Any
-) -> None:
-    """Update the data state of one row and put ``mu R(t)`` in the place of ``M y``.
-
-    On valid pixels of the sensor ``prox(t) = (b + mu t) / (1 + mu)``; elsewhere nothing is known and
-    ``prox(t) = t``.
-    """
-    zero = mu - mu
-    primal, change, norm = zero, zero, zero
-    first = left if on_sensor else my.size
-    last = left + data.size if on_sensor else my.size
-    for side in range(2):
-        for j in range(0 if side == 0 else last, first if side == 0 else my.size):
-            step = relax * (my[j] - t[j])
-            new = t[j] + step
-            primal += (my[j] - new) ** 2
-            change += step * step
-            norm += new * new
-            t[j] = new
-            my[j] = mu * new
-    residual, multiplier = zero, zero
-    for j in range(first, last):
-        w, b = weight[j - left], data[j - left]
-        share = w / (w + mu)
-        p = t[j] + share * (b - t[j])
-        new = t[j] + relax * (my[j] - p)
-        p_new = new + share * (b - new)
-        residual += w * (my[j] - b) ** 2
-        primal += (my[j] - p_new) ** 2
-        change += (p_new - p) ** 2
-        norm += p_new * p_new
-        multiplier += (new - p_new) ** 2
-        t[j] = new
-        my[j] = mu * (p_new + p_new - new)
-    sums[DATA] += residual
-    sums[PRIMAL_V] += primal
-    sums[CHANGE_V] += change
-    sums[NORM_V] += norm
-    sums[MULTIPLIER_V] += multiplier
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
@@ -199,58 +155,3 @@ def sweep_priors(
             for j in range(1, width):
                 out[j] = mu_w[c] * rw[j] + mu_u[c] * (rx[j - 1] - rx[j] + ry_above[j] - ry[j])
             ry, ry_above = ry_above, ry
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def sweep(
-    start: int, stop: int, edges: Any, below: Any, above: Any,
-    y: Any, my: Any, t_v: Any, tx: Any, ty: Any, t_w: Any,
-    data: Any, weight: Any, top: int, left: int,
-    mu_v: Any, mu_u: Any, mu_w: Any, threshold_u: Any, threshold_w: Any, lower: Any, upper: Any,
-    relax: Any, isotropic: bool, sums: Any,
-) -> None:  # fmt: skip
-    """Update all split states from ``y`` and ``M y``, and put the next right-hand sides in their place.
-
-    As :func:`sweep_priors`; afterwards ``my`` holds ``mu_v R(t_v)``.
-    """
-    sweep_priors(
-        start, stop, edges, below, above, y, tx, ty, t_w,
-        mu_u, mu_w, threshold_u, threshold_w, lower, upper, relax, isotropic, sums,
-    )  # fmt: skip
-    height = y.shape[1]
-    n_strips = edges.size - 1
-    for strip in range(start, stop):
-        c, s = strip // n_strips, strip % n_strips
-        for i in range(edges[s], edges[s + 1]):
-            on_sensor = top <= i < top + data.shape[1]
-            k = i - top if on_sensor else 0
-            _update_data(
-                my[c, i], t_v[c, i], data[c, k], weight[c, k], left, on_sensor, mu_v[c], relax,
-                sums[c * height + i],
-            )  # fmt: skip
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def solve_spectrum(
-    start: int, stop: int, Y: Any, MY: Any, H: Any, laplace_rows: Any, laplace_columns: Any,
-    mu_v: Any, mu_u: Any, mu_w: Any,
-) -> None:  # fmt: skip
-    """Solve ``(mu_v |H|^2 + mu_u |Psi|^2 + mu_w) y = rhs`` for rows ``start`` to ``stop`` of all channels.
-
-    In: ``Y`` the spectrum of the prior's right-hand side, ``MY`` that of the data's, before the adjoint.
-    Out: the spectra of ``y`` and ``M y``.
-    """
-    _, height, width = Y.shape
-    shared = H.shape[0] == 1
-    for r in range(start, stop):
-        c, i = r // height, r % height
-        h, a, b = H[0 if shared else c, i], Y[c, i], MY[c, i]
-        row, data, columns = mu_w[c] + mu_u[c] * laplace_rows[i], mu_v[c], mu_u[c]
-        for j in range(width):
-            hr, hi = h[j].real, h[j].imag
-            br, bi = b[j].real, b[j].imag
-            scale = data * (hr * hr + hi * hi) + row + columns * laplace_columns[j]
-            yr = (a[j].real + hr * br + hi * bi) / scale
-            yi = (a[j].imag + hr * bi - hi * br) / scale
-            a[j] = complex(yr, yi)
-            b[j] = complex(hr * yr - hi * yi, hr * yi + hi * yr)

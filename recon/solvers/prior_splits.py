@@ -65,28 +65,32 @@ class PriorSplits:
         self._above = np.empty_like(self._below)
         self._sums = np.zeros((len(start) * height, _split_kernels.N_SUMS))
 
-    def sweep(self, relax: float) -> None:
-        """Update all states from ``y`` and write the next right-hand side over it.
+    def sweep(self, relax: float, channel: int | None = None) -> None:
+        """Update the states from ``y`` and write the next right-hand side over it; of one channel, or all.
 
         A ``relax`` of 0 leaves the states as they are.
         """
-        dtype = self.y.dtype
+        dtype, height = self.y.dtype, self.y.shape[1]
         f = dtype.type
-        mu_u, mu_w = self.mu.astype(dtype)
-        threshold_u, threshold_w = (t.astype(dtype) for t in self._thresholds())
+        part = slice(None) if channel is None else slice(channel, channel + 1)
+        y, tx, ty, t_w = self.y[part], self.tx[part], self.ty[part], self.t_w[part]
+        below, above = self._below[part], self._above[part]
+        sums = self._sums if channel is None else self._sums[channel * height : (channel + 1) * height]
+        mu_u, mu_w = self.mu[:, part].astype(dtype)
+        threshold_u, threshold_w = (t[part].astype(dtype) for t in self._thresholds())
         isotropic = bool(self.tv and self.tv.isotropic)
         self._kernels.save_strip_neighbours(
-            self.y, self.tx, self.ty, self._edges, threshold_u, f(relax), isotropic, self._below, self._above
+            y, tx, ty, self._edges, threshold_u, f(relax), isotropic, below, above
         )
 
         def strips(start: int, stop: int) -> None:
             self._kernels.sweep_priors(
-                start, stop, self._edges, self._below, self._above, self.y, self.tx, self.ty, self.t_w,
+                start, stop, self._edges, below, above, y, tx, ty, t_w,
                 mu_u, mu_w, threshold_u, threshold_w,
-                f(self.separable.lower), f(self.separable.upper), f(relax), isotropic, self._sums,
+                f(self.separable.lower), f(self.separable.upper), f(relax), isotropic, sums,
             )  # fmt: skip
 
-        in_blocks(strips, len(self.y) * (len(self._edges) - 1))
+        in_blocks(strips, len(y) * (len(self._edges) - 1))
 
     def solution(self) -> Array:
         """Return the split variable that obeys the separable prior."""

@@ -38,7 +38,7 @@ from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_
 from recon.solvers.prior_splits import PriorSplits
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.structure import as_cropped_convolution
-from recon.threads import in_blocks
+from recon.threads import over_rows
 
 BALANCING = (3, 6, 12, 24, 48, 96, 192)
 """Iterations before which the penalties are balanced; fixed after the last, so that convergence is sure."""
@@ -192,8 +192,10 @@ class SensorAdmm(Solver):
             self._adapt()
             self._splits.sweep(0)
         steps = self.data_steps if self.iteration else max(self.data_steps, FIRST_DATA_STEPS)
-        misfit = sum(self._solve(channel, steps) for channel in range(len(self._y)))
-        self._splits.sweep(self.relax)
+        misfit = 0.0
+        for channel in range(len(self._y)):  # one after the other, so that the caches hold it
+            misfit += self._solve(channel, steps)
+            self._splits.sweep(self.relax, channel)
         primal, dual, change = self._splits.residuals()
         data = float(np.sqrt(misfit)) if np.isfinite(misfit) else np.inf
         return IterationRecord(0, 0.0, 0.5 * data**2 + self._splits.value(), data, primal, dual, change)
@@ -217,9 +219,9 @@ class SensorAdmm(Solver):
         kernels, columns = self._kernels, slice(self._left, self._left + p.shape[1])
 
         fft.rfft(y, out=Y)
-        _over_rows(kernels.predict, Y, E, H, *T, P)
+        over_rows(kernels.predict, Y, E, H, *T, P)
         fft.irfft_strip(P[None], self._top, band[None])
-        _over_rows(kernels.residual, r, band, self._left, self._data[channel], e)
+        over_rows(kernels.residual, r, band, self._left, self._data[channel], e)
         rho_before = 1.0
         for step in range(steps):
             rho = float(np.vdot(r, self._preconditioners[channel].apply(r, self._z)))
@@ -237,20 +239,20 @@ class SensorAdmm(Solver):
             band[:, columns] = p
             fft.rfft_strip(band[None], self._top, P[None])
             # <p, (I + C q C^T) p> by Parseval: the last step needs no transform back.
-            _over_rows(kernels.curvature, P, H, *T, band.shape[1] % 2 == 0, self._row_sums)
+            over_rows(kernels.curvature, P, H, *T, band.shape[1] % 2 == 0, self._row_sums)
             bend = float(np.vdot(p, p)) + float(self._row_sums.sum()) / y.size
             if not bend > 0:
                 break
             length = f(rho / bend)
             e += length * p
-            _over_rows(kernels.advance, Y, E, P, H, *T, length)
+            over_rows(kernels.advance, Y, E, P, H, *T, length)
             if step < steps - 1:
-                _over_rows(kernels.weigh, P, H, *T)
+                over_rows(kernels.weigh, P, H, *T)
                 fft.irfft_strip(P[None], self._top, band[None])
-                _over_rows(kernels.reduce_residual, r, p, band, self._left, length)
+                over_rows(kernels.reduce_residual, r, p, band, self._left, length)
             rho_before = rho
         if self._erased:
-            _over_rows(kernels.impute, self._data[channel], weight, e, f(IMPUTATION))
+            over_rows(kernels.impute, self._data[channel], weight, e, f(IMPUTATION))
         fft.irfft(Y, y.shape[1], out=y)
         return float(np.vdot(e, weight * e if self._erased else e))
 
@@ -311,11 +313,6 @@ def _compile(dtype: np.dtype[Any]) -> None:
     valid = np.arange(4).reshape(1, 2, 2) > 0
     masked = Erasures(valid, (1, 2, 2), dtype) @ tiny
     SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2).step()
-
-
-def _over_rows(kernel: Any, first: Array, *args: Any) -> None:
-    """Run a kernel over the rows of its first array, shared among threads."""
-    in_blocks(lambda start, stop: kernel(start, stop, first, *args), len(first))
 
 
 def fill_smoothly(image: Array, weight: Array) -> None:

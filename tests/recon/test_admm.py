@@ -9,7 +9,7 @@ from recon import fft
 from recon.operators import Erasures, PadCropConvolution
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, LiteralAdmm, Penalties, StoppingRules, StopReason
-from recon.solvers.admm import split_prior
+from recon.solvers.prior_splits import split_prior
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
@@ -187,7 +187,7 @@ def test_settling_a_penalty_leaves_split_and_multiplier(name):
     def split_and_multiplier():
         t = np.stack([solver._tx, solver._ty])
         size = np.linalg.norm(t, axis=0) if "iso" in name else np.abs(t)
-        mu = solver._mu[1][:, None, None]
+        mu = solver._mu[0][:, None, None]
         u = t * np.maximum(1 - 0.05 / mu / np.maximum(size, 1e-300), 0)
         return mu.copy(), u, mu * (t - u)
 
