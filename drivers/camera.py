@@ -208,6 +208,9 @@ class Camera(Device):
     drops_counted_by: ClassVar[str] = "the driver's own count"
     """How ``dropped_before`` is known; recordings say so: ``"device frame numbers"``, ``"timestamps"`` ..."""
 
+    longest_silence_s: ClassVar[float] = 2.0
+    """A free-running camera that sends nothing for this long beyond three exposures has failed."""
+
     frames_in_flight: ClassVar[int] = 2
     """Frames that can be between the sensor and the host while the next one is exposed, at most."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from drivers.camera import Camera
 
 _POLL_S = 0.25
-_SILENCE_S = 2.0
-"""A free-running camera that is silent for this long beyond three exposures has failed."""
 
 
 class Slot(NamedTuple):
@@ -183,7 +181,7 @@ class FrameStream:
         """
         since_ns = time.monotonic_ns() if since_ns is None else since_ns
         if timeout_s is None:
-            timeout_s = _SILENCE_S + (self.n_buffers + 4) * self.camera.exposure_ms / 1e3
+            timeout_s = self.camera.longest_silence_s + (self.n_buffers + 4) * self.camera.exposure_ms / 1e3
         deadline_s = time.monotonic() + timeout_s
         reader = self.reader()
         to_skip = self.camera.frames_in_flight + 1
@@ -234,7 +232,7 @@ class FrameStream:
                     )
                 except DeviceTimeoutError as error:
                     silent_s += time.monotonic() - began_s
-                    limit_s = _SILENCE_S + 3 * self.camera.exposure_ms / 1e3
+                    limit_s = self.camera.longest_silence_s + 3 * self.camera.exposure_ms / 1e3
                     if self.camera.trigger_mode == "free_run" and silent_s > limit_s:
                         raise DeviceTimeoutError(
                             error.device, f"has sent no frame for {silent_s:.1f} s.", error.remedy

@@ -20,7 +20,7 @@ from PySide6.QtCore import QObject, Qt, Signal
 from drivers.errors import StoppedError
 from instrument.errors import BenchError, in_words
 
-DEVICE_LANES = frozenset({"camera", "stage", "led_array", "slm"})
+DEVICE_LANES = frozenset({"camera", "stage", "led_array", "slm", "light"})
 """Jobs on different devices run side by side; on the same device one after the other."""
 _MOST_WAITING = 16
 """Device jobs that may wait for their turn; more are refused: a held key must not fill a queue."""
@@ -147,6 +147,8 @@ class Job(QObject):
         self.title = title
         self.lanes = lanes
         self.exclusive = exclusive
+        self.quiet = False
+        """Whether it is too small to be told of: a value read back every few seconds."""
         self.state = JobState.WAITING
         self.error: BaseException | None = None
         self._work = work
@@ -188,7 +190,7 @@ class JobRunner(QObject):
         self._threads: dict[int, threading.Thread] = {}
 
     # Starting ------------------------------------------------------------------------------------
-    def device(self, title: str, work: Work, lanes: Collection[str]) -> Job:
+    def device(self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False) -> Job:
         """Run a short job on some devices, after those before it that use one of them.
 
         Raises
@@ -200,7 +202,9 @@ class JobRunner(QObject):
             raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
         if len(self._waiting) >= _MOST_WAITING:
             raise BusyError(f"{title}: {_MOST_WAITING} commands are waiting already. Wait a moment.")
-        return self._add(title, work, frozenset(lanes), exclusive=False)
+        job = self._add(title, work, frozenset(lanes), exclusive=False)
+        job.quiet = quiet
+        return job
 
     def exclusive(self, title: str, work: Work) -> Job:
         """Run a job that needs the whole bench: a sweep, a run, a calibration.

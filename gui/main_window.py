@@ -207,6 +207,16 @@ class MainWindow(QMainWindow):
             action.setShortcut(QKeySequence(f"Ctrl+Shift+{number + 1}"))
             action.triggered.connect(partial(self.set_theme, name))
             theme.addAction(action)
+        camera = self.menuBar().addMenu("&Camera")
+        for words, keys, what in (
+            ("&Live view, or hold the last frame", "Ctrl+L", "toggle_live"),
+            ("Take a &photograph", "Ctrl+K", "snap"),
+            ("&Record, or end the recording", "Ctrl+R", "record"),
+        ):
+            action = QAction(words, self)
+            action.setShortcut(QKeySequence(keys))
+            action.triggered.connect(partial(self._on_live_panel, what))
+            camera.addAction(action)
         bench = self.menuBar().addMenu("&Bench")
         for kind in self.session.kinds:
             action = QAction(f"Reconnect the {kind.replace('_', ' ')}", self)
@@ -217,6 +227,10 @@ class MainWindow(QMainWindow):
         leave.setShortcut(QKeySequence("Ctrl+Q"))
         leave.triggered.connect(self.close)
         bench.addAction(leave)
+
+    def _on_live_panel(self, what: str) -> None:
+        """Do what the live view offers, whatever panel is in front."""
+        getattr(self.panel("live"), what)()
 
     def _panel_action(self, name: str, entry: PanelEntry) -> QAction:
         action = QAction(entry.title, self)
@@ -269,6 +283,8 @@ class MainWindow(QMainWindow):
         self.simulated.setText("SIMULATED" if everything else f"SIMULATED: {', '.join(simulated)}")
 
     def _job_started(self, job: Job) -> None:
+        if job.quiet:
+            return
         if job.exclusive or not job.lanes:
             self.job_progress.show()
         self.job_label.setText(f"{job.title} …")
@@ -278,7 +294,7 @@ class MainWindow(QMainWindow):
         self.job_progress.setVisible(bool(running))
         if running:
             self.job_label.setText(f"{running[0].title} …")
-        elif job.state.value == "succeeded":
+        elif job.state.value == "succeeded" and not job.quiet:
             self.job_label.setText(f"{job.title}: done")
 
     def _show_problem(self, level: str, text: str) -> None:

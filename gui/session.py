@@ -13,12 +13,14 @@ from typing import Any, Literal
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
+from drivers.camera import Camera
 from drivers.errors import DeviceError, LimitError, StoppedError
 from gui.jobs import Job, JobContext, JobRunner, Work, words_for
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
 from instrument.live_view import LiveView
 from instrument.safety import StepsFailedError
+from instrument.snapshot import Light, switch_light
 
 DeviceCondition = Literal["closed", "opening", "open", "failed"]
 Level = Literal["debug", "info", "warning", "error"]
@@ -201,9 +203,24 @@ class BenchSession(QObject):
             self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"})
 
     # Jobs ----------------------------------------------------------------------------------------
-    def device_job(self, title: str, work: Work, lanes: Collection[str]) -> Job:
-        """Run a short job on devices; errors as ``JobRunner.device``."""
-        return self.jobs.device(title, work, lanes)
+    def device_job(self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False) -> Job:
+        """Run a short job on devices; errors as ``JobRunner.device``. ``quiet`` ones are not told of."""
+        return self.jobs.device(title, work, lanes, quiet=quiet)
+
+    def camera_job(self, title: str, work: Callable[[Camera], Any], *, idle: bool = False) -> Job:
+        """Run a short job on the camera; with ``idle`` the live view pauses for it (regions, formats ...)."""
+
+        def on_camera(_: JobContext) -> Any:
+            with self.live.paused() if idle else contextlib.nullcontext():
+                return work(self.bench.camera)
+
+        return self.jobs.device(title, on_camera, {"camera"})
+
+    def switch_light(self, light: Light) -> Job:
+        """Light the scene, the point source, or nothing."""
+        return self.jobs.device(
+            f"Light: {light}", lambda _: switch_light(self.bench, light), {"led_array", "light"}
+        )
 
     def exclusive_job(self, title: str, work: Work) -> Job:
         """Run a job that needs the whole bench (a run, a calibration): the live view is ended for it.
@@ -216,14 +233,15 @@ class BenchSession(QObject):
 
         def alone(context: JobContext) -> Any:
             self.live.stop()
-            return work(context)
+            with self.live.watching(lambda: self.bench.newest_frame):
+                return work(context)
 
         return self.jobs.exclusive(title, alone)
 
     def _job_ended(self, job: Job) -> None:
         if job.error is not None:
             self._note_error(job)
-        elif job.lanes:
+        elif job.lanes and not job.quiet:
             self.log("debug", f"{job.title}: done.")
         if job is self._live_job:
             self._live_job = None

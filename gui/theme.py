@@ -116,6 +116,7 @@ QLineEdit, QPlainTextEdit, QTextEdit, QComboBox, QSpinBox, QDoubleSpinBox, QList
   background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; padding: 3px 5px;
   selection-background-color: {c.accent}; selection-color: {c.window}; }}
 QLineEdit:focus, QComboBox:focus, QPlainTextEdit:focus, QListView:focus {{ border-color: {c.accent}; }}
+QComboBox::drop-down {{ border: none; width: 18px; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 *[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
 QLabel#refusal {{ color: {c.warning}; }}

@@ -17,7 +17,7 @@ from drivers.camera import Camera
 from drivers.claim import Claim
 from drivers.device import Device, SharedPart
 from drivers.errors import DeviceLostError, LimitError
-from drivers.frame import FrameMetadata
+from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
@@ -68,6 +68,8 @@ class Bench:
             for kind, device in config.devices.items()
         }
         switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+        self.newest_frame: Frame | None = None
+        """The last frame of a photograph, whoever took it: what a window shows while a run goes on."""
         self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
 
     # Devices -----------------------------------------------------------------------------------
@@ -187,7 +189,9 @@ class Bench:
             if on_frame is not None:
                 on_frame(taken)
 
-        taken = photograph(self.camera, average, on_frame=noticed)
+        taken = photograph(
+            self.camera, average, on_frame=noticed, seen=lambda frame: setattr(self, "newest_frame", frame)
+        )
         return replace(taken, metadata=self.with_surroundings(taken.metadata))
 
     def require_light(self) -> None:
@@ -309,6 +313,17 @@ class Bench:
     def can_switch_scene(self) -> bool:
         """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
         return self._lights.can_switch_scene
+
+    @property
+    def scene_lit(self) -> bool:
+        """Whether the scene is lit, as far as the program knows: an operator's own switching is not seen."""
+        return self._lights.scene_lit
+
+    @property
+    def source_lit(self) -> bool:
+        """Whether any LED is lit, by the last pattern that the LED array confirmed."""
+        leds = self.led_array
+        return leds is not None and leds.is_open and not leds.pattern.is_dark
 
     # Safety ------------------------------------------------------------------------------------
     def stop(self) -> None:

@@ -4,11 +4,67 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from drivers.camera import Camera, Roi
+from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
 from instrument.config import CameraTable
+
+
+@dataclass(frozen=True, slots=True)
+class CameraState:
+    """What a camera says of itself now, and what it offers.
+
+    Attributes
+    ----------
+    exposure_ms, gain, black_level, binning, roi, pixel_format
+        As read back.
+    exposure_limits_ms, gain_limits, binnings, pixel_formats, sensor_shape
+        What it offers.
+    temperature_c : float or None
+        Of the sensor or the camera, where it has a thermometer; degrees Celsius.
+    settings : mapping
+        All of its settings, by name.
+    """
+
+    exposure_ms: float
+    gain: float
+    black_level: float
+    binning: int
+    roi: Roi
+    pixel_format: str
+    exposure_limits_ms: tuple[float, float]
+    gain_limits: tuple[float, float]
+    binnings: tuple[int, ...]
+    pixel_formats: tuple[str, ...]
+    sensor_shape: tuple[int, int]
+    temperature_c: float | None
+    settings: Mapping[str, Setting]
+
+
+def read_camera(camera: Camera) -> CameraState:
+    """Ask a camera for everything; takes as long as the camera needs to answer."""
+    settings = camera.settings()
+    temperature = next(
+        (v for k, v in settings.items() if "temperature" in k.lower() and isinstance(v, int | float)), None
+    )
+    return CameraState(
+        exposure_ms=camera.exposure_ms,
+        gain=camera.gain,
+        black_level=camera.black_level,
+        binning=camera.binning,
+        roi=camera.roi,
+        pixel_format=camera.pixel_format,
+        exposure_limits_ms=camera.exposure_limits_ms,
+        gain_limits=camera.gain_limits,
+        binnings=camera.binnings,
+        pixel_formats=camera.pixel_formats,
+        sensor_shape=camera.sensor_shape,
+        temperature_c=None if temperature is None else float(temperature),
+        settings=dict(settings),
+    )
 
 
 def camera_settings(camera: Camera) -> dict[str, Any]:

@@ -58,6 +58,13 @@ class Lights:
         """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
         return self._ask is not None if self._by_operator else self.scene_switch is not None
 
+    @property
+    def scene_lit(self) -> bool:
+        """Whether the scene is lit, as far as is known."""
+        if self._by_operator:
+            return self._asked.get("the scene", False)
+        return self.scene_switch is not None and self.scene_switch.scene_lit
+
     def switch_source(self, *, lit: bool) -> None:
         """Light or darken the point source; confirmed when this returns."""
         if self._led_array is None:

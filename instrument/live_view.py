@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -53,6 +53,7 @@ class LiveView:
         self._changing = threading.RLock()
         self._stream: FrameStream | None = None
         self._acquired_before = self._dropped_before = 0
+        self._elsewhere: Callable[[], Frame | None] | None = None
         self._history: deque[tuple[float, int]] = deque()
 
     def start(self) -> None:
@@ -107,8 +108,20 @@ class LiveView:
         stream = self._stream
         return None if stream is None else stream.error
 
+    @contextmanager
+    def watching(self, newest: Callable[[], Frame | None]) -> Iterator[None]:
+        """For a block that uses the camera otherwise (a run, a recording), show what that has newest."""
+        self._elsewhere = newest
+        try:
+            yield
+        finally:
+            self._elsewhere = None
+
     def newest(self) -> Frame | None:
         """Return the newest frame, at once; None where nothing runs or came yet."""
+        elsewhere = self._elsewhere
+        if elsewhere is not None:
+            return elsewhere()
         stream = self._stream
         return None if stream is None else stream.newest()
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.camera import Camera
-from drivers.frame import FrameMetadata
+from drivers.frame import Frame, FrameMetadata
 from instrument.errors import BenchError
 
 
@@ -39,11 +39,15 @@ class Snapshot:
 
 
 def photograph(
-    camera: Camera, average: int = 1, *, on_frame: Callable[[int], None] | None = None
+    camera: Camera,
+    average: int = 1,
+    *,
+    on_frame: Callable[[int], None] | None = None,
+    seen: Callable[[Frame], None] | None = None,
 ) -> Snapshot:
     """Take the mean of ``average`` frames, all exposed after this call.
 
-    ``on_frame`` is called with the number of frames taken so far, after each.
+    ``on_frame`` is called with the number of frames taken so far, after each; ``seen`` with the frame itself.
 
     Raises
     ------
@@ -62,6 +66,8 @@ def photograph(
         saturated = max(saturated, frame.metadata.saturated_fraction)
         if average > 1:
             total = np.add(total, frame.image)
+        if seen is not None:
+            seen(frame)
         if on_frame is not None:
             on_frame(taken)
     metadata = replace(frame.metadata, dropped_before=dropped, saturated_fraction=saturated)

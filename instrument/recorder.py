@@ -109,6 +109,7 @@ class Recorder:
         self._batch = min(_BATCH, max(1, self.n_buffers // 4))
         self.on_progress = on_progress
         self._stopping = threading.Event()
+        self._stream: FrameStream | None = None
         self._surroundings: FrameMetadata | None = None
         self._next = 0
         self._written = self._bytes = self._by_device = self._not_written = 0
@@ -119,6 +120,10 @@ class Recorder:
     def stop(self) -> None:
         """End the recording after the frames being written; callable from any thread."""
         self._stopping.set()
+
+    def newest(self) -> Frame | None:
+        """Return the newest frame, at once; None before the first. Callable from any thread."""
+        return None if self._stream is None else self._stream.newest()
 
     def execute(self) -> Run:
         """Record; returns the finished run, whose ``reason`` says how it ended.
@@ -131,7 +136,7 @@ class Recorder:
         KeyboardInterrupt, SystemExit
             After the run was marked as aborted and the bench made safe.
         """
-        stream = FrameStream(self._bench.camera, self.n_buffers)
+        stream = self._stream = FrameStream(self._bench.camera, self.n_buffers)
         reader = stream.reader()
         try:
             self._writer.start(drops_counted_by=self._bench.camera.drops_counted_by, n_buffers=self.n_buffers)

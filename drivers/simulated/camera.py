@@ -33,6 +33,8 @@ class SimulatedCamera(SimulatedCameraSettings):
     """
 
     drops_counted_by = "device frame numbers"
+    longest_silence_s = 120.0
+    """What it sees of a new light is computed first, on a large sensor for many seconds."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__(options, shared)

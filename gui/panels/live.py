@@ -1,57 +1,389 @@
-"""The live view: the camera's newest frame, at most thirty times a second."""
+"""The live view: the camera's newest frame, its histogram, settings, photographs and recordings."""
 
 from __future__ import annotations
 
-from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QLabel, QVBoxLayout, QWidget
+import time
+from collections import deque
+
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QComboBox,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QSplitter,
+    QVBoxLayout,
+    QWidget,
+)
 
 from drivers.frame import Frame
+from gui.jobs import BusyError, JobContext
 from gui.panel import Panel
+from gui.panels.camera_form import CameraForm
+from gui.panels.live_overlays import CrossHair, ProfileLine, RegionBox
+from gui.panels.record_bar import RecordBar
 from gui.session import BenchSession
+from gui.widgets.colour_maps import NAMES
+from gui.widgets.histogram import HistogramPlot
 from gui.widgets.image_view import ImageView
+from gui.widgets.number_edit import NumberEdit
+from gui.widgets.plot import curve_pen, plot_widget
+from instrument.frame_view import histogram, line_profile, percentiles, sensor_roi
+from instrument.snapshot import Light, check_target, light_of, photograph_name, write_snapshot
 
-_INTERVAL_MS = 33
+FRAME_MS = 32
+"""Between two looks at the newest frame: thirty a second on the screen."""
+_STATISTICS_MS = 250
+_RATE_WINDOW_S = 2.0
+LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0, 99.0), "by hand": None}
 
 
 class LivePanel(Panel):
-    """Shows the newest frame of the live view; owns nothing of it."""
+    """Shows the newest frame of the live view, or of the run that goes on; owns nothing of it."""
 
     title = "Live view"
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.view = ImageView()
-        self.status = QLabel()
+        self.histogram = HistogramPlot()
+        self.form = CameraForm(self)
+        self.record_bar = RecordBar(self)
+        self.cross_hair = CrossHair(self.view)
+        self.profile_line = ProfileLine(self.view)
+        self.region_box = RegionBox(self.view)
+        self.profile_plot = plot_widget("along the line", "counts", x_unit="pixels")
+        self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(1))
+        self.profile_plot.setMaximumHeight(170)
+        self.profile_plot.hide()
+        self.status = QLabel("Waiting for the first frame …")
+        self.status.setObjectName("dim")
+        self.status.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.under_mouse = QLabel()
+        self.view.hovered.connect(self.under_mouse.setText)
+        self._levels = (0.0, 1.0)
+        self._shown: Frame | None = None
+        self._counted: Frame | None = None
+        self._shown_at: deque[float] = deque(maxlen=400)
+        self._lay_out()
+        self.histogram.levels_dragged.connect(self._levels_by_hand)
+        session.device_changed.connect(self._device_changed)
+        session.opened.connect(self._light_the_scene)
+        if session.is_open("camera"):
+            self._light_the_scene()
+        self._frame_timer = QTimer(self)
+        self._frame_timer.setTimerType(Qt.TimerType.PreciseTimer)
+        self._frame_timer.timeout.connect(self.look)
+        self._frame_timer.start(FRAME_MS)
+        self._statistics_timer = QTimer(self)
+        self._statistics_timer.timeout.connect(self.count)
+        self._statistics_timer.start(_STATISTICS_MS)
+
+    # Layout --------------------------------------------------------------------------------------
+    def _lay_out(self) -> None:
+        self.live_button = QPushButton("▶ Live")
+        self.live_button.setCheckable(True)
+        self.live_button.setChecked(self.session.live_wanted)
+        self.live_button.setToolTip("Run the camera, or hold the last frame (Ctrl+L)")
+        self.live_button.clicked.connect(self.toggle_live)
+        self.snap_button = QPushButton("Snap")
+        self.snap_button.setToolTip("Take a photograph and keep it in the runs' folder (Ctrl+K)")
+        self.snap_button.clicked.connect(self.snap)
+        self.average = NumberEdit("frames", 1, minimum=1, integer=True, tip="Frames averaged in a photograph")
+        self.average.setFixedWidth(90)
+        self.colour_map = QComboBox()
+        self.colour_map.addItems(NAMES)
+        self.colour_map.setCurrentText(self.view.colour_map)
+        self.colour_map.setToolTip("Colour map; saturated pixels have a colour of their own")
+        self.colour_map.currentTextChanged.connect(self.view.set_colour_map)
+        self.stretch = QComboBox()
+        self.stretch.addItems(list(LEVELS))
+        self.stretch.setToolTip("Counts shown darkest and brightest: full range, percentiles, or dragged")
+        self.stretch.currentTextChanged.connect(lambda _: self.count())
+        self.light_buttons = QButtonGroup(self)
+        self.light_buttons.setExclusive(False)  # what is lit is shown as it is, not as it was clicked
+        light = QHBoxLayout()
+        light.setSpacing(2)
+        for choice, words in ((Light.SCENE, "Scene"), (Light.SOURCE, "Source"), (Light.DARK, "Dark")):
+            button = QPushButton(words)
+            button.setCheckable(True)
+            button.setProperty("light", choice.value)
+            button.setToolTip(
+                {
+                    Light.SCENE: "Light the scene",
+                    Light.SOURCE: "Light the point source",
+                    Light.DARK: "Light nothing",
+                }[choice]
+            )
+            button.clicked.connect(lambda _=False, choice=choice: self.switch_light(choice))
+            self.light_buttons.addButton(button)
+            light.addWidget(button)
+        self.cross_button = _toggle("✛", "Cross-hair: a click moves it", self.cross_hair.set_enabled)
+        self.profile_button = _toggle("Profile", "Counts along a line; drag its ends", self._toggle_profile)
+        self.region_button = _toggle("Region", "Drag a region of interest", self._toggle_region)
+        self.apply_region = QPushButton("Send")
+        self.apply_region.setToolTip("Send the region to the camera")
+        self.apply_region.clicked.connect(self.send_region)
+        self.apply_region.hide()
+        self.whole_button = QPushButton("Whole sensor")
+        self.whole_button.setToolTip("Read the whole sensor again")
+        self.whole_button.clicked.connect(lambda: self.form.set_region(None))
+        self.fit_button = QPushButton("Fit")
+        self.fit_button.setToolTip("Show the whole image (wheel zooms, dragging moves)")
+        self.fit_button.clicked.connect(self.view.whole)
+        bar = QHBoxLayout()
+        bar.setSpacing(6)
+        before: tuple[QWidget, ...] = (self.live_button, self.snap_button, self.average)
+        after: tuple[QWidget, ...] = (
+            self.colour_map,
+            self.stretch,
+            self.cross_button,
+            self.profile_button,
+            self.region_button,
+            self.apply_region,
+            self.fit_button,
+        )
+        for widget in before:
+            bar.addWidget(widget)
+        bar.addSpacing(10)
+        bar.addLayout(light)
+        bar.addStretch(1)
+        for widget in after:
+            bar.addWidget(widget)
+        side = QWidget()
+        column = QVBoxLayout(side)
+        column.setContentsMargins(8, 0, 0, 0)
+        column.addWidget(_heading("CAMERA"))
+        column.addWidget(self.form)
+        column.addWidget(self.whole_button)
+        column.addSpacing(6)
+        column.addWidget(_heading("HISTOGRAM, RAW DATA"))
+        column.addWidget(self.histogram, 1)
+        pictures = QWidget()
+        left = QVBoxLayout(pictures)
+        left.setContentsMargins(0, 0, 0, 0)
+        left.addWidget(self.view, 1)
+        left.addWidget(self.profile_plot)
+        line = QHBoxLayout()
+        line.addWidget(self.status)
+        line.addStretch(1)
+        line.addWidget(self.under_mouse)
+        left.addLayout(line)
+        split = QSplitter(Qt.Orientation.Horizontal)
+        split.addWidget(pictures)
+        split.addWidget(side)
+        split.setStretchFactor(0, 1)
+        split.setSizes([900, 270])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.view, 1)
-        layout.addWidget(self.status)
-        self._shown: Frame | None = None
-        self._timer = QTimer(self)
-        self._timer.timeout.connect(self._look)
-        self._timer.start(_INTERVAL_MS)
+        layout.addLayout(bar)
+        layout.addWidget(split, 1)
+        layout.addWidget(self.record_bar)
 
+    # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
-        """Return lines that look at the camera's newest frames."""
+        """Return lines that bring the camera to these settings and take the same photograph."""
         path = self.session.config.path
-        return (
-            "from instrument.bench import open_bench\n"
-            "from instrument.live_view import LiveView\n\n"
-            f"with open_bench({str(path) if path else None!r}) as bench:\n"
-            "    live = LiveView(bench.camera)\n"
-            "    live.start()\n"
-            "    frame = live.newest()\n"
-        )
+        state = self.form.state
+        lines = [
+            "from pathlib import Path",
+            "",
+            "from drivers.camera import Roi",
+            "from instrument.bench import open_bench",
+            "from instrument.snapshot import Light, photograph_name, switch_light, write_snapshot",
+            "",
+            f"with open_bench({str(path) if path else None!r}) as bench:",
+        ]
+        if state is not None:
+            lines += [
+                f"    bench.camera.set_pixel_format({state.pixel_format!r})",
+                f"    bench.camera.set_binning({state.binning})",
+                f"    bench.camera.set_roi({state.roi!r})",
+                f"    bench.camera.set_black_level({state.black_level!r})",
+                f"    bench.camera.set_gain({state.gain!r})",
+                f"    bench.camera.set_exposure_ms({state.exposure_ms!r})",
+            ]
+        light = self.light
+        lines += [
+            f"    switch_light(bench, Light.{light.name})",
+            f"    taken = bench.snap({int(self.average.value or 1)})",
+            f"    write_snapshot(bench, Path(photograph_name()), taken, Light.{light.name})",
+        ]
+        return "\n".join(lines) + "\n"
 
     def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
+        """End the timers."""
+        self._frame_timer.stop()
+        self._statistics_timer.stop()
+        self.form.shutdown()
+        self.record_bar.shutdown()
 
-    def _look(self) -> None:
+    def theme_changed(self) -> None:
+        """Take over the theme's colour map and plot colours."""
+        from gui.theme import colours
+        from gui.widgets.plot import restyle
+
+        self.colour_map.setCurrentText(colours().colour_map)
+        self.histogram.restyle()
+        restyle(self.profile_plot)
+        self.view.graphics.setBackground(colours().window)
+
+    # Frames --------------------------------------------------------------------------------------
+    def look(self) -> None:
+        """Show the newest frame, if it is another than the one shown."""
+        if not self.isVisible():
+            return
         frame = self.session.live.newest()
         if frame is None or frame is self._shown:
             return
+        first = self._shown is None
         self._shown = frame
-        self.view.show_image(frame.image, 0, frame.full_scale, frame.full_scale)
+        if first:
+            self.count()
+        full_scale = frame.full_scale
+        low, high = self._levels
+        self.view.show_image(frame.image, low, high, full_scale)
+        self._shown_at.append(time.monotonic())
+
+    @property
+    def screen_rate(self) -> float:
+        """Frames a second that were shown, over the last two seconds."""
+        now = time.monotonic()
+        return sum(1 for t in self._shown_at if now - t <= _RATE_WINDOW_S) / _RATE_WINDOW_S
+
+    def count(self) -> None:
+        """Make histogram, levels, profile and the line of figures from the frame shown."""
+        frame = self._shown
+        if not self.isVisible():
+            return
+        self._show_light()
+        if frame is None:
+            return
+        if frame is not self._counted or self.sender() is self.stretch:
+            self._counted = frame
+            counts = histogram(frame.image)
+            wanted = LEVELS[self.stretch.currentText()]
+            if wanted is not None:
+                self._levels = percentiles(counts, *wanted)
+            elif self.stretch.currentText() == "full range":
+                self._levels = (0.0, float(frame.full_scale))
+            self.histogram.show_counts(counts, frame.full_scale, *self._levels)
+            if (ends := self.profile_line.ends) is not None:
+                self._profile_curve.setData(*line_profile(frame.image, *ends))
+        self.status.setText(self._figures(frame))
+
+    def _figures(self, frame: Frame) -> str:
         now = self.session.live.status()
-        self.status.setText(f"{now.frames_per_s:.1f} frames/s, {now.dropped} dropped")
+        height, width = frame.image.shape[:2]
+        words = [
+            f"{width} × {height}, {frame.metadata.significant_bits} bit",
+            f"screen {self.screen_rate:.1f}/s",
+            f"camera {now.frames_per_s:.1f}/s" if now.running else "camera used by a run or held",
+            f"dropped {now.dropped}",
+            f"saturated {frame.metadata.saturated_fraction:.3%}",
+        ]
+        state = self.form.state
+        if state is not None and state.temperature_c is not None:
+            words.append(f"{state.temperature_c:.1f} °C")
+        if self.cross_hair.enabled and self.cross_hair.pixel is not None:
+            column, row = self.cross_hair.pixel
+            if row < height and column < width:
+                words.append(f"✛ {self.view.describe(column, row)}")
+        return "   ".join(words)
+
+    def _levels_by_hand(self, low: float, high: float) -> None:
+        self._levels = (low, high)
+        if self.stretch.currentText() != "by hand":
+            self.stretch.blockSignals(True)
+            self.stretch.setCurrentText("by hand")
+            self.stretch.blockSignals(False)
+
+    # What the operator does ----------------------------------------------------------------------
+    def toggle_live(self) -> None:
+        """Run the camera, or hold the last frame."""
+        if self.session.live_wanted:
+            self.session.stop_live()
+        else:
+            self.session.start_live()
+        self.live_button.setChecked(self.session.live_wanted)
+
+    def snap(self) -> None:
+        """Take a photograph into the runs' folder."""
+        bench, average, light = self.session.bench, int(self.average.value or 1), self.light
+        target = self.session.runs_folder / "photographs" / photograph_name()
+
+        def work(context: JobContext) -> None:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            check_target(target, average)
+            with self.session.live.paused():
+                taken = bench.snap(average, on_frame=lambda n: context.report(n))
+            write_snapshot(bench, target, taken, light)
+
+        try:
+            job = self.tells(self.session.device_job("Photograph", work, {"camera"}))
+        except BusyError as error:
+            self.refused(self.snap_button, str(error))
+            return
+        job.succeeded.connect(lambda _: self.session.log("info", f"Photograph: {target}"))
+        job.succeeded.connect(lambda _: self.accepted(self.snap_button))
+
+    def record(self) -> None:
+        """Start a recording, or end the one that runs."""
+        self.record_bar.toggle()
+
+    @property
+    def light(self) -> Light:
+        """What is lit, as far as the program knows."""
+        return light_of(self.session.bench)
+
+    def switch_light(self, light: Light) -> None:
+        """Light the scene, the point source, or nothing."""
+        try:
+            self.tells(self.session.switch_light(light)).ended.connect(self._show_light)
+        except BusyError as error:
+            self.refused(None, str(error))
+
+    def send_region(self) -> None:
+        """Send the dragged region to the camera."""
+        rectangle, frame = self.region_box.rectangle, self._shown
+        if rectangle is not None and frame is not None:
+            self.form.set_region(sensor_roi(frame.metadata, *rectangle))
+            self.region_button.setChecked(False)
+
+    def _toggle_profile(self, on: bool) -> None:
+        self.profile_line.set_enabled(on)
+        self.profile_plot.setVisible(on)
+
+    def _toggle_region(self, on: bool) -> None:
+        self.region_box.set_enabled(on)
+        self.apply_region.setVisible(on)
+
+    def _light_the_scene(self) -> None:
+        """Begin with something to see, where the simulated world can light it by itself."""
+        if self.session.config.scene.control == "simulated" and self.light is Light.DARK:
+            self.switch_light(Light.SCENE)
+
+    def _show_light(self) -> None:
+        now = self.light
+        for button in self.light_buttons.buttons():
+            button.setChecked(button.property("light") == now.value)
+
+    def _device_changed(self, kind: str) -> None:
+        if kind == "camera" and not self.session.is_open("camera"):
+            state = self.session.state("camera")
+            self.status.setText(" ".join(state.text.split()) or f"The camera is {state.condition}.")
+
+
+def _toggle(text: str, tip: str, switched: object) -> QPushButton:
+    button = QPushButton(text)
+    button.setCheckable(True)
+    button.setToolTip(tip)
+    button.toggled.connect(switched)
+    return button
+
+
+def _heading(text: str) -> QLabel:
+    label = QLabel(text)
+    label.setProperty("role", "heading")
+    return label

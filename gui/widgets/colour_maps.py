@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-SATURATED = 255
-"""Index of saturated pixels; signal uses 0 to 254."""
+from instrument.frame_view import SATURATED
+
 _SATURATED_RGB = {"grey": (255, 40, 40), "red": (255, 255, 255)}
 _STOPS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "grey": ((0, 0, 0), (255, 255, 255)),
@@ -39,6 +39,6 @@ def table(name: str, *, mark_saturation: bool = True) -> npt.NDArray[np.uint8]:
         colours = colormaps[name](np.linspace(0, 1, 255))[:, :3] * 255
     result = np.empty((256, 3), np.uint8)
     result[:255] = np.round(colours)
-    result[255] = _SATURATED_RGB.get(name, (255, 255, 255)) if mark_saturation else result[254]
+    result[SATURATED] = _SATURATED_RGB.get(name, (255, 255, 255)) if mark_saturation else result[254]
     result.flags.writeable = False
     return result

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, Signal
+from PySide6.QtCore import QPointF, QRectF, Signal
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from gui.theme import colours
-from gui.widgets.colour_maps import SATURATED, table
+from gui.widgets.colour_maps import table
+from instrument.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 
@@ -21,8 +22,9 @@ _SIGNAL = SATURATED - 1
 class ImageView(QWidget):
     """Shows ``(height, width)`` or ``(height, width, 3)`` images of any number type.
 
-    Integer images go through one look-up table from counts to 8-bit indices, made when levels change, so that
-    a frame costs one pass; saturated counts get an index (and colour) of their own.
+    Integer images go through one look-up table from counts to 8-bit indices, made when levels change, and are
+    shrunk on the way to what the screen can show, so that a frame costs one pass; saturated counts get an
+    index (and colour) of their own, which survives the shrinking.
 
     Signals
     -------
@@ -51,6 +53,7 @@ class ImageView(QWidget):
         self.box.addItem(self.item)
         self.image: Image | None = None
         self._colour_map = colour_map or colours().colour_map
+        self._placed: tuple[Any, ...] = ()
         self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
@@ -87,18 +90,18 @@ class ImageView(QWidget):
         """
         first = self.image is None or self.image.shape[:2] != image.shape[:2]
         self.image = image
-        if self._indices.shape != image.shape:
-            self._indices = np.empty(image.shape, np.uint8)
-        self._fill(image, low, high, full_scale)
-        if image.ndim == 2:
-            self.item.setImage(self._indices, autoLevels=False, levels=None, lut=table(self._colour_map))
-        else:
-            rgb = self._indices
-            if full_scale is not None:
-                rgb[(image >= full_scale).any(axis=2)] = table("grey")[SATURATED]
-            self.item.setImage(rgb, autoLevels=False, levels=None, lut=None)
         if first:
             self.whole()
+        step = self._step(image)
+        shape = (image.shape[0] // step, image.shape[1] // step, *image.shape[2:])
+        if self._indices.shape != shape:
+            self._indices = np.empty(shape, np.uint8)
+        self._fill(image, low, high, full_scale, step)
+        lut = table(self._colour_map) if image.ndim == 2 else None
+        self.item.setImage(self._indices, autoLevels=False, levels=None, lut=lut)
+        if (shape, step) != self._placed:
+            self._placed = (shape, step)
+            self.item.setRect(QRectF(0, 0, shape[1] * step, shape[0] * step))
 
     def whole(self) -> None:
         """Show the whole image."""
@@ -111,18 +114,30 @@ class ImageView(QWidget):
         self.image = None
         self.item.clear()
 
-    def _fill(self, image: Image, low: float, high: float, full_scale: int | None) -> None:
-        span = max(high - low, 1e-12)
+    def _step(self, image: Image) -> int:
+        """Return how many pixels along each axis fall on one of the screen."""
+        width = max(1.0, self.graphics.width() * self.devicePixelRatioF())
+        height = max(1.0, self.graphics.height() * self.devicePixelRatioF())
+        (left, right), (top, bottom) = self.box.viewRange()
+        step = int(min((right - left) / width, (bottom - top) / height))
+        return max(1, min(step, int(image.shape[0]), int(image.shape[1])))
+
+    def _fill(self, image: Image, low: float, high: float, full_scale: int | None, step: int) -> None:
         if image.dtype in (np.uint8, np.uint16):
             key = (image.dtype, low, high, full_scale)
             if key != self._table_key:
-                counts = np.arange(np.iinfo(image.dtype).max + 1)
-                levels = np.clip((counts - low) * (_SIGNAL / span), 0, _SIGNAL).astype(np.uint8)
-                if full_scale is not None:
-                    levels[counts >= full_scale] = SATURATED
-                self._table, self._table_key = levels, key
-            np.take(self._table, image, out=self._indices, mode="clip")
+                self._table, self._table_key = index_table(image.dtype, low, high, full_scale), key
+            if image.ndim == 2:
+                fill_indices(image, self._table, step, self._indices)
+                return
+            height, width = self._indices.shape[:2]
+            np.take(self._table, image[::step, ::step][:height, :width], out=self._indices, mode="clip")
+            if full_scale is not None:
+                self._indices[(self._indices == SATURATED).any(axis=2)] = table("grey")[SATURATED]
             return
+        height, width = self._indices.shape[:2]
+        image = image[::step, ::step][:height, :width]
+        span = max(high - low, 1e-12)
         scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(_SIGNAL / span)
         np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
         self._indices[...] = scaled

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import enum
-from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 
-from instrument.atomic import check_writable
 from instrument.bench import Bench
 from instrument.cli.app import (
     BenchOption,
@@ -22,23 +18,13 @@ from instrument.cli.app import (
     saying_what_is_left,
 )
 from instrument.cli.progress import progress_bar
-from instrument.errors import FileError
-from instrument.images import check_suffix, side_car, write_image
 from instrument.photograph import Snapshot
+from instrument.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
 
 app = command_app()
 
 DIM = 0.1
 """Of full scale: a lit photograph whose brightest pixel stays below it wastes most of the sensor's range."""
-
-
-class Light(enum.StrEnum):
-    """What is lit while the photograph is taken."""
-
-    SCENE = "scene"
-    SOURCE = "source"
-    DARK = "dark"
-    AS_IS = "as-is"
 
 
 @app.command(
@@ -94,16 +80,16 @@ def snap(
     The bench is opened for it and made safe again: light off, motion stopped.
     """
     light = _one_light({Light.SCENE: scene, Light.SOURCE: source, Light.DARK: dark}, as_is=as_is)
-    target = out or Path(f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif")
-    _check_target(target, average, force=force)
+    target = out or Path(photograph_name())
+    check_target(target, average, force=force)
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=as_is) as opened:
         if exposure_ms is not None:
             opened.camera.set_exposure_ms(exposure_ms)
         if gain is not None:
             opened.camera.set_gain(gain)
-        _light(opened, light)
+        switch_light(opened, light)
         taken = _photograph(opened, average)
-        write_image(target, taken.image, {**_metadata(opened, taken, light), "operator_asked": not as_is})
+        write_snapshot(opened, target, taken, light, operator_asked=not as_is)
     _report(target, taken, light)
 
 
@@ -116,42 +102,10 @@ def _one_light(flags: dict[Light, bool], *, as_is: bool) -> Light:
     return Light.AS_IS if as_is else Light.SCENE
 
 
-def _check_target(target: Path, average: int, *, force: bool) -> None:
-    check_suffix(target)
-    if average > 1 and target.suffix.lower() == ".png":
-        raise FileError(
-            target, "a mean of several frames is float32, which PNG cannot hold.", "Use .tif or .npy."
-        )
-    files = [target] if target.suffix.lower() in (".tif", ".tiff") else [target, side_car(target)]
-    for file in files:
-        check_writable(file)
-        if file.exists() and not force:
-            raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
-
-
-def _light(bench: Bench, light: Light) -> None:
-    if light is Light.AS_IS:
-        return
-    bench.source_on() if light is Light.SOURCE else bench.source_off()
-    bench.scene_on() if light is Light.SCENE else bench.scene_off()
-
-
 def _photograph(bench: Bench, average: int) -> Snapshot:
     with progress_bar() as bar:
         task = bar.add_task("Frames", total=average, note="")
         return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))
-
-
-def _metadata(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
-    return {
-        "bench": bench.label,
-        "simulated": bool(bench.simulated_kinds),
-        "camera": str(bench.camera.identity),
-        "light": light.value,
-        "average": taken.average,
-        "full_scale": taken.full_scale,
-        **asdict(taken.metadata),
-    }
 
 
 def _report(target: Path, taken: Snapshot, light: Light) -> None:

@@ -30,7 +30,7 @@ name = "test bench"
 data_folder = "runs"
 [camera]
 driver = "simulated"
-exposure_ms = 2.0
+exposure_ms = 10.0
 frames_per_s = 60.0
 replay_frames = 2
 [stage]

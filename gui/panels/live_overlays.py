@@ -1,0 +1,112 @@
+"""What is drawn over the live view: cross-hair, line profile, a region to send to the camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyqtgraph as pg
+from PySide6.QtCore import QObject, Signal
+
+from gui.theme import colours
+from gui.widgets.image_view import ImageView
+
+
+class CrossHair(QObject):
+    """Two lines through a pixel; a click moves them.
+
+    Signals
+    -------
+    moved : int, int
+        Column and row.
+    """
+
+    moved = Signal(int, int)
+
+    def __init__(self, view: ImageView) -> None:
+        super().__init__(view)
+        self._view = view
+        pen = pg.mkPen(colours().accent, width=1)
+        self._lines: tuple[Any, Any] = (pg.InfiniteLine(angle=90, pen=pen), pg.InfiniteLine(angle=0, pen=pen))
+        self.pixel: tuple[int, int] | None = None
+        self.enabled = False
+        for line in self._lines:
+            line.setVisible(False)
+            view.box.addItem(line, ignoreBounds=True)
+        view.clicked.connect(self.move_to)
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide it; shown first in the middle."""
+        self.enabled = enabled
+        for line in self._lines:
+            line.setVisible(enabled)
+        if enabled and self.pixel is None and self._view.image is not None:
+            height, width = self._view.image.shape[:2]
+            self.move_to(width // 2, height // 2)
+
+    def move_to(self, column: int, row: int) -> None:
+        """Move it to a pixel."""
+        if self.enabled:
+            self.pixel = (column, row)
+            self._lines[0].setValue(column + 0.5)
+            self._lines[1].setValue(row + 0.5)
+            self.moved.emit(column, row)
+
+
+class ProfileLine:
+    """A line whose ends are dragged; ``ends`` in pixels."""
+
+    def __init__(self, view: ImageView) -> None:
+        self._view = view
+        self.item: Any = None
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide the line; shown first across the middle."""
+        if enabled and self.item is None and self._view.image is not None:
+            height, width = self._view.image.shape[:2]
+            ends = [[0.1 * width, 0.5 * height], [0.9 * width, 0.5 * height]]
+            self.item = pg.LineSegmentROI(ends, pen=pg.mkPen(colours().warning, width=1.5))
+            self._view.box.addItem(self.item)
+        elif not enabled and self.item is not None:
+            self._view.box.removeItem(self.item)
+            self.item = None
+
+    @property
+    def ends(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Start and end, x and y in pixels; None while hidden."""
+        if self.item is None:
+            return None
+        (_, a), (_, b) = self.item.getSceneHandlePositions()
+        first, second = self._view.box.mapSceneToView(a), self._view.box.mapSceneToView(b)
+        return (first.x(), first.y()), (second.x(), second.y())
+
+
+class RegionBox:
+    """A rectangle dragged with the mouse; ``rectangle`` in pixels of the frame."""
+
+    def __init__(self, view: ImageView) -> None:
+        self._view = view
+        self.item: Any = None
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide it; shown first over the middle half."""
+        if enabled and self.item is None and self._view.image is not None:
+            height, width = self._view.image.shape[:2]
+            self.item = pg.RectROI(
+                [0.25 * width, 0.25 * height],
+                [0.5 * width, 0.5 * height],
+                pen=pg.mkPen(colours().ok, width=1.5),
+                sideScalers=True,
+            )
+            self.item.addScaleHandle([0, 0], [1, 1])
+            self._view.box.addItem(self.item)
+        elif not enabled and self.item is not None:
+            self._view.box.removeItem(self.item)
+            self.item = None
+
+    @property
+    def rectangle(self) -> tuple[float, float, float, float] | None:
+        """Left, top, width, height in pixels; None while hidden."""
+        if self.item is None:
+            return None
+        place, size = self.item.pos(), self.item.size()
+        return place.x(), place.y(), size.x(), size.y()

@@ -1,0 +1,71 @@
+"""The histogram of the raw counts, with the levels shown darkest and brightest to drag."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from gui.theme import colours
+from gui.widgets.plot import curve_pen, plot_widget, restyle
+from instrument.frame_view import grouped
+
+BINS = 256
+
+
+class HistogramPlot(QWidget):
+    """Pixels over counts, logarithmic; the sensor's full scale is marked.
+
+    Signals
+    -------
+    levels_dragged : float, float
+        The levels that were dragged with the mouse.
+    """
+
+    levels_dragged = Signal(float, float)
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.plot = plot_widget("counts", "pixels")
+        self.plot.setMouseEnabled(x=False, y=False)
+        self.plot.hideButtons()
+        self.plot.setLogMode(y=True)
+        self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0, brush=(74, 163, 223, 60))
+        self.region: Any = pg.LinearRegionItem(brush=(255, 255, 255, 18))
+        self.region.sigRegionChanged.connect(self._dragged)
+        self.plot.addItem(self.region)
+        self.full_scale: Any = pg.InfiniteLine(angle=90, pen=pg.mkPen(colours().error, width=1.5))
+        self.full_scale.setToolTip("full scale of the sensor")
+        self.plot.addItem(self.full_scale)
+        self._quiet = False
+        self.setToolTip("Histogram of the raw data. Drag the borders to choose levels; red: full scale")
+        self.setMinimumHeight(130)
+        self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.plot)
+
+    def show_counts(self, counts: npt.NDArray[np.float32], full_scale: int, low: float, high: float) -> None:
+        """Show a histogram of all counts (``instrument.frame_view.histogram``) and the levels in use."""
+        bins = grouped(counts, full_scale, BINS)
+        step = (full_scale + 1) / BINS
+        self.curve.setData(np.arange(BINS) * step, np.maximum(bins, 0.5))
+        self.plot.setXRange(0, full_scale * 1.02, padding=0)
+        self.full_scale.setValue(full_scale)
+        self._quiet = True
+        self.region.setRegion((low, high))
+        self._quiet = False
+
+    def restyle(self) -> None:
+        """Take over the theme in use."""
+        restyle(self.plot)
+        self.curve.setPen(curve_pen(0))
+
+    def _dragged(self) -> None:
+        if not self._quiet:
+            low, high = self.region.getRegion()
+            self.levels_dragged.emit(float(low), float(max(high, low + 1)))

@@ -1,0 +1,139 @@
+"""What is shown of a frame: 8-bit indices, histogram, levels, profiles, a region dragged on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from drivers.camera import Roi
+from drivers.frame import FrameMetadata
+from recon.optics.jit import compiled
+
+SATURATED = 255
+"""Index of saturated pixels; signal uses 0 to 254."""
+_SIGNAL = SATURATED - 1
+
+Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+def index_table(
+    dtype: npt.DTypeLike, low: float, high: float, full_scale: int | None = None
+) -> npt.NDArray[np.uint8]:
+    """Return the 8-bit index of every count of a type: 0 to 254 from ``low`` to ``high``, 255 saturated.
+
+    Parameters
+    ----------
+    dtype
+        uint8 or uint16.
+    low, high : float
+        Counts shown darkest and brightest.
+    full_scale : int, optional
+        Counts from here on are saturated.
+    """
+    counts = np.arange(np.iinfo(np.dtype(dtype)).max + 1)
+    span = max(float(high) - float(low), 1e-12)
+    table: npt.NDArray[np.uint8] = np.clip((counts - low) * (_SIGNAL / span), 0, _SIGNAL).astype(np.uint8)
+    if full_scale is not None:
+        table[full_scale:] = SATURATED
+    return table
+
+
+@compiled
+def fill_indices(
+    image: npt.NDArray[Any], table: npt.NDArray[np.uint8], step: int, out: npt.NDArray[np.uint8]
+) -> None:
+    """Look counts up in a table, taking one pixel of each ``step`` x ``step``.
+
+    A block with a saturated pixel is saturated as a whole: shrinking an image must not hide saturation.
+
+    Parameters
+    ----------
+    image : ndarray, (height, width), uint8 or uint16
+    table : ndarray, uint8
+        From :func:`index_table`.
+    step : int
+    out : ndarray, (height // step, width // step), uint8
+    """
+    height, width = out.shape
+    if step == 1:
+        for y in range(height):
+            for x in range(width):
+                out[y, x] = table[image[y, x]]
+        return
+    for y in range(height):
+        for x in range(width):
+            highest = image[y * step, x * step]
+            for dy in range(step):
+                for dx in range(step):
+                    highest = max(highest, image[y * step + dy, x * step + dx])
+            index = table[highest]
+            out[y, x] = index if index == 255 else table[image[y * step, x * step]]
+
+
+def histogram(image: Counts) -> npt.NDArray[np.float32]:
+    """Return how many pixels (of all channels) have each count: of all of the raw data, at its full depth."""
+    flat = image.reshape(image.shape[0], -1)
+    n = np.iinfo(image.dtype).max + 1
+    return np.asarray(cv2.calcHist([flat], [0], None, [n], [0, n]), np.float32).ravel()
+
+
+def grouped(counts: npt.NDArray[np.float32], full_scale: int, bins: int = 256) -> npt.NDArray[np.float32]:
+    """Return a histogram in ``bins`` equal steps from zero to the sensor's full scale."""
+    used = counts[: full_scale + 1]
+    size = -(-len(used) // bins)
+    padded = np.zeros(size * bins, np.float32)
+    padded[: len(used)] = used
+    return np.asarray(padded.reshape(bins, size).sum(axis=1))
+
+
+def percentiles(counts: npt.NDArray[np.float32], low: float, high: float) -> tuple[float, float]:
+    """Return the counts below which ``low`` and ``high`` per cent of a histogram's pixels lie."""
+    total = np.cumsum(counts, dtype=np.float64)
+    at = np.searchsorted(total, np.array([low, high]) / 100 * total[-1])
+    return float(at[0]), float(max(at[1], at[0] + 1))
+
+
+def line_profile(
+    image: npt.NDArray[Any], start: tuple[float, float], end: tuple[float, float]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return distance in pixels and value along a line, about one sample a pixel, linear between pixels.
+
+    Parameters
+    ----------
+    image : ndarray, (height, width) or (height, width, 3)
+        Of colour the mean is taken.
+    start, end : (x, y)
+        In pixels; pixel ``(0, 0)`` reaches from 0 to 1. What lies outside is left out.
+    """
+    from scipy.ndimage import map_coordinates
+
+    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+    n = max(2, round(length) + 1)
+    along = np.linspace(0.0, 1.0, n)
+    x = start[0] + along * (end[0] - start[0]) - 0.5
+    y = start[1] + along * (end[1] - start[1]) - 0.5
+    height, width = image.shape[:2]
+    inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+    grey = image if image.ndim == 2 else image.mean(axis=2)
+    values = map_coordinates(grey, [y[inside], x[inside]], order=1, mode="nearest", output=np.float64)
+    return along[inside] * length, values
+
+
+def sensor_roi(metadata: FrameMetadata, left: float, top: float, width: float, height: float) -> Roi:
+    """Return the region of the sensor under a rectangle drawn on a frame, both as the frame was taken.
+
+    Parameters
+    ----------
+    metadata : FrameMetadata
+    left, top, width, height : float
+        In pixels of the frame; cut at its borders.
+    """
+    frame_top, frame_left, frame_height, frame_width = metadata.roi
+    b = metadata.binning
+    x0, y0 = max(0, round(left)), max(0, round(top))
+    x1 = min(frame_width // b, round(left + width))
+    y1 = min(frame_height // b, round(top + height))
+    return Roi(frame_top + y0 * b, frame_left + x0 * b, max(0, y1 - y0) * b, max(0, x1 - x0) * b)

@@ -1,0 +1,92 @@
+"""A photograph as it is kept: which light, which facts stand beside it, where it goes."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from instrument.atomic import check_writable
+from instrument.bench import Bench
+from instrument.errors import FileError
+from instrument.images import check_suffix, side_car, write_image
+from instrument.photograph import Snapshot
+
+
+class Light(enum.StrEnum):
+    """What is lit while a photograph is taken."""
+
+    SCENE = "scene"
+    SOURCE = "source"
+    DARK = "dark"
+    AS_IS = "as-is"
+
+
+def switch_light(bench: Bench, light: Light) -> None:
+    """Light the scene, the point source, or nothing; ``AS_IS`` changes nothing.
+
+    Raises
+    ------
+    DeviceError, BenchError
+        When a light cannot be switched.
+    """
+    if light is Light.AS_IS:
+        return
+    bench.source_on() if light is Light.SOURCE else bench.source_off()
+    bench.scene_on() if light is Light.SCENE else bench.scene_off()
+
+
+def light_of(bench: Bench) -> Light:
+    """Return what is lit now, as far as the program knows; ``AS_IS`` where scene and source both are."""
+    if bench.scene_lit and bench.source_lit:
+        return Light.AS_IS
+    if bench.scene_lit:
+        return Light.SCENE
+    return Light.SOURCE if bench.source_lit else Light.DARK
+
+
+def photograph_name() -> str:
+    """Return a file name for a photograph taken now."""
+    return f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif"
+
+
+def check_target(target: Path, average: int, *, force: bool = False) -> None:
+    """Refuse a file that cannot hold the photograph, cannot be written, or is there already.
+
+    Raises
+    ------
+    FileError
+    """
+    check_suffix(target)
+    if average > 1 and target.suffix.lower() == ".png":
+        raise FileError(
+            target, "a mean of several frames is float32, which PNG cannot hold.", "Use .tif or .npy."
+        )
+    files = [target] if target.suffix.lower() in (".tif", ".tiff") else [target, side_car(target)]
+    for file in files:
+        check_writable(file)
+        if file.exists() and not force:
+            raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+
+
+def write_snapshot(
+    bench: Bench, target: Path, taken: Snapshot, light: Light, *, operator_asked: bool = True
+) -> None:
+    """Write a photograph with what is known about it; errors as ``write_image``."""
+    facts = {**snapshot_facts(bench, taken, light), "operator_asked": operator_asked}
+    write_image(target, taken.image, facts)
+
+
+def snapshot_facts(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
+    """Return what is kept beside a photograph."""
+    return {
+        "bench": bench.label,
+        "simulated": bool(bench.simulated_kinds),
+        "camera": str(bench.camera.identity),
+        "light": light.value,
+        "average": taken.average,
+        "full_scale": taken.full_scale,
+        **asdict(taken.metadata),
+    }

@@ -1,0 +1,182 @@
+"""The live view: frames, saturation, settings, region, photographs, recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.live import LivePanel
+from gui.widgets.image_view import ImageView
+from instrument.images import read_image
+from instrument.store import Run
+
+WAIT_MS = 20_000
+
+
+@pytest.fixture
+def live(qtbot: QtBot, window: MainWindow) -> LivePanel:
+    panel = window.show_panel("live")
+    assert isinstance(panel, LivePanel)
+    qtbot.waitUntil(lambda: panel._shown is not None and panel.form.state is not None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not window.session.jobs.jobs, timeout=WAIT_MS)
+    return panel
+
+
+def _type(qtbot: QtBot, field: object, text: str) -> None:
+    field.setFocus()  # type: ignore[attr-defined]
+    field.selectAll()  # type: ignore[attr-defined]
+    qtbot.keyClicks(field, text)
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+
+
+def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> None:
+    qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
+    shown = live._shown
+    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    qtbot.waitUntil(
+        lambda: "camera" in live.status.text() and "dropped 0" in live.status.text(), timeout=WAIT_MS
+    )
+    qtbot.waitUntil(lambda: float(live._shown.image.mean()) > 50, timeout=WAIT_MS)  # type: ignore[union-attr]
+
+
+def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
+    _type(qtbot, live.form.exposure, "3.21 ms")
+    qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 3.21, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: live.form.exposure.text() == "3.21 ms", timeout=WAIT_MS)
+    assert live.session.live.is_running
+
+
+def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel) -> None:
+    before = live.session.bench.camera.exposure_ms
+    _type(qtbot, live.form.exposure, "1e9")
+    assert live.form.exposure.property("refused")
+    assert "outside" in live.form.exposure.toolTip()
+    assert "outside" in live._note.text()
+    assert live.form.exposure.text() == "1e9"
+    assert live.session.bench.camera.exposure_ms == before
+    _type(qtbot, live.form.exposure, "2.5")
+    qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 2.5, timeout=WAIT_MS)
+    assert not live.form.exposure.property("refused")
+
+
+def test_binning_pauses_the_stream_and_goes_on(qtbot: QtBot, live: LivePanel) -> None:
+    live.form.binning.setCurrentIndex(1)
+    live.form.binning.activated.emit(1)
+    qtbot.waitUntil(
+        lambda: live._shown is not None and live._shown.image.shape == (120, 160), timeout=WAIT_MS
+    )
+
+
+def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -> None:
+    qtbot.mouseClick(live.region_button, Qt.MouseButton.LeftButton)
+    live.region_box.item.setPos((40, 60))
+    live.region_box.item.setSize((80, 100))
+    qtbot.mouseClick(live.apply_region, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: live.session.bench.camera.roi.as_tuple() == (60, 40, 100, 80), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: live._shown is not None and live._shown.image.shape == (100, 80), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
+    qtbot.mouseClick(live.whole_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: live.session.bench.camera.roi.height == 240, timeout=WAIT_MS)
+
+
+def test_a_photograph_by_its_key(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
+    folder = live.session.runs_folder / "photographs"
+    qtbot.keyClick(window, Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: folder.is_dir() and any(folder.glob("*.tif")), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
+    (file,) = folder.glob("*.tif")
+    photo = read_image(file)
+    assert photo.pixels.shape == (240, 320)
+    assert photo.is_simulated
+    assert photo.metadata["light"] == "scene"
+    assert live.session.live.is_running
+
+
+def test_the_live_key_holds_and_goes_on(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
+    qtbot.keyClick(window, Qt.Key.Key_L, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: not live.session.live.is_running, timeout=WAIT_MS)
+    assert not live.live_button.isChecked()
+    qtbot.keyClick(window, Qt.Key.Key_L, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: live.session.live.is_running, timeout=WAIT_MS)
+
+
+def test_a_recording_by_its_key_shows_what_it_records(
+    qtbot: QtBot, window: MainWindow, live: LivePanel
+) -> None:
+    finished: list[Path] = []
+    live.session.run_finished.connect(finished.append)
+    qtbot.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
+    shown = live._shown
+    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    assert "GB free" in live.record_bar.gauge.format()
+    qtbot.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: bool(finished), timeout=WAIT_MS)
+    run = Run.open(finished[0])
+    assert len(run.records) > 2
+    qtbot.waitUntil(lambda: live.session.live.is_running, timeout=WAIT_MS)
+    assert live.session.bench.scene_lit
+
+
+def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
+    live.record()
+    qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
+    with qtbot.waitSignal(live.session.stopped, timeout=WAIT_MS):
+        qtbot.keyClick(window, Qt.Key.Key_Escape)
+    qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
+    assert not live.session.bench.scene_lit
+    (folder,) = live.session.runs_folder.glob("*recording*")
+    assert len(Run.open(folder).records) > 0
+
+
+def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) -> None:
+    qtbot.mouseClick(live.profile_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: live._profile_curve.getData()[0] is not None, timeout=WAIT_MS)
+    assert len(live._profile_curve.getData()[0]) > 200
+    qtbot.mouseClick(live.cross_button, Qt.MouseButton.LeftButton)
+    live.view.clicked.emit(7, 9)
+    qtbot.waitUntil(lambda: "x 7  y 9" in live.status.text(), timeout=WAIT_MS)
+
+
+def test_levels_follow_percentiles_of_the_raw_data(qtbot: QtBot, live: LivePanel) -> None:
+    qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
+    live.stretch.setCurrentText("1 – 99 %")
+    qtbot.waitUntil(lambda: live._levels[1] < 4000, timeout=WAIT_MS)
+    frame = live._shown
+    assert frame is not None
+    live.histogram.region.setRegion((10.0, 200.0))
+    assert live.stretch.currentText() == "by hand"
+    assert live._levels == (10.0, 200.0)
+
+
+@pytest.mark.parametrize("size", [(200, 300), (1500, 1700)])
+def test_saturated_pixels_keep_their_colour_however_small_they_are_shown(
+    qtbot: QtBot, size: tuple[int, int]
+) -> None:
+    """At 12 bits in a 16-bit frame: 4095 is saturated, 4094 is not; one pixel is enough."""
+    view = ImageView("grey")
+    qtbot.addWidget(view)
+    view.resize(400, 400)
+    view.show()
+    image = np.full(size, 4094, np.uint16)
+    view.show_image(image, 0, 4095, 4095)
+    view.show_image(image, 0, 4095, 4095)
+    assert 255 not in view._indices
+    image[101, 57] = 4095
+    view.show_image(image, 0, 4095, 4095)
+    assert (view._indices == 255).sum() == 1
+    if size[0] > 1000:
+        assert view._indices.shape[0] < size[0]
+    picture = view.grab().toImage()
+    reds = sum(
+        QColor(picture.pixel(x, y)).red() > QColor(picture.pixel(x, y)).green() + 100
+        for y in range(picture.height())
+        for x in range(picture.width())
+    )
+    assert reds > 0
