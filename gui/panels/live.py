@@ -99,6 +99,7 @@ class LivePanel(Panel):
         self.colour_map.currentTextChanged.connect(self.view.set_colour_map)
         self.stretch = QComboBox()
         self.stretch.addItems(list(LEVELS))
+        self.stretch.setCurrentIndex(1)
         self.stretch.setToolTip("Counts shown darkest and brightest: full range, percentiles, or dragged")
         self.stretch.currentTextChanged.connect(lambda _: self.count())
         self.light_buttons = QButtonGroup(self)

@@ -46,6 +46,7 @@ settle_ms = 0.0
 control = "simulated"
 [simulated]
 preset = "tiny"
+scene_rgb = [30.0, 30.0, 30.0]
 """
 
 
