@@ -222,6 +222,12 @@ class JobRunner(QObject):
         """Run a job that touches no device, at once."""
         return self._add(title, work, frozenset(), exclusive=False)
 
+    def watch(self, title: str, work: Work) -> Job:
+        """Run a quiet look at a device, at once and whatever holds it: what drivers allow from any thread."""
+        job = self.compute(title, work)
+        job.quiet = True
+        return job
+
     # What runs -----------------------------------------------------------------------------------
     @property
     def jobs(self) -> tuple[Job, ...]:

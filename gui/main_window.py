@@ -34,8 +34,6 @@ _AREAS = {
     "right": Qt.DockWidgetArea.RightDockWidgetArea,
     "bottom": Qt.DockWidgetArea.BottomDockWidgetArea,
 }
-_LAYOUT_VERSION = 1
-"""Raised when docks are renamed: a layout kept by an older program is then not restored."""
 
 
 class MainWindow(QMainWindow):
@@ -290,12 +288,18 @@ class MainWindow(QMainWindow):
         self.job_label.setText(f"{job.title} …")
 
     def _job_ended(self, job: Job) -> None:
-        running = [other for other in self.session.jobs.jobs if other.exclusive or not other.lanes]
+        if job.quiet:
+            return
+        running = self._long_jobs()
         self.job_progress.setVisible(bool(running))
         if running:
             self.job_label.setText(f"{running[0].title} …")
-        elif job.state.value == "succeeded" and not job.quiet:
+        elif job.state.value == "succeeded":
             self.job_label.setText(f"{job.title}: done")
+
+    def _long_jobs(self) -> list[Job]:
+        """Return what runs and would be missed: runs, calibrations, computations."""
+        return [job for job in self.session.jobs.jobs if (job.exclusive or not job.lanes) and not job.quiet]
 
     def _show_problem(self, level: str, text: str) -> None:
         if level in ("warning", "error"):
@@ -322,7 +326,7 @@ class MainWindow(QMainWindow):
             event.accept()
             return
         event.ignore()
-        running = [job.title for job in self.session.jobs.jobs if job.exclusive or not job.lanes]
+        running = [job.title for job in self._long_jobs()]
         if running and self.question is None:
             box = QMessageBox(
                 QMessageBox.Icon.Warning,
@@ -349,19 +353,19 @@ class MainWindow(QMainWindow):
         self.close()
 
     def _keep_layout(self) -> None:
-        self._settings.setValue("version", _LAYOUT_VERSION)
+        self._settings.setValue("docks", sorted(self._docks))
         self._settings.setValue("geometry", self.saveGeometry())
-        self._settings.setValue("state", self.saveState(_LAYOUT_VERSION))
+        self._settings.setValue("state", self.saveState())
         self._settings.sync()
 
     def _restore_layout(self) -> None:
-        if self._settings.value("version", type=int) != _LAYOUT_VERSION:
-            return
+        if self._settings.value("docks") != sorted(self._docks):
+            return  # kept by a program with other panels: their docks would land anywhere
         geometry, state = self._settings.value("geometry"), self._settings.value("state")
         if geometry is not None:
             self.restoreGeometry(geometry)
         if state is not None:
-            self.restoreState(state, _LAYOUT_VERSION)
+            self.restoreState(state)
 
 
 def theme_of(settings: QSettings) -> str:

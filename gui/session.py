@@ -251,6 +251,8 @@ class BenchSession(QObject):
     def _note_error(self, job: Job) -> None:
         error = job.error
         assert error is not None
+        if job.quiet and isinstance(error, StoppedError | LimitError):
+            return
         if job.state.value == "cancelled":
             self.log("info", f"{job.title}: stopped. " + " ".join(getattr(error, "__notes__", ())))
             return

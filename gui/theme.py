@@ -139,6 +139,8 @@ QPushButton#primary {{ background: {c.accent}; color: {c.window}; border: none; 
 QPushButton#primary:disabled {{ background: {c.field}; color: {c.dim}; }}
 QLabel#simulated {{ background: {c.warning}; color: {c.window}; font-weight: 800; padding: 3px 10px;
   border-radius: 4px; letter-spacing: 1px; }}
+QFrame#jog-pad {{ background: {c.field}; border: 1px dashed {c.line}; border-radius: 5px; }}
+QFrame#jog-pad[active="true"] {{ border: 2px solid {c.accent}; }}
 QFrame#strip {{ background: {c.panel}; border-bottom: 1px solid {c.line}; }}
 QGroupBox {{ border: 1px solid {c.line}; border-radius: 5px; margin-top: 10px; padding-top: 6px; }}
 QGroupBox::title {{ subcontrol-origin: margin; left: 8px; padding: 0 4px; color: {c.dim}; }}

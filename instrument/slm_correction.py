@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from drivers.slm import Slm
 from instrument.atomic import write_text
 from instrument.errors import FileError
 
@@ -72,6 +73,25 @@ class SlmCorrection:
             **facts,
         }
         write_text(path, json.dumps(record) + "\n")
+
+
+def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrection | None = None) -> None:
+    """Show ideal levels (256 a turn) on an SLM, through its calibration where there is one.
+
+    Parameters
+    ----------
+    slm : Slm
+        Open.
+    levels : ndarray, uint8, of the SLM's shape
+    correction : SlmCorrection, optional
+
+    Raises
+    ------
+    LimitError
+        When the levels are not of the SLM's shape.
+    """
+    fits = levels.shape == slm.shape
+    slm.display(correction.apply(levels) if correction is not None and fits else levels)
 
 
 def load_slm_correction(path: Path) -> SlmCorrection:

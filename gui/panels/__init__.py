@@ -40,5 +40,12 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+6",
         "Pictures and volumes: look, reconstruct, export",
     ),
+    "stage": PanelEntry(
+        "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home"
+    ),
+    "led_array": PanelEntry(
+        "LED array", "gui.panels.led_array:LedPanel", "right", "Ctrl+8", "Which LEDs are lit"
+    ),
+    "slm": PanelEntry("SLM", "gui.panels.slm:SlmPanel", "right", "Ctrl+9", "What is on the SLM"),
     "log": PanelEntry("Log", "gui.panels.log:LogPanel", "bottom", "Ctrl+0", "What happened, with filters"),
 }

@@ -203,7 +203,7 @@ def test_a_camera_that_fails_gives_its_frames_first_and_then_its_error() -> None
 
 
 def test_a_camera_that_falls_silent_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.stream._SILENCE_S", 0.05)
+    monkeypatch.setattr("drivers.camera.Camera.longest_silence_s", 0.05)
     camera = finite(3)
     with FrameStream(camera) as stream:
         reader = stream.reader()

@@ -1,0 +1,338 @@
+"""The stage: where it is, where it shall go, jogging by keys, home."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import cast
+
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QFocusEvent, QKeyEvent
+from PySide6.QtWidgets import (
+    QFrame,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QMessageBox,
+    QProgressBar,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from drivers.stage import StageAxis
+from gui.jobs import BusyError, Job
+from gui.panel import Panel
+from gui.session import BenchSession
+from gui.widgets.number_edit import NumberEdit
+
+_READ_MS = 200
+_FINE, _COARSE = 0.1, 10.0
+"""Factors of the step with Ctrl and with Shift."""
+_STEPS = {"um": 100.0, "mrad": 1.0}
+"""Steps to begin with, by unit: a tenth of a millimetre, a milliradian."""
+_KEYS: dict[Qt.Key, tuple[str, int]] = {
+    Qt.Key.Key_Left: ("x", -1),
+    Qt.Key.Key_Right: ("x", 1),
+    Qt.Key.Key_Down: ("y", -1),
+    Qt.Key.Key_Up: ("y", 1),
+    Qt.Key.Key_PageDown: ("z", -1),
+    Qt.Key.Key_PageUp: ("z", 1),
+}
+_GAUGE = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    position: dict[str, float]
+    is_homed: bool
+    is_moving: bool
+
+
+@dataclass(slots=True)
+class _Row:
+    axis: StageAxis
+    position: QLabel
+    gauge: QProgressBar
+    target: NumberEdit
+    buttons: tuple[QPushButton, QPushButton]
+
+
+class JogPad(QFrame):
+    """Takes the arrow keys and PgUp, PgDn; its border shows when it does."""
+
+    def __init__(self, panel: StagePanel) -> None:
+        super().__init__(panel)
+        self._panel = panel
+        self.setObjectName("jog-pad")
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setToolTip(
+            "With this in focus: arrow keys move x and y, PgUp and PgDn z;\nShift: ten steps, Ctrl: a tenth"
+        )
+        self.words = QLabel("Click here, then  ← → ↑ ↓  PgUp PgDn\nShift × 10    Ctrl × 0.1")
+        self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.words.setObjectName("dim")
+        layout = QVBoxLayout(self)
+        layout.addWidget(self.words)
+        self._mark(active=False)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
+        """Jog."""
+        direction = _KEYS.get(Qt.Key(event.key()))
+        if direction is None:
+            super().keyPressEvent(event)
+            return
+        modifiers = event.modifiers()
+        factor = 1.0
+        if modifiers & Qt.KeyboardModifier.ShiftModifier:
+            factor = _COARSE
+        elif modifiers & Qt.KeyboardModifier.ControlModifier:
+            factor = _FINE
+        self._panel.jog(direction[0], direction[1] * factor, repeated=event.isAutoRepeat())
+
+    def focusInEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
+        """Show that keys go here."""
+        super().focusInEvent(event)
+        self._mark(active=True)
+
+    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
+        """Show that they do not any more."""
+        super().focusOutEvent(event)
+        self._mark(active=False)
+
+    def _mark(self, *, active: bool) -> None:
+        self.setProperty("active", active)
+        self.style().unpolish(self)
+        self.style().polish(self)
+
+
+class StagePanel(Panel):
+    """Position, targets and limits of every axis; jogging; home, which asks first."""
+
+    title = "Stage"
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(session, parent)
+        self.rows: dict[str, _Row] = {}
+        self.steps: dict[str, NumberEdit] = {}
+        self.question: QMessageBox | None = None
+        self._reading: Job | None = None
+        self.state = QLabel()
+        self.state.setWordWrap(True)
+        self.pad = JogPad(self)
+        self.setFocusProxy(self.pad)
+        self.home_button = QPushButton("Home …")
+        self.home_button.setToolTip("Find the reference of every axis: the stage moves; asks first")
+        self.home_button.clicked.connect(self.ask_home)
+        self._grid = QGridLayout()
+        self._grid.setHorizontalSpacing(6)
+        self._grid.setColumnStretch(2, 1)
+        self._step_row = QHBoxLayout()
+        bottom = QHBoxLayout()
+        bottom.addWidget(self.pad, 1)
+        bottom.addWidget(self.home_button)
+        layout = QVBoxLayout(self.body)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.state)
+        layout.addLayout(self._grid)
+        layout.addLayout(self._step_row)
+        layout.addLayout(bottom)
+        layout.addStretch(1)
+        session.device_changed.connect(self._device_changed)
+        self._timer = QTimer(self)
+        self._timer.timeout.connect(self.read)
+        self._timer.start(_READ_MS)
+        self._device_changed("stage")
+
+    # Panel ---------------------------------------------------------------------------------------
+    def as_python(self) -> str:
+        """Return lines that bring the stage to where it is now."""
+        path = self.session.config.path
+        here = {name: row.target.value for name, row in self.rows.items()}
+        return (
+            "from instrument.bench import open_bench\n\n"
+            f"with open_bench({str(path) if path else None!r}) as bench:\n"
+            "    if not bench.stage.is_homed:\n"
+            "        bench.stage.home()\n"
+            f"    bench.stage.move_to({here!r})\n"
+        )
+
+    def shutdown(self) -> None:
+        """End the timer."""
+        self._timer.stop()
+
+    # Rows ----------------------------------------------------------------------------------------
+    def _device_changed(self, kind: str) -> None:
+        if kind != "stage":
+            return
+        is_open = self.session.is_open("stage")
+        for widget in (self.pad, self.home_button):
+            widget.setEnabled(is_open)
+        for row in self.rows.values():
+            row.target.setEnabled(is_open)
+            for button in row.buttons:
+                button.setEnabled(is_open)
+        if is_open and not self.rows and self.session.bench.stage is not None:
+            self._make_rows(self.session.bench.stage.axes)
+        if not is_open:
+            state = self.session.state("stage")
+            has_one = "stage" in self.session.kinds
+            self.state.setText(state.text or state.condition if has_one else "This bench has no stage.")
+
+    def _make_rows(self, axes: tuple[StageAxis, ...]) -> None:
+        for number, axis in enumerate(axes):
+            letter, unit = axis.name.rsplit("_", 1)[0], _words(axis.unit)
+            name = QLabel(letter)
+            name.setProperty("role", "value")
+            position = QLabel("–")
+            position.setProperty("role", "value")
+            position.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+            position.setMinimumWidth(110)
+            position.setToolTip(f"Where the stage says that {letter} is")
+            gauge = QProgressBar()
+            gauge.setRange(0, _GAUGE)
+            gauge.setTextVisible(False)
+            gauge.setFixedHeight(6)
+            limits = f"{axis.lower_limit:g} to {axis.upper_limit:g} {unit}"
+            gauge.setToolTip(f"Place between the soft limits: {limits}")
+            target = NumberEdit(
+                unit,
+                minimum=axis.lower_limit,
+                maximum=axis.upper_limit,
+                tip=f"Where to move {letter}; Enter moves. Soft limits:",
+            )
+            target.setFixedWidth(120)
+            target.submitted.connect(partial(self._move_to, axis.name))
+            target.refused.connect(lambda why: self.refused(None, why))
+            minus, plus = (_jog_button(text) for text in ("−", "+"))
+            minus.clicked.connect(partial(self._jog_clicked, letter, -1))
+            plus.clicked.connect(partial(self._jog_clicked, letter, 1))
+            limit = QLabel(f"{axis.lower_limit:g} … {axis.upper_limit:g}")
+            limit.setProperty("role", "dim")
+            limit.setToolTip(f"Soft limits, {unit}")
+            travel = QVBoxLayout()
+            travel.setSpacing(1)
+            travel.addWidget(gauge)
+            travel.addWidget(limit)
+            self._grid.addWidget(name, number, 0)
+            self._grid.addWidget(position, number, 1)
+            self._grid.addLayout(travel, number, 2)
+            self._grid.addWidget(minus, number, 3)
+            self._grid.addWidget(target, number, 4)
+            self._grid.addWidget(plus, number, 5)
+            self.rows[axis.name] = _Row(axis, position, gauge, target, (minus, plus))
+        for unit in dict.fromkeys(axis.unit for axis in axes):
+            step = NumberEdit(
+                _words(unit), _STEPS.get(unit, 1.0), minimum=1e-6, tip="A jog; Shift × 10, Ctrl × 0.1"
+            )
+            step.setFixedWidth(110)
+            step.refused.connect(lambda why: self.refused(None, why))
+            self.steps[unit] = step
+            self._step_row.addWidget(QLabel("Step"))
+            self._step_row.addWidget(step)
+        self._step_row.addStretch(1)
+
+    # Reading -------------------------------------------------------------------------------------
+    def read(self) -> None:
+        """Ask the stage where it is, whatever else is going on."""
+        stage = self.session.bench.stage
+        if not self.isVisible() or stage is None or not self.session.is_open("stage"):
+            return
+        if self._reading is not None:
+            return
+        self._reading = self.session.jobs.watch(
+            "Reading the stage", lambda _: _Reading(stage.position(), stage.is_homed, stage.is_moving)
+        )
+        self._reading.succeeded.connect(self._show)
+        self._reading.ended.connect(self._read)
+
+    def _read(self) -> None:
+        self._reading = None
+
+    def _show(self, value: object) -> None:
+        reading = cast(_Reading, value)
+        for name, row in self.rows.items():
+            here = reading.position[name]
+            row.position.setText(f"{here:,.1f} {_words(row.axis.unit)}".replace(",", "\u2009"))
+            travel = row.axis.upper_limit - row.axis.lower_limit
+            row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
+            if row.target.value is None or not row.target.hasFocus():
+                row.target.set_value(round(here, 3))
+        if reading.is_moving:
+            self.state.setText("Moving …  Esc stops")
+        elif not reading.is_homed:
+            self.state.setText("Not homed: positions have no reference. Home it first.")
+        else:
+            self.state.setText("At rest, homed")
+
+    # Moving --------------------------------------------------------------------------------------
+    def jog(self, letter: str, steps: float, *, repeated: bool = False) -> None:
+        """Move an axis by steps; a held key's repeats are let go while it still moves."""
+        row = next((row for row in self.rows.values() if row.axis.name.startswith(f"{letter}_")), None)
+        stage = self.session.bench.stage
+        if row is None or stage is None:
+            self.refused(self.pad, f"This stage has no axis {letter}.")
+            return
+        if repeated and self.session.jobs.is_busy("stage"):
+            return
+        step = self.steps[row.axis.unit].value or 0.0
+        name, delta = row.axis.name, steps * step
+        self._start(f"Jog {letter} by {delta:g} {_words(row.axis.unit)}", {name: delta}, relative=True)
+
+    def _jog_clicked(self, letter: str, sign: int, _checked: bool = False) -> None:
+        self.jog(letter, sign)
+
+    def _move_to(self, name: str, value: float) -> None:
+        row = self.rows[name]
+        job = self._start(f"Move {name} to {value:g}", {name: value}, relative=False)
+        if job is not None:
+            job.failed.connect(row.target.refuse)
+
+    def _start(self, title: str, where: dict[str, float], *, relative: bool) -> Job | None:
+        stage = self.session.bench.stage
+        assert stage is not None
+        move = stage.move_by if relative else stage.move_to
+        try:
+            job = self.session.device_job(title, lambda _: move(where), {"stage"})
+        except BusyError as error:
+            self.refused(None, str(error))
+            return None
+        job.succeeded.connect(lambda _: self.accepted())
+        return self.tells(job)
+
+    def ask_home(self) -> None:
+        """Ask whether the stage may be homed, then do it."""
+        box = QMessageBox(
+            QMessageBox.Icon.Question,
+            "Home the stage?",
+            "Every axis moves to its reference and then to its home position. Is its way free?",
+            parent=self,
+        )
+        go = box.addButton("Home", QMessageBox.ButtonRole.AcceptRole)
+        stay = box.addButton("Stay", QMessageBox.ButtonRole.RejectRole)
+        box.setDefaultButton(stay)
+        box.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        box.finished.connect(lambda _: self._home() if box.clickedButton() is go else None)
+        self.question = box
+        box.open()
+
+    def _home(self) -> None:
+        stage = self.session.bench.stage
+        if stage is None:
+            return
+        try:
+            self.tells(self.session.device_job("Homing the stage", lambda _: stage.home(), {"stage"}))
+        except BusyError as error:
+            self.refused(None, str(error))
+
+
+def _words(unit: str) -> str:
+    return {"um": "µm"}.get(unit, unit)
+
+
+def _jog_button(text: str) -> QPushButton:
+    button = QPushButton(text)
+    button.setFixedWidth(34)
+    button.setAutoRepeat(False)
+    button.setToolTip("Jog by one step")
+    return button

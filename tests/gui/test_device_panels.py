@@ -1,0 +1,211 @@
+"""Stage, LED array and SLM: clicks and keys on the simulated bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.led_array import LedPanel
+from gui.panels.slm import SlmPanel
+from gui.panels.stage import StagePanel
+from instrument.slm_correction import SlmCorrection
+from instrument.slm_image import write_slm_image
+
+WAIT_MS = 20_000
+LEFT = Qt.MouseButton.LeftButton
+
+
+def _settled(qtbot: QtBot, window: MainWindow) -> None:
+    qtbot.waitUntil(lambda: not window.session.jobs.device_jobs, timeout=WAIT_MS)
+
+
+@pytest.fixture
+def stage(qtbot: QtBot, window: MainWindow) -> StagePanel:
+    panel = window.show_panel("stage")
+    assert isinstance(panel, StagePanel)
+    qtbot.waitUntil(lambda: panel.rows["x_um"].position.text() != "–", timeout=WAIT_MS)
+    return panel
+
+
+def _home(qtbot: QtBot, window: MainWindow, panel: StagePanel) -> None:
+    qtbot.mouseClick(panel.home_button, LEFT)
+    assert panel.question is not None
+    button = next(b for b in panel.question.buttons() if b.text() == "Home")
+    qtbot.mouseClick(button, LEFT)
+    stage = window.session.bench.stage
+    assert stage is not None
+    qtbot.waitUntil(lambda: stage.is_homed, timeout=WAIT_MS)
+    _settled(qtbot, window)
+
+
+def test_home_asks_first(qtbot: QtBot, window: MainWindow, stage: StagePanel) -> None:
+    assert "Not homed" in stage.state.text()
+    qtbot.mouseClick(stage.home_button, LEFT)
+    assert stage.question is not None
+    stay = next(b for b in stage.question.buttons() if b.text() == "Stay")
+    qtbot.mouseClick(stay, LEFT)
+    assert window.session.bench.stage is not None
+    assert not window.session.bench.stage.is_homed
+    _home(qtbot, window, stage)
+    qtbot.waitUntil(
+        lambda: "homed" in stage.state.text() and "Not" not in stage.state.text(), timeout=WAIT_MS
+    )
+
+
+def test_jogging_by_keys(qtbot: QtBot, window: MainWindow, stage: StagePanel) -> None:
+    _home(qtbot, window, stage)
+    device = window.session.bench.stage
+    assert device is not None
+    shift, control = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.ControlModifier
+    for key, modifier, axis, delta in (
+        (Qt.Key.Key_Right, Qt.KeyboardModifier.NoModifier, "x_um", 100.0),
+        (Qt.Key.Key_Up, shift, "y_um", 1000.0),
+        (Qt.Key.Key_PageUp, control, "z_um", 10.0),
+        (Qt.Key.Key_Left, Qt.KeyboardModifier.NoModifier, "x_um", -100.0),
+    ):
+        before = device.commanded_position()[axis]
+        qtbot.keyClick(stage.pad, key, modifier)
+        _settled(qtbot, window)
+        assert device.commanded_position()[axis] == pytest.approx(before + delta, abs=0.2)
+
+
+def test_a_target_is_typed_and_one_outside_the_limits_refused(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    _home(qtbot, window, stage)
+    field, device = stage.rows["x_um"].target, window.session.bench.stage
+    assert device is not None
+    field.setFocus()
+    field.selectAll()
+    qtbot.keyClicks(field, "1234")
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: abs(device.position()["x_um"] - 1234) < 20, timeout=WAIT_MS)
+    _settled(qtbot, window)
+    field.selectAll()
+    qtbot.keyClicks(field, "60001")
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+    assert field.property("refused")
+    assert "-60000 to 60000" in field.toolTip()
+    assert abs(device.commanded_position()["x_um"] - 1234) < 1
+
+
+def test_an_unhomed_stage_says_why_it_does_not_move(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    qtbot.mouseClick(stage.rows["x_um"].buttons[1], LEFT)
+    qtbot.waitUntil(lambda: "home" in stage._note.text().lower(), timeout=WAIT_MS)
+    assert window.session.is_open("stage")
+
+
+def test_a_stage_that_is_unplugged_is_noticed_and_the_rest_goes_on(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    window.session.bench.shared["simulated"].unplug("stage")  # type: ignore[attr-defined]
+    qtbot.waitUntil(lambda: window.session.state("stage").condition == "failed", timeout=WAIT_MS)
+    assert "unplugged" in stage.state.text()
+    assert not stage.home_button.isEnabled()
+    assert window.session.live.is_running
+    window.session.bench.shared["simulated"].plug_in("stage")  # type: ignore[attr-defined]
+    qtbot.mouseClick(window.chips.reconnect_buttons["stage"], LEFT)
+    qtbot.waitUntil(lambda: window.session.is_open("stage"), timeout=WAIT_MS)
+    assert stage.home_button.isEnabled()
+
+
+@pytest.fixture
+def leds(qtbot: QtBot, window: MainWindow) -> LedPanel:
+    panel = window.show_panel("led_array")
+    assert isinstance(panel, LedPanel)
+    qtbot.waitUntil(lambda: panel._drawn is not None, timeout=WAIT_MS)
+    return panel
+
+
+@pytest.mark.parametrize("name", ["bright", "dark", "source", "left", "right", "top", "bottom"])
+def test_led_patterns(qtbot: QtBot, window: MainWindow, leds: LedPanel, name: str) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    leds.colour.setCurrentText("green")
+    leds.brightness.setValue(100)
+    leds.na.set_value(0.2)
+    qtbot.mouseClick(leds.pattern_buttons[name], LEFT)
+    qtbot.waitUntil(lambda: not array.pattern.is_dark, timeout=WAIT_MS)
+    lit = dict(array.pattern.levels)
+    if name == "source":
+        assert set(lit) == {0}
+    else:
+        assert set(lit.values()) == {(0, 100, 0)}
+        inside = np.hypot(*array.led_na[sorted(lit)].T) <= 0.2
+        assert not inside.any() if name == "dark" else inside.all()
+    qtbot.waitUntil(lambda: leds._drawn == array.pattern, timeout=WAIT_MS)
+    qtbot.mouseClick(leds.pattern_buttons["off"], LEFT)
+    qtbot.waitUntil(lambda: array.pattern.is_dark, timeout=WAIT_MS)
+
+
+def test_a_click_toggles_an_led(qtbot: QtBot, window: MainWindow, leds: LedPanel) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    for _ in range(2):  # the second time it goes out again
+        spot = leds.spots.points()[5]
+        view = leds.plot.plotItem.vb.mapViewToScene(spot.pos())
+        before = array.pattern
+        qtbot.mouseClick(leds.plot.viewport(), LEFT, pos=leds.plot.mapFromScene(view))
+        qtbot.waitUntil(lambda before=before: array.pattern is not before, timeout=WAIT_MS)
+        _settled(qtbot, window)
+        leds.look()
+    assert array.pattern.is_dark
+    leds.index.setFocus()
+    leds.index.selectAll()
+    qtbot.keyClicks(leds.index, "7")
+    qtbot.keyClick(leds.index, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: dict(array.pattern.levels).keys() == {7}, timeout=WAIT_MS)
+
+
+@pytest.fixture
+def slm(window: MainWindow) -> SlmPanel:
+    panel = window.show_panel("slm")
+    assert isinstance(panel, SlmPanel)
+    return panel
+
+
+def _type(qtbot: QtBot, field: object, text: str) -> None:
+    field.setFocus()  # type: ignore[attr-defined]
+    field.selectAll()  # type: ignore[attr-defined]
+    qtbot.keyClicks(field, text)
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+
+
+def test_a_picture_goes_on_the_slm_through_its_table_and_off_again(
+    qtbot: QtBot, window: MainWindow, slm: SlmPanel, tmp_path: Path
+) -> None:
+    device = window.session.bench.slm
+    assert device is not None
+    levels = np.arange(60 * 80, dtype=np.uint32).reshape(60, 80).astype(np.uint8)
+    write_slm_image(tmp_path / "phase.png", levels, {})
+    _type(qtbot, slm.file, str(tmp_path / "phase.png"))
+    qtbot.waitUntil(lambda: np.array_equal(device.displayed, levels), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "phase.png" in slm.now.text(), timeout=WAIT_MS)
+    half = SlmCorrection(np.arange(256) * (4 * np.pi / 256))
+    half.save(tmp_path / "table.json", {})
+    _type(qtbot, slm.table_file, str(tmp_path / "table.json"))
+    assert slm.use_table.isChecked()
+    qtbot.mouseClick(slm.load_button, LEFT)
+    qtbot.waitUntil(lambda: np.array_equal(device.displayed, half.apply(levels)), timeout=WAIT_MS)
+    qtbot.mouseClick(slm.blank_button, LEFT)
+    qtbot.waitUntil(lambda: not device.displayed.any(), timeout=WAIT_MS)
+
+
+def test_wrong_files_are_refused_at_their_fields(
+    qtbot: QtBot, window: MainWindow, slm: SlmPanel, tmp_path: Path
+) -> None:
+    write_slm_image(tmp_path / "small.png", np.zeros((6, 8), np.uint8), {})
+    _type(qtbot, slm.file, str(tmp_path / "small.png"))
+    qtbot.waitUntil(lambda: bool(slm.file.property("refused")), timeout=WAIT_MS)
+    assert "(60, 80)" in slm.file.toolTip()
+    _type(qtbot, slm.table_file, str(tmp_path / "nothing.json"))
+    assert "no such file" in slm.table_file.toolTip()
+    assert not slm.use_table.isEnabled()
+    assert window.session.is_open("slm")
