@@ -43,6 +43,7 @@ def run(config: BenchConfig) -> int:
     window.show()
     session.open()
     status = app.exec()
+    session.join()
     sys.excepthook = sys.__excepthook__
     return status
 

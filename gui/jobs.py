@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import threading
+import time
 import traceback
 from collections.abc import Callable, Collection
 from enum import Enum
@@ -187,7 +188,7 @@ class JobRunner(QObject):
         self._numbers = itertools.count()
         self._jobs: dict[int, Job] = {}
         self._waiting: list[int] = []
-        self._threads: dict[int, threading.Thread] = {}
+        self._threads: list[threading.Thread] = []
 
     # Starting ------------------------------------------------------------------------------------
     def device(self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False) -> Job:
@@ -256,10 +257,14 @@ class JobRunner(QObject):
             job.cancel()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the threads of all jobs; returns whether they ended in time. Blocks: for the very end."""
-        for thread in list(self._threads.values()):
-            thread.join(timeout_s)
-        return not any(thread.is_alive() for thread in self._threads.values())
+        """Wait for the threads of all jobs; returns whether they ended in time. Blocks: for the very end.
+
+        Also for those that have sent their last message: an interpreter that ends meanwhile aborts in Qt.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
 
     # Inside --------------------------------------------------------------------------------------
     def _add(self, title: str, work: Work, lanes: frozenset[str], *, exclusive: bool) -> Job:
@@ -288,7 +293,7 @@ class JobRunner(QObject):
         thread = threading.Thread(
             target=_do, args=(job._work, job._context), name=f"job: {job.title}", daemon=True
         )
-        self._threads[number] = thread
+        self._threads = [*(t for t in self._threads if t.is_alive()), thread]
         thread.start()
         job.started.emit()
         self.job_started.emit(job)
@@ -313,7 +318,6 @@ class JobRunner(QObject):
         job = self._jobs.pop(number)
         if number in self._waiting:
             self._waiting.remove(number)
-        self._threads.pop(number, None)
         if kind == "succeeded":
             job.state = JobState.SUCCEEDED
             job.succeeded.emit(value)

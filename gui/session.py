@@ -90,6 +90,7 @@ class BenchSession(QObject):
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
+        self._threads: list[threading.Thread] = []
         self._stopping = False
         self._closing = False
         self.is_closed = False
@@ -293,7 +294,7 @@ class BenchSession(QObject):
         self._stopping = True
         self.log("warning", "STOP")
         running = self.jobs.device_jobs
-        threading.Thread(target=self._stop_all, args=(running,), name="STOP", daemon=True).start()
+        self._in_thread("STOP", self._stop_all, running)
 
     def _stop_all(self, running: tuple[Job, ...]) -> None:
         deadline_s = time.monotonic() + _STOP_WAIT_S
@@ -334,7 +335,20 @@ class BenchSession(QObject):
             job.cancel()
         self.stop()
         jobs = self.jobs.jobs
-        threading.Thread(target=self._close_all, args=(jobs,), name="closing the bench", daemon=True).start()
+        self._in_thread("closing the bench", self._close_all, jobs)
+
+    def join(self, timeout_s: float = 5.0) -> bool:
+        """Wait for all threads, after ``closed``; returns whether they ended. For the end of the program."""
+        deadline_s = time.monotonic() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        ended = not any(thread.is_alive() for thread in self._threads)
+        return self.jobs.join(max(0.0, deadline_s - time.monotonic())) and ended
+
+    def _in_thread(self, name: str, work: Callable[..., None], *arguments: object) -> None:
+        thread = threading.Thread(target=work, args=arguments, name=name, daemon=True)
+        self._threads = [*(t for t in self._threads if t.is_alive()), thread]
+        thread.start()
 
     def _close_all(self, jobs: tuple[Job, ...]) -> None:
         deadline_s = time.monotonic() + _STOP_WAIT_S

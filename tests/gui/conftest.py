@@ -80,7 +80,7 @@ def make_session(qtbot: QtBot, tmp_path: Path, bench_text: str) -> Iterator[Call
         if not session.is_closed:
             with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
                 session.close()
-        session.jobs.join(5.0)
+        assert session.join(10.0)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from gui.main_window import MainWindow
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
-from instrument.slm_correction import SlmCorrection
+from instrument.slm_correction import SlmCorrection, load_slm_correction
 from instrument.slm_image import write_slm_image
 
 WAIT_MS = 20_000
@@ -188,12 +188,12 @@ def test_a_picture_goes_on_the_slm_through_its_table_and_off_again(
     _type(qtbot, slm.file, str(tmp_path / "phase.png"))
     qtbot.waitUntil(lambda: np.array_equal(device.displayed, levels), timeout=WAIT_MS)
     qtbot.waitUntil(lambda: "phase.png" in slm.now.text(), timeout=WAIT_MS)
-    half = SlmCorrection(np.arange(256) * (4 * np.pi / 256))
-    half.save(tmp_path / "table.json", {})
+    SlmCorrection(np.arange(256) * (3.9 * np.pi / 256)).save(tmp_path / "table.json", {})
+    table = load_slm_correction(tmp_path / "table.json")
     _type(qtbot, slm.table_file, str(tmp_path / "table.json"))
     assert slm.use_table.isChecked()
     qtbot.mouseClick(slm.load_button, LEFT)
-    qtbot.waitUntil(lambda: np.array_equal(device.displayed, half.apply(levels)), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: np.array_equal(device.displayed, table.apply(levels)), timeout=WAIT_MS)
     qtbot.mouseClick(slm.blank_button, LEFT)
     qtbot.waitUntil(lambda: not device.displayed.any(), timeout=WAIT_MS)
 
