@@ -24,11 +24,11 @@ def test_a_simulated_bench_says_so(window: MainWindow) -> None:
     assert all(window.session.is_open(kind) for kind in ("camera", "stage", "led_array", "slm"))
 
 
-def test_every_panel_opens_and_copies_python(window: MainWindow) -> None:
+def test_every_panel_opens_and_copies_python(qtbot: QtBot, window: MainWindow) -> None:
     for name, entry in PANELS.items():
         panel = window.show_panel(name)
         assert panel.title == entry.title
-        assert panel.isVisible(), name
+        qtbot.waitUntil(panel.isVisible, timeout=WAIT_MS)
         panel.copy_button.click()
         code = QApplication.clipboard().text()
         compile(code, name, "exec")
