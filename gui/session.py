@@ -18,7 +18,7 @@ from drivers.errors import DeviceError, LimitError, StoppedError
 from gui.jobs import Job, JobContext, JobRunner, Work, words_for
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
-from instrument.live_view import LiveView
+from instrument.live_camera import LiveCamera
 from instrument.safety import StepsFailedError
 from instrument.snapshot import Light, switch_light
 
@@ -86,7 +86,7 @@ class BenchSession(QObject):
         super().__init__(parent)
         self.config = config
         self.bench = Bench(config, self._ask)
-        self.live = LiveView(self.bench.camera)
+        self.live = LiveCamera(self.bench.camera)
         self.jobs = JobRunner(self)
         self.jobs.job_ended.connect(self._job_ended)
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}

@@ -40,6 +40,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+6",
         "Pictures and volumes: look, reconstruct, export",
     ),
+    "live_reconstruction": PanelEntry(
+        "Live reconstruction",
+        "gui.panels.live_reconstruction:LiveReconstructionPanel",
+        "top right",
+        "Ctrl+2",
+        "What the newest frame shows, with its latency",
+    ),
     "stage": PanelEntry(
         "Stage", "gui.panels.stage:StagePanel", "right", "Ctrl+7", "Position, targets, jog, home"
     ),

@@ -20,7 +20,7 @@ _RATE_WINDOW_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class LiveStatus:
+class LiveCameraStatus:
     """How the camera is doing.
 
     Attributes
@@ -38,7 +38,7 @@ class LiveStatus:
     dropped: int
 
 
-class LiveView:
+class LiveCamera:
     """Runs a camera's stream and gives its newest frame to whoever asks; never a queue.
 
     Callable from any thread; ``start``, ``stop`` and ``paused`` talk to the camera and block.
@@ -103,6 +103,12 @@ class LiveView:
         return stream is not None and stream.is_running
 
     @property
+    def stream(self) -> FrameStream | None:
+        """The stream that runs now, for other readers; another one after each pause."""
+        stream = self._stream
+        return stream if stream is not None and stream.is_running else None
+
+    @property
     def error(self) -> DeviceError | None:
         """What ended the stream, if it was not ``stop``."""
         stream = self._stream
@@ -125,7 +131,7 @@ class LiveView:
         stream = self._stream
         return None if stream is None else stream.newest()
 
-    def status(self) -> LiveStatus:
+    def status(self) -> LiveCameraStatus:
         """Return rates and losses; meant to be asked a few times a second."""
         stream = self._stream
         acquired = self._acquired_before + (stream.acquired if stream else 0)
@@ -137,4 +143,4 @@ class LiveView:
             history.popleft()
         seconds = now_s - history[0][0]
         rate = (acquired - history[0][1]) / seconds if seconds > 0 else 0.0
-        return LiveStatus(self.is_running, rate, acquired, dropped)
+        return LiveCameraStatus(self.is_running, rate, acquired, dropped)

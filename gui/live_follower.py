@@ -1,0 +1,75 @@
+"""Keeps a live reconstruction on whatever stream the live view's camera runs."""
+
+from __future__ import annotations
+
+from drivers.errors import DeviceError
+from drivers.stream import FrameStream
+from instrument.errors import BenchError, in_words
+from instrument.live import LiveResult, LiveStatus, LiveView
+from instrument.live_camera import LiveCamera
+from recon.errors import InputError
+from recon.live import LiveReconstructor
+
+
+class LiveFollower:
+    """Starts a :class:`LiveView` on each new stream of a camera: regions, runs, reconnections make new ones.
+
+    Nothing here blocks but for ``stop``, which waits for the picture in progress.
+
+    Parameters
+    ----------
+    camera : LiveCamera
+    """
+
+    def __init__(self, camera: LiveCamera) -> None:
+        self._camera = camera
+        self._view: LiveView | None = None
+        self._stream: FrameStream | None = None
+        self._shape: tuple[int, ...] = ()
+        self.reconstructor: LiveReconstructor | None = None
+        self.problem = ""
+        """Why there are no pictures, in words."""
+
+    def use(self, reconstructor: LiveReconstructor | None) -> None:
+        """Take another reconstructor from the next ``follow`` on; the view before must have been stopped."""
+        self.reconstructor = reconstructor
+        self._stream = None
+        self.problem = ""
+
+    def follow(self) -> None:
+        """Begin on a new stream; to be called now and then."""
+        view = self._view
+        if view is not None and not view.is_running:
+            self._view = None
+            try:
+                view.close()
+            except (DeviceError, BenchError, InputError) as error:
+                self.problem = in_words(error) or str(error)
+        stream = self._camera.stream
+        if self._view is None and self.reconstructor is not None and stream not in (None, self._stream):
+            assert stream is not None
+            self._stream = stream
+            self.problem = ""
+            shape = stream.camera.frame_shape
+            if shape != self._shape:
+                self.reconstructor.restart()
+                self._shape = shape
+            self._view = LiveView(stream, self.reconstructor).start()
+
+    def newest(self) -> LiveResult | None:
+        """Return the newest picture; None before the first."""
+        return None if self._view is None else self._view.newest()
+
+    @property
+    def status(self) -> LiveStatus | None:
+        """How it does; None while nothing runs."""
+        return None if self._view is None else self._view.status
+
+    def stop(self) -> None:
+        """End the view and wait for the picture in progress."""
+        view, self._view, self._stream = self._view, None, None
+        if view is not None:
+            try:
+                view.close()
+            except (DeviceError, BenchError, InputError) as error:
+                self.problem = in_words(error) or str(error)

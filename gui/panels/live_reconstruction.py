@@ -1,0 +1,320 @@
+"""The live reconstruction: a picture of the newest frame, with its latency; refined on request."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QTimer
+from PySide6.QtWidgets import (
+    QComboBox,
+    QFileDialog,
+    QHBoxLayout,
+    QLabel,
+    QLineEdit,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.jobs import Job, JobContext
+from gui.live_follower import LiveFollower
+from gui.panel import Panel
+from gui.session import BenchSession
+from gui.widgets.image_view import ImageView
+from gui.widgets.message import elided
+from gui.widgets.number_edit import NumberEdit
+from instrument.calibration_file import is_calibration, load_calibration
+from instrument.full_picture import full_picture
+from instrument.live import LiveResult
+from instrument.reconstruction_job import find_calibration
+from recon.live import LiveReconstructor
+from recon.result import Reconstruction
+from recon.types import Calibration
+
+_LOOK_MS = 50
+_BUDGET_MS = 80.0
+"""A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
+_PROGRESS_S = 0.5
+_WHITE = 99.8
+"""Percentile of a picture that is shown white."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Loaded:
+    path: Path
+    calibration: Calibration
+    reconstructor: LiveReconstructor
+
+
+@dataclass(frozen=True, slots=True)
+class _SoFar:
+    iteration: int
+    image: npt.NDArray[np.float32]
+
+
+class LiveReconstructionPanel(Panel):
+    """Reconstructs the live view's newest frame again and again; never slows the camera."""
+
+    title = "Live reconstruction"
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(session, parent)
+        self.follower = LiveFollower(session.live)
+        self.loaded: _Loaded | None = None
+        self._loading: Job | None = None
+        self._refining: Job | None = None
+        self._holds = False
+        self._shown: LiveResult | None = None
+        self.view = ImageView()
+        self.file = QLineEdit()
+        self.file.setPlaceholderText("calibration folder")
+        self.file.setToolTip("A calibration, or a run that holds one; Enter loads it")
+        self.file.returnPressed.connect(self.load)
+        self.browse_button = QPushButton("…")
+        self.browse_button.setToolTip("Choose a calibration folder")
+        self.browse_button.clicked.connect(self._browse)
+        self.plane = QComboBox()
+        self.plane.setToolTip("Depth of the scene: which PSF of the calibration is used")
+        self.plane.activated.connect(self._rebuild)
+        self.run_button = QPushButton("▶ Preview")
+        self.run_button.setCheckable(True)
+        self.run_button.setChecked(True)
+        self.run_button.setToolTip("Reconstruct the newest frame again and again")
+        self.run_button.toggled.connect(self._toggle)
+        self.refine_button = QPushButton("Refine")
+        self.refine_button.setToolTip("Reconstruct the newest frame with the full solver; again ends it")
+        self.refine_button.clicked.connect(self.refine)
+        self.budget = NumberEdit(
+            "ms",
+            _BUDGET_MS,
+            minimum=5.0,
+            maximum=5000.0,
+            tip="Time for one picture: quality gives way",
+        )
+        self.budget.setFixedWidth(80)
+        self.budget.submitted.connect(self._set_budget)
+        self.budget.refused.connect(lambda why: self.refused(None, why))
+        self.status = QLabel("Choose a calibration: diffuserbench calibrate, or the sweeps panel, makes one.")
+        self.status.setWordWrap(True)
+        self.status.setObjectName("dim")
+        first = QHBoxLayout()
+        first.addWidget(self.file, 1)
+        first.addWidget(self.browse_button)
+        first.addWidget(self.plane)
+        second = QHBoxLayout()
+        second.addWidget(self.run_button)
+        second.addWidget(self.refine_button)
+        second.addStretch(1)
+        second.addWidget(QLabel("within"))
+        second.addWidget(self.budget)
+        layout = QVBoxLayout(self.body)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(first)
+        layout.addWidget(self.view, 1)
+        layout.addWidget(self.status)
+        layout.addLayout(second)
+        session.run_finished.connect(self._run_finished)
+        self._timer = QTimer(self)
+        self._timer.timeout.connect(self.look)
+        self._timer.start(_LOOK_MS)
+        self._find_newest()
+
+    # Panel ---------------------------------------------------------------------------------------
+    def as_python(self) -> str:
+        """Return lines that reconstruct live with the same calibration."""
+        path = self.session.config.path
+        calibration = self.file.text() or "calibration"
+        return (
+            "from instrument.bench import open_bench\n\n"
+            f"with open_bench({str(path) if path else None!r}) as bench:\n"
+            f"    settings = dict(z_um={self.z_um!r}, budget_ms={self.budget.value!r})\n"
+            f"    with bench.live({calibration!r}, **settings) as live:\n"
+            "        for result in live:\n"
+            "            print(result.picture.quality, result.latency_ms)\n"
+        )
+
+    def shutdown(self) -> None:
+        """End the timer, the preview and a refinement."""
+        self._timer.stop()
+        if self._refining is not None:
+            self._refining.cancel()
+        self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
+
+    @property
+    def z_um(self) -> float | None:
+        """The depth chosen, micrometres; None where the calibration has one PSF."""
+        value = self.plane.currentData()
+        return None if value is None else float(value)
+
+    # The calibration -----------------------------------------------------------------------------
+    def load(self) -> None:
+        """Load the calibration in the field."""
+        folder = Path(self.file.text().strip()).expanduser()
+
+        def work(_: JobContext) -> tuple[Path, Calibration]:
+            found = find_calibration(folder)
+            return found, load_calibration(found)
+
+        job = self.session.jobs.compute("Loading the calibration", work)
+        job.quiet = True
+        job.succeeded.connect(self._got_calibration)
+        job.failed.connect(lambda why: self.refused(self.file, why))
+
+    def _got_calibration(self, value: object) -> None:
+        path, calibration = cast(tuple[Path, Calibration], value)
+        self.accepted(self.file)
+        self.file.setText(str(path))
+        depths = np.unique(calibration.source_positions_um[:, 2])
+        depths = depths[np.isfinite(depths)]
+        self.plane.clear()
+        if len(depths) > 1:
+            for z_um in depths:
+                self.plane.addItem(f"z {z_um / 1e3:.4g} mm", float(z_um))
+            self.plane.setCurrentIndex(len(depths) // 2)
+        self.plane.setVisible(len(depths) > 1)
+        self._build(path, calibration)
+
+    def _rebuild(self) -> None:
+        if self.loaded is not None:
+            self._build(self.loaded.path, self.loaded.calibration)
+
+    def _build(self, path: Path, calibration: Calibration) -> None:
+        z_um, budget_ms = self.z_um, self.budget.value or _BUDGET_MS
+
+        def work(_: JobContext) -> _Loaded:
+            self.follower.stop()
+            return _Loaded(path, calibration, LiveReconstructor(calibration, z_um=z_um, budget_ms=budget_ms))
+
+        job = self.session.jobs.compute("Preparing the preview", work)
+        job.quiet = True
+        self._loading = job
+        job.succeeded.connect(self._ready)
+        job.failed.connect(lambda why: self.refused(self.file, why))
+        job.ended.connect(self._not_loading)
+
+    def _not_loading(self) -> None:
+        self._loading = None
+
+    def _ready(self, value: object) -> None:
+        self.loaded = cast(_Loaded, value)
+        self.follower.use(self.loaded.reconstructor)
+        self.status.setText("Waiting for a frame …")
+
+    def _browse(self) -> None:
+        start = self.file.text() or str(self.session.runs_folder)
+        if name := QFileDialog.getExistingDirectory(self, "Calibration", start):
+            self.file.setText(name)
+            self.load()
+
+    def _find_newest(self) -> None:
+        """Begin with the newest calibration among the runs, if there is one."""
+        patterns = ("*/calibration.json", "*/*/calibration.json")
+        files = [f for pattern in patterns for f in self.session.runs_folder.glob(pattern)]
+        if files:
+            self.file.setText(str(max(files, key=lambda f: f.stat().st_mtime).parent))
+            self.load()
+
+    def _run_finished(self, path: Path) -> None:
+        if self.loaded is None and (is_calibration(path) or any(path.glob("*/calibration.json"))):
+            self.file.setText(str(path))
+            self.load()
+
+    def _set_budget(self, value: float) -> None:
+        if self.loaded is not None:
+            self.loaded.reconstructor.budget_ms = value
+
+    # Pictures ------------------------------------------------------------------------------------
+    def look(self) -> None:
+        """Show the newest picture, if it is another than the one shown."""
+        runs = self.run_button.isChecked() and self._refining is None and self._loading is None
+        if runs and self.isVisible():
+            self.follower.follow()
+        if self._holds or not self.isVisible() or not runs:
+            return
+        if self.follower.problem:
+            elided(self.status, self.follower.problem)
+            return
+        result = self.follower.newest()
+        if result is None or result is self._shown:
+            return
+        self._shown = result
+        self._show_picture(result.picture.image)
+        how = self.follower.status
+        rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
+        passed = "" if how is None else f", {how.passed_over} frames passed over"
+        self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
+
+    def _show_picture(self, image: npt.NDArray[Any]) -> None:
+        sample = image[::3, ::3]
+        self.view.show_image(image, 0.0, float(np.percentile(sample, _WHITE)) or 1.0)
+
+    def _toggle(self, on: bool) -> None:
+        self._holds = False
+        if not on:
+            self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
+            self.status.setText("The preview is off.")
+
+    # Refining ------------------------------------------------------------------------------------
+    def refine(self) -> None:
+        """Reconstruct the newest frame with the full solver; while it runs, end it."""
+        if self._refining is not None:
+            self._refining.cancel()
+            return
+        if self._holds:  # back to the preview
+            self._holds = False
+            self.refine_button.setText("Refine")
+            return
+        frame, loaded, z_um = self.session.live.newest(), self.loaded, self.z_um
+        if loaded is None:
+            self.refused(self.file, "Choose a calibration first.")
+            return
+        if frame is None:
+            self.refused(None, "There is no frame yet: start the live view.")
+            return
+        image = np.array(frame.image)  # a copy: the ring's buffer is wanted back
+
+        def work(context: JobContext) -> Reconstruction:
+            self.follower.stop()
+            shown_s = time.monotonic()
+
+            def watch(record: Any, present: Any) -> None:
+                nonlocal shown_s
+                if not context.cancel.is_set() and time.monotonic() - shown_s > _PROGRESS_S:
+                    shown_s = time.monotonic()
+                    context.report(_SoFar(record.iteration, np.array(present())))
+
+            return full_picture(image, loaded.calibration, z_um=z_um, callback=watch, cancel=context.cancel)
+
+        job = self.session.jobs.compute("Refining the newest frame", work)
+        self._refining = job
+        self.refine_button.setText("■ End")
+        self.status.setText(f"Refining frame {frame.metadata.frame_id} …")
+        job.progressed.connect(self._refined_so_far)
+        job.succeeded.connect(self._refined)
+        job.failed.connect(lambda why: self.refused(None, why))
+        job.ended.connect(self._refining_ended)
+
+    def _refined_so_far(self, value: object) -> None:
+        so_far = cast(_SoFar, value)
+        self._show_picture(so_far.image)
+        self.status.setText(f"Refining: iteration {so_far.iteration}")
+
+    def _refined(self, value: object) -> None:
+        result = cast(Reconstruction, value)
+        self._holds = True
+        self._show_picture(result.image)
+        reason = f", {result.stop_reason}" if result.stop_reason is not None else ""
+        elided(
+            self.status,
+            f"Refined: {result.method} with {result.prior}, {len(result.history)} iterations, "
+            f"{result.seconds:.1f} s{reason}. {' '.join(result.warnings)}",
+        )
+
+    def _refining_ended(self) -> None:
+        self._refining = None
+        self.refine_button.setText("Back to the preview" if self._holds else "Refine")
