@@ -140,6 +140,7 @@ def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
         "iterations": len(result.history),
         "seconds": result.seconds,
         "warnings": [*job.warnings, *result.warnings],
+        "verdict": None if result.verdict is None else result.verdict.as_json(),
         "grid": asdict(result.grid),
         "provenance": result.provenance,
         "history": [asdict(entry) for entry in result.history],

@@ -27,7 +27,7 @@ def map_figure(record: Mapping[str, Any]) -> Figure:
     methods = record["methods"]
     columns = min(len(methods), 3)
     rows = -(-len(methods) // columns)
-    figure = Figure(figsize=(4.6 * columns + 0.9, 3.5 * rows + 1.0), dpi=100, layout="constrained")
+    figure = Figure(figsize=(max(4.6 * columns + 0.9, 7.0), 3.5 * rows + 1.0), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes[len(methods) :]:
@@ -37,8 +37,8 @@ def map_figure(record: Mapping[str, Any]) -> Figure:
     ]
     bar = figure.colorbar(images[0], ax=list(axes), shrink=0.8, ticks=[-1, 0, 1])
     bar.ax.set_yticklabels(["10 times\nbelow", "boundary", "10 times\nabove"], fontsize=8)
-    bar.ax.set_title("severity", fontsize=9, color=_INK)
-    figure.suptitle(f"{record['title']} (SIMULATED)", fontsize=13, color=_INK)
+    bar.set_label("severity", fontsize=9, color=_INK)
+    figure.suptitle(f"{record['title']} (SIMULATED)", fontsize=12, color=_INK, wrap=True)
     return figure
 
 

@@ -68,6 +68,7 @@ def volume_record(result: VolumeReconstruction, job: Job) -> dict[str, Any]:
         "stop_reasons": [str(reason) for reason in result.stop_reasons],
         "seconds": result.seconds,
         "warnings": [*job.warnings, *result.warnings],
+        "verdict": None if result.verdict is None else result.verdict.as_json(),
         "grid": {
             "shape": result.grid.shape,
             "centre": result.grid.centre,

@@ -16,10 +16,13 @@ from recon.noise import NoiseModel
 from recon.preparation import Field, Prepared, prepare
 from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
 from recon.result import Reconstruction
-from recon.solvers.base import Solver
+from recon.solvers.base import Outcome, Solver
 from recon.solvers.stopping import IterationRecord, StoppingRules
 from recon.types import Calibration
 from recon.varying_picture import model_of, reconstruct_varying
+from recon.verdict.collect import evidence_of, unsettled_by
+from recon.verdict.judge import method_name, verdict_on
+from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS as VOLUME_PRIORS
 from recon.volume.model import MODELS, ModelName
 
@@ -63,6 +66,7 @@ def reconstruct(
     field: Field = "sensor",
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
+    judged: bool = True,
 ) -> Reconstruction:
     """Reconstruct the picture of one depth from a lensless camera's measurement.
 
@@ -108,6 +112,8 @@ def reconstruct(
         ``callback(record, image)`` after each iteration; ``image()`` makes the present picture.
     cancel : threading.Event, optional
         Set it to stop after the iteration in progress.
+    judged : bool
+        Say whether the result can be trusted (``verdict``), at the cost of about two iterations.
 
     Returns
     -------
@@ -142,6 +148,7 @@ def reconstruct(
             field=field,
             callback=callback,
             cancel=cancel,
+            judged=judged,
         )
     problem = prepare(
         measurement, calibration, z_um=z_um, noise=noise, background=background, erasures=erasures
@@ -179,8 +186,9 @@ def reconstruct(
             cancel=cancel,
         )
     )
+    picture = problem.picture(outcome.solution, field)
     return Reconstruction(
-        image=problem.picture(outcome.solution, field),
+        image=picture,
         grid=problem.grid(field, z_um),
         method=method,
         prior=name,
@@ -196,7 +204,34 @@ def reconstruct(
             "psf_z_um": problem.psf_z_um,
             "valid_share": float(problem.noise_norm**2 / problem.data.size),
         },
+        verdict=_verdict(measurement, problem, picture, outcome, rules, method, name) if judged else None,
     )
+
+
+def _verdict(
+    measurement: npt.ArrayLike,
+    problem: Prepared,
+    picture: Array,
+    outcome: Outcome,
+    rules: StoppingRules,
+    method: str,
+    prior: str,
+) -> Verdict:
+    if outcome.history:
+        residual = outcome.history[-1].data_residual
+    else:
+        residual = float(np.linalg.norm(problem.operator.forward(outcome.solution) - problem.data))
+    evidence = evidence_of(
+        measurement,
+        problem.data,
+        problem.valid,
+        problem.noise,
+        picture[None],
+        problem.psfs[None],
+        [residual],
+        unsettled_by(outcome.history, outcome.stop_reason, rules.tolerance),
+    )
+    return verdict_on(evidence, method_name(method, prior))
 
 
 def _varying_model(

@@ -56,6 +56,10 @@ class Prepared:
     psf_z_um: float | None
     geometry: Geometry
     warnings: tuple[str, ...]
+    psfs: Floats
+    """As calibrated, (1 or n_channels, height, width)."""
+    valid: npt.NDArray[np.bool_]
+    """Of the shape of ``data``."""
 
     def picture(self, solution: Array, field: Field) -> Floats:
         """Return the object as an image (height, width[, n_channels]) in measurement units."""
@@ -127,6 +131,8 @@ def prepare(
         psf_z_um=psf_z_um,
         geometry=geometry,
         warnings=tuple(warnings),
+        psfs=psfs,
+        valid=valid,
     )
 
 

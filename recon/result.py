@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.solvers.stopping import IterationRecord, StopReason
+from recon.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,8 @@ class Reconstruction:
         The whole object on the operator's grid, (n_channels, ...): pass as ``initial`` for a warm start.
     provenance : mapping
         Software and settings, JSON-compatible.
+    verdict : Verdict or None
+        Whether to trust it, from the data alone; None where nobody asked for one.
     """
 
     image: npt.NDArray[np.float32]
@@ -77,3 +80,4 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    verdict: Verdict | None = None

@@ -63,6 +63,7 @@ def reconstruct_varying(
     field: Field,
     callback: Progress | None,
     cancel: threading.Event | None,
+    judged: bool = True,
 ) -> Reconstruction:
     """Reconstruct a picture with the local or low-rank model. Parameters as :func:`recon.reconstruct`."""
     if prior not in PRIORS:
@@ -92,6 +93,7 @@ def reconstruct_varying(
         field=field,
         callback=None if callback is None else show,
         cancel=cancel,
+        judged=judged,
     )
     z, pitch = float(result.grid.z_um[0]), float(result.grid.pitch_um[0])
     provenance: dict[str, Any] = {**result.provenance, "model": model, "model_reason": reason}
@@ -115,4 +117,5 @@ def reconstruct_varying(
         seconds=result.seconds,
         warnings=result.warnings,
         provenance={**provenance, "psf_z_um": z if np.isfinite(z) else None},
+        verdict=result.verdict,
     )

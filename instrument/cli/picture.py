@@ -6,6 +6,7 @@ import typer
 
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
+from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs, write_reconstruction
 from instrument.reconstruction_job import Job
 from instrument.reconstruction_request import PICTURE_ITERATIONS, PictureRequest
@@ -70,5 +71,6 @@ def _tell(result: Reconstruction) -> None:
         typer.echo(
             f"{'Stopped':<12}after {count} iterations, {result.seconds:.1f} s ({each}): {result.stop_reason}"
         )
+    tell_verdict(result.verdict)
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)

@@ -6,6 +6,7 @@ import typer
 
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
+from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_request import VOLUME_ITERATIONS, VolumeRequest
 from instrument.volume_file import write_volume
@@ -36,6 +37,7 @@ def reconstruct_to_volume(request: VolumeRequest, outputs: Outputs, *, force: bo
         typer.echo(
             f"{'Stopped':<12}after {count} iterations, {result.seconds:.1f} s: {result.stop_reasons[0]}"
         )
+        tell_verdict(result.verdict)
         for warning in (*job.warnings, *result.warnings):
             typer.echo(f"Warning: {warning}", err=True)
         write_volume(outputs, result, job)

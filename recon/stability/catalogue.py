@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 from recon.errors import InputError
-from recon.stability import maps_light
+from recon.stability import (
+    maps_calibration,
+    maps_display,
+    maps_light,
+    maps_scene,
+    maps_solver,
+    maps_volume,
+)
 from recon.stability.map import StressMap
 
-MAPS: dict[str, StressMap] = {m.name: m for m in maps_light.MAPS}
+MAPS: dict[str, StressMap] = {
+    stress.name: stress
+    for module in (maps_light, maps_volume, maps_scene, maps_calibration, maps_solver, maps_display)
+    for stress in module.MAPS
+}
 
 
 def map_named(name: str) -> StressMap:

@@ -6,7 +6,8 @@ criterion      severity
 trivial        error over that of the trivial reconstruction: the measurement's back-projection ``A^H b``
                with the best scale and offset that the truth itself would choose
 resolution     0.5 over the correlation with the truth on the ring of frequencies whose period is twice the
-               resolved distance (the resolution has fallen below half of nominal)
+               resolved distance (the resolution has fallen below half of nominal); that distance is the
+               shift at which the PSF's autocorrelation is 0.7, and at least two pixels
 spots          share of true points (away from others) without a peak within 1.5 pixels, and of peaks without
                a point, over 10 %
 dip            0.2 over the least dip between neighbouring points (two-point resolution)

@@ -90,7 +90,7 @@ class StressMap:
     methods: tuple[str, ...]
     trial: TrialFunction
     error: str = "NRMSE"
-    draws: int = 3
+    draws: int = 1
 
 
 @dataclass(frozen=True, slots=True)

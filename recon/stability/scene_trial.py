@@ -35,11 +35,10 @@ Image = npt.NDArray[Any]
 PIXELS: Mapping[Size, int] = {"quick": 48, "full": 64}
 LEVEL = 0.7
 """Autocorrelation taken for resolved (Kuo 2020, sec. 3.2)."""
+LEAST_RESOLVED_PX = 2.0
+"""No grid of pixels tells neighbours apart that are nearer: there must be a darker pixel between them."""
 ITERATIONS = {"quick": 150, "full": 200}
 TOLERANCE = {"admm": 2e-3, "admm-sensor": 2e-3, "fista": 5e-4, "volume": 1e-3}
-FEW_POINTS = 1000
-"""Scenes of at most so many points are judged by the points found, others by resolution."""
-
 METHODS: Mapping[str, Mapping[str, str]] = {
     "admm tv": {"method": "admm", "prior": "tv"},
     "admm l1": {"method": "admm", "prior": "l1"},
@@ -130,7 +129,8 @@ def judge(scene: TestScene, result: Reconstruction | VolumeReconstruction) -> Tr
     found = result.image[None] if isinstance(result, Reconstruction) else result.volume
     truth = scene.truth.reshape(found.shape)
     error, severities = judge_image(scene, np.asarray(found), truth)
-    return Trial(error, {**severities, **{Failure.CONVERGENCE: _convergence(result)}})
+    evidence = {} if result.verdict is None else result.verdict.evidence
+    return Trial(error, {**severities, Failure.CONVERGENCE: _convergence(result)}, evidence)
 
 
 def _convergence(result: Reconstruction | VolumeReconstruction) -> float:
@@ -156,10 +156,11 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     )
     error = relative_error(seen, wanted) if found.any() else 1.0
     severities = {Failure.TRIVIAL: error / max(trivial_error(back, wanted), 1e-6)}
-    if len(scene.points) <= FEW_POINTS:
+    if scene.spec.family == "beads":
         severities[Failure.SPOTS] = spot_severity(found, _places(scene, len(found)), _depth_reach(scene, psf))
     elif len(found) == 1:
-        severities[Failure.RESOLUTION] = resolution_severity(seen[0], wanted[0], resolved_px)
+        nominal_px = max(resolved_px, LEAST_RESOLVED_PX)
+        severities[Failure.RESOLUTION] = resolution_severity(seen[0], wanted[0], nominal_px)
     return error, severities
 
 

@@ -20,6 +20,9 @@ from recon.preparation import Field, channel_noise, data_of, require_same_pixels
 from recon.solvers import Outcome, Solver, StoppingRules
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
+from recon.verdict.collect import evidence_of, unsettled_by
+from recon.verdict.judge import method_name, verdict_on
+from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
@@ -55,6 +58,7 @@ def reconstruct_volume(
     device: Device = "cpu",
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
+    judged: bool = True,
 ) -> VolumeReconstruction:
     """Reconstruct a volume from one measurement (Kuo 2020, Eq. 4.2; with a background Eq. 6.2).
 
@@ -103,6 +107,8 @@ def reconstruct_volume(
         called until ``callback`` returns.
     cancel : threading.Event, optional
         Set it to stop after the iteration in progress.
+    judged : bool
+        Say whether the result can be trusted (``verdict``).
 
     Raises
     ------
@@ -174,6 +180,7 @@ def reconstruct_volume(
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
+    verdict = _verdict(measurement, scaled, volume, outcomes, tolerance, prior) if judged else None
     return VolumeReconstruction(
         volume=np.ascontiguousarray(volume),
         grid=grid,
@@ -189,7 +196,29 @@ def reconstruct_volume(
         empty_planes=tuple(empty),
         warnings=(*scaled.warnings, *_uncertified(empty)),
         provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": planned},
+        verdict=verdict,
     )
+
+
+def _verdict(
+    measurement: npt.ArrayLike,
+    scaled: Scaled,
+    volume: Array,
+    outcomes: list[Outcome],
+    tolerance: float,
+    prior: str,
+) -> Verdict:
+    evidence = evidence_of(
+        measurement,
+        scaled.data,
+        scaled.valid,
+        scaled.noise,
+        volume,
+        scaled.depths.central,
+        [o.history[-1].data_residual for o in outcomes],
+        max(unsettled_by(o.history, o.stop_reason, tolerance) for o in outcomes),
+    )
+    return verdict_on(evidence, method_name("volume", prior))
 
 
 def _uncertified(empty: list[EmptyPlanes]) -> list[str]:

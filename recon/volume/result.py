@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.solvers.stopping import IterationRecord, StopReason
+from recon.verdict.verdict import Verdict
 from recon.volume.empty_planes import EmptyPlanes
 
 
@@ -84,6 +85,8 @@ class VolumeReconstruction:
     empty_planes : tuple of EmptyPlanes
         One a channel: depth planes that were left out because they stayed empty, and whether the optimality
         condition certifies it.
+    verdict : Verdict or None
+        Whether to trust it, from the data alone; None where nobody asked for one.
     """
 
     volume: npt.NDArray[np.float32]
@@ -100,3 +103,4 @@ class VolumeReconstruction:
     empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    verdict: Verdict | None = None

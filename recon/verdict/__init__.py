@@ -1,0 +1,1 @@
+"""Whether a reconstruction can be trusted, judged from its data alone."""

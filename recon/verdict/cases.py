@@ -1,0 +1,90 @@
+"""What the shipped stability maps saw: one case a reconstruction, its evidence and whether it failed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.stability.shipped import shipped_maps
+
+Floats = npt.NDArray[np.float64]
+
+FEATURES = ("detail", "unexplained", "load", "signal", "similarity", "erased", "saturated", "unsettled")
+"""Evidence by which cases are alike."""
+FLOOR = {
+    "detail": 0.05,
+    "unexplained": 0.02,
+    "load": 0.005,
+    "signal": 0.1,
+    "saturated": 0.01,
+    "unsettled": 0.05,
+}
+"""Below these nothing can be told from zero; above, ratios count."""
+WEIGHT = {"similarity": 2.0, "erased": 1.0, "unsettled": 0.3, "signal": 0.5}
+"""How much a feature's difference counts, relative to a ratio of ``e`` in the others."""
+
+GROUPS = {
+    "picture tv": ("admm tv", "admm-sensor tv", "fista tv"),
+    "picture l1": ("admm l1", "fista l1", "admm-sensor l1"),
+    "wiener": ("wiener",),
+    "volume tv": ("volume tv",),
+    "volume l1": ("volume l1", "volume nonnegative"),
+}
+"""Methods that reach the same minimiser, and so fail alike."""
+
+
+def group_of(method: str) -> str | None:
+    """Return the group of a method, or None where no map has one like it."""
+    return next((g for g, methods in GROUPS.items() if method in methods), None)
+
+
+@dataclass(frozen=True)
+class Cases:
+    """Cases of a group of methods.
+
+    Attributes
+    ----------
+    places : ndarray, (n, n_features)
+        In the space in which distances tell how alike they are.
+    severities : ndarray, (n,)
+    maps : tuple of str
+        The maps that they come from.
+    """
+
+    places: Floats
+    severities: Floats
+    maps: tuple[str, ...]
+
+
+def place_of(evidence: Mapping[str, Any]) -> Floats:
+    """Return where evidence lies in the space of :class:`Cases`."""
+    coordinates = []
+    for name in FEATURES:
+        value = float(evidence[name])
+        if name in FLOOR:
+            value = float(np.log(max(value, 0.0) + FLOOR[name]))
+        coordinates.append(WEIGHT.get(name, 1.0) * value)
+    return np.asarray(np.minimum(coordinates, 1e3))
+
+
+@cache
+def cases_of(group: str) -> Cases:
+    """Return the shipped maps' cases of a group."""
+    places, severities, names = [], [], []
+    for name, stress in shipped_maps().items():
+        for method, result in stress["methods"].items():
+            # "admm tv, left out": what follows the comma is how the data was handled.
+            if method.partition(",")[0] not in GROUPS[group]:
+                continue
+            for entry in result["evidence"]:
+                places.append(place_of(entry))
+                severities.append(float(entry["severity"]))
+                names.append(name)
+    return Cases(
+        np.array(places).reshape(-1, len(FEATURES)), np.array(severities), tuple(dict.fromkeys(names))
+    )

@@ -1,0 +1,78 @@
+"""From a reconstruction in the making to its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.checks import as_channels, saturated_share
+from recon.solvers.stopping import IterationRecord, StopReason
+from recon.verdict.evidence import Evidence, averaged, measure
+
+Array = npt.NDArray[Any]
+
+DIVERGED = 1e3
+"""``unsettled`` of a run whose iterates were no longer finite; it is never more."""
+LIMITS = (StopReason.ITERATIONS, StopReason.TIME, StopReason.CANCELLED)
+
+
+def evidence_of(
+    measurement: npt.ArrayLike,
+    data: Array,
+    valid: npt.NDArray[np.bool_],
+    noise: Array,
+    volume: Array,
+    psfs: Array,
+    residuals: Sequence[float],
+    unsettled: float,
+) -> Evidence:
+    """Measure all channels of a reconstruction.
+
+    Parameters
+    ----------
+    measurement : array
+        As it came: (height, width[, n_channels]).
+    data : ndarray, (n_channels, height, width)
+        Background subtracted, in units of the noise.
+    valid : ndarray of bool, shape of ``data``
+    noise : ndarray, (n_channels,)
+        Deviations, counts.
+    volume : ndarray, (n_z, rows, columns[, n_channels])
+        The result in measurement units.
+    psfs : ndarray, (n_z, 1 or n_channels, height, width)
+        As calibrated.
+    residuals : sequence of float
+        Residual norms in units of the noise: one a channel, or one of all together.
+    unsettled : float
+    """
+    counts = as_channels(measurement, "measurement")
+    n = len(data)
+    channels = []
+    for c in range(n):
+        residual = residuals[c] if len(residuals) == n else residuals[0] / n**0.5
+        channels.append(
+            measure(
+                data[c],
+                valid[c],
+                volume if volume.ndim == 3 else volume[..., c],
+                psfs[:, min(c, psfs.shape[1] - 1)],
+                float(noise[c]),
+                residual,
+                saturated=saturated_share(counts[c][valid[c]]),
+                unsettled=unsettled,
+            )
+        )
+    return averaged(channels)
+
+
+def unsettled_by(history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float) -> float:
+    """Return the last change over ten times the tolerance, where a limit ended the run; else 0."""
+    if reason is StopReason.NOT_FINITE:
+        return DIVERGED
+    if not history or tolerance <= 0 or reason not in LIMITS:
+        return 0.0
+    change = history[-1].change
+    return min(float(change / (10 * tolerance)), DIVERGED) if np.isfinite(change) else DIVERGED

@@ -1,0 +1,167 @@
+"""What the data alone tell about a reconstruction: light, misfit, load, missing pixels.
+
+Nothing here knows the truth. Everything is relative, so that it means the same at any exposure and size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+
+LIT = 0.05
+"""Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
+difference between neighbours as an edge."""
+NO_LESS = 1e-4
+"""Least variance of the signal in units of the noise', so that ratios to it stay finite."""
+RING = (0.1, 0.25)
+"""Spatial frequencies of details, cycles a pixel: periods from ten to four pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What was measured.
+
+    Attributes
+    ----------
+    signal : float
+        Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
+        there is to reconstruct from.
+    detail : float
+        Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root
+        of the power of the picture times the PSF's on that ring of frequencies, over the noise'.
+    unexplained : float
+        Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
+        what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation).
+    erased, saturated : float
+        Shares of the pixels: not used; used though at full scale.
+    lit, edges : float
+        Shares of the voxels that are not dark, and that differ from a neighbour.
+    load : float
+        Unknowns a measured pixel: lit voxels or edges, whichever are fewer, over the pixels used.
+    planes : int
+        Depths.
+    similarity : float
+        Greatest inner product of PSFs of neighbouring depths; 0 for one depth.
+    unsettled : float
+        Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
+    """
+
+    signal: float
+    detail: float
+    unexplained: float
+    erased: float
+    saturated: float
+    lit: float
+    edges: float
+    load: float
+    planes: int
+    similarity: float
+    unsettled: float
+
+    def as_json(self) -> dict[str, float]:
+        """Return the numbers by name."""
+        return {name: float(value) for name, value in asdict(self).items()}
+
+
+def measure(
+    data: Array,
+    valid: npt.NDArray[np.bool_],
+    volume: Array,
+    psfs: Array,
+    noise: float,
+    residual_norm: float,
+    *,
+    saturated: float,
+    unsettled: float,
+) -> Evidence:
+    """Measure a reconstruction of one channel.
+
+    Parameters
+    ----------
+    data : ndarray, (height, width)
+        Measurement, background subtracted, in units of its noise.
+    valid : ndarray of bool, (height, width)
+    volume : ndarray, (n_z, rows, columns)
+        The result: ``measurement = sum_z PSF_z * volume_z``.
+    psfs : ndarray, (n_z, height, width)
+        On-axis PSFs as calibrated.
+    noise : float
+        Its deviation, counts.
+    residual_norm : float
+        ``||A x - b||`` over the valid pixels, in units of the noise.
+    saturated : float
+        Share of the valid pixels at full scale.
+    unsettled : float
+    """
+    used = data[valid].astype(np.float64)
+    signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
+    beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
+    lit, edges = _lit_and_edges(volume)
+    return Evidence(
+        signal=float(np.sqrt(signal2)),
+        detail=_detail(volume, psfs, noise, len(used)),
+        unexplained=float(np.sqrt(beyond2 / signal2)),
+        erased=1.0 - len(used) / data.size,
+        saturated=saturated,
+        lit=lit,
+        edges=edges,
+        load=min(lit, edges) * volume.size / len(used),
+        planes=len(volume),
+        similarity=_similarity(psfs),
+        unsettled=unsettled,
+    )
+
+
+def _lit_and_edges(volume: Array) -> tuple[float, float]:
+    white = float(np.percentile(volume, 99.5))
+    if white <= 0:
+        white = float(volume.max())
+    if white <= 0:
+        return 0.0, 0.0
+    lit = float(np.mean(volume > LIT * white))
+    step = np.zeros(volume.shape, bool)
+    for axis in range(volume.ndim):
+        if volume.shape[axis] > 1:
+            differs = np.abs(np.diff(volume, axis=axis)) > LIT * white
+            front = [slice(None)] * volume.ndim
+            front[axis] = slice(0, -1)
+            step[tuple(front)] |= differs
+    return lit, float(np.mean(step))
+
+
+def _detail(volume: Array, psfs: Array, noise: float, count: int) -> float:
+    """Signal over noise of what a picture's finer half throws onto ``count`` pixels."""
+    shape = tuple(a + b for a, b in zip(volume.shape[1:], psfs.shape[1:], strict=True))
+    y, x = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
+    ring = (np.hypot(y, x) > RING[0]) & (np.hypot(y, x) < RING[1])
+    if not ring.any():  # a picture of a few pixels has no such frequency
+        return 0.0
+    thrown = np.zeros(int(np.count_nonzero(ring)), complex)
+    for plane, psf in zip(volume, psfs, strict=True):
+        thrown += (np.fft.rfft2(plane, shape) * np.fft.rfft2(psf, shape))[ring]
+    # White noise of this deviation on so many pixels has this power at every frequency.
+    return float(np.sqrt(np.mean(np.abs(thrown) ** 2) / (noise**2 * count)))
+
+
+def _similarity(psfs: Array) -> float:
+    if len(psfs) < 2:
+        return 0.0
+    flat = psfs.reshape(len(psfs), -1).astype(np.float64)
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    return float(np.max(np.sum(flat[1:] * flat[:-1], axis=1)))
+
+
+def averaged(channels: list[Evidence]) -> Evidence:
+    """Return the mean over channels, the worst of what must not average."""
+    numbers: Mapping[str, list[float]] = {
+        k: [c.as_json()[k] for c in channels] for k in channels[0].as_json()
+    }
+    mean = {k: float(np.mean(v)) for k, v in numbers.items()}
+    worst = {k: max(numbers[k]) for k in ("unexplained", "saturated", "unsettled", "load")}
+    return Evidence(**{**mean, **worst, "planes": int(numbers["planes"][0])})  # type: ignore[arg-type]

@@ -1,0 +1,136 @@
+"""From evidence to a verdict: what happened in the stability maps to data like these.
+
+The verdict looks up the most similar cases of the shipped maps and asks how many of them failed. Which stress
+limits is asked the same way: were this one number as good as in a good case, how many would fail then?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.verdict.cases import FEATURES, Cases, cases_of, group_of, place_of
+from recon.verdict.evidence import Evidence
+from recon.verdict.verdict import Finding, Region, Verdict
+
+Floats = npt.NDArray[np.float64]
+
+NEIGHBOURS = 12
+"""Cases that are asked."""
+RELIABLE, LOST = 0.15, 0.6
+"""Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""
+FAR = 1.5
+"""Distance beyond which the nearest case is no witness: a factor of about ``e^1.5`` in one number."""
+UNFINISHED = 10.0
+"""``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
+FEWEST = 40
+"""Cases that a group needs to be judged by."""
+
+STRESSES: Mapping[str, tuple[int, str, str]] = {
+    "detail": (
+        1,
+        "Little light: the picture's details stand {value:.2g} times above the noise",
+        "More light would help (exposure, brighter scene, several frames averaged), or larger pixels (--bin)",
+    ),
+    "signal": (
+        1,
+        "Little contrast: the measurement varies by {value:.2g} times its noise",
+        "More light would help, or less background light",
+    ),
+    "unexplained": (
+        -1,
+        "{value:.0%} of the measurement's contrast is not explained by the model beyond noise",
+        "Check that depth and colour are those of the calibration, that nothing moved since (diffuserbench "
+        "compare), and that background is subtracted; more PSFs over the field may help (--model local)",
+    ),
+    "load": (
+        -1,
+        "{value:.2g} unknowns for each measured pixel",
+        "A sparser scene, fewer depths, more pixels, or a prior that fits the scene better would help",
+    ),
+    "similarity": (
+        -1,
+        "PSFs of neighbouring depths are {value:.0%} alike",
+        "Fewer depths would help, or a longer range of depths",
+    ),
+    "erased": (
+        -1,
+        "{value:.0%} of the pixels are not used",
+        "Use more pixels: expose shorter if they are saturated",
+    ),
+    "saturated": (
+        -1,
+        "{value:.0%} of the pixels used are at full scale",
+        "Leave them out (--erasures saturated), or better, expose shorter",
+    ),
+    "unsettled": (
+        -1,
+        "The iterations were ended while the picture still changed",
+        "More iterations or more time would help",
+    ),
+}
+"""By evidence: whether more of it is better, what is said, what would help."""
+
+
+def method_name(method: str, prior: str) -> str:
+    """Return the name that a method with a prior has on the maps."""
+    if method == "wiener":
+        return "wiener"
+    kind = "tv" if prior.startswith("tv") else prior
+    solver = "admm" if method == "admm-gpu" else method
+    return f"{solver} {kind}"
+
+
+def verdict_on(evidence: Evidence, method: str) -> Verdict:
+    """Judge a reconstruction by its evidence and the shipped maps."""
+    numbers = evidence.as_json()
+    group = group_of(method)
+    cases = None if group is None else cases_of(group)
+    if cases is None or len(cases.severities) < FEWEST:
+        return Verdict(Region.UNKNOWN, method, None, (), numbers)
+    place = place_of(numbers)
+    share, nearest = failing_share(cases, place)
+    if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all() or share >= LOST:
+        region = Region.OUTSIDE
+    elif share <= RELIABLE and nearest <= FAR:
+        region = Region.INSIDE
+    else:
+        region = Region.NEAR
+    basis = (
+        f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)})"
+        + ("" if nearest <= FAR else "; none of them is much like this one")
+    )
+    return Verdict(region, method, share, _findings(cases, place, numbers, share), numbers, basis)
+
+
+def failing_share(cases: Cases, place: Floats) -> tuple[float, float]:
+    """Return the share of failures among the nearest cases, and the distance of the third nearest.
+
+    Nearer cases count more.
+    """
+    distance = np.linalg.norm(cases.places - place, axis=1)
+    order = np.argsort(distance)[:NEIGHBOURS]
+    weight = 1 / (0.2 + distance[order])
+    failed = cases.severities[order] >= 1
+    return float(np.sum(weight * failed) / np.sum(weight)), float(distance[order[2]])
+
+
+def _findings(cases: Cases, place: Floats, numbers: Mapping[str, float], share: float) -> tuple[Finding, ...]:
+    """Return the stresses, those first whose removal would lower the share of failures most."""
+    good = cases.places[cases.severities < 0.7]
+    if len(good) < 5:
+        return ()
+    findings = []
+    for index, name in enumerate(FEATURES):
+        better, words, help_ = STRESSES[name]
+        typical = float(np.median(good[:, index]))
+        if (place[index] - typical) * better >= 0:
+            continue  # as good as in a good case already
+        relieved = place.copy()
+        relieved[index] = typical
+        gain = share - failing_share(cases, relieved)[0]
+        if gain > 0:
+            findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
+    return tuple(sorted(findings, key=lambda f: -f.gain))

@@ -1,0 +1,101 @@
+"""The verdict on a reconstruction: how it lies to the boundaries of the shipped stability maps."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+class Region(enum.StrEnum):
+    """Where a reconstruction lies."""
+
+    INSIDE = "inside"
+    NEAR = "near"
+    OUTSIDE = "outside"
+    UNKNOWN = "unknown"
+
+
+WORDS: Mapping[Region, str] = {
+    Region.INSIDE: "reliable: inside the region where {method} works",
+    Region.NEAR: "doubtful: near the boundary where {method} fails",
+    Region.OUTSIDE: "not reliable: outside the region where {method} works",
+    Region.UNKNOWN: "not judged: no stability map was made for {method}",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One stress that makes a reconstruction less reliable.
+
+    Attributes
+    ----------
+    stress : str
+        Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`.
+    value : float
+        What was measured.
+    gain : float
+        By how much the share of failing cases would fall, were this one as in a good case.
+    words, help : str
+        What it is, and what would help.
+    """
+
+    stress: str
+    value: float
+    gain: float
+    words: str
+    help: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether to trust a reconstruction.
+
+    Attributes
+    ----------
+    region : Region
+    method : str
+        The maps' name of the method.
+    failing : float or None
+        Share of the most similar cases of the maps that failed; None where there are none.
+    findings : tuple of Finding
+        What limits, the most limiting first.
+    evidence : mapping
+        What was measured, see :class:`~recon.verdict.evidence.Evidence`.
+    basis : str
+        By which cases it was judged.
+    """
+
+    region: Region
+    method: str
+    failing: float | None
+    findings: tuple[Finding, ...]
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    basis: str = ""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in plain words: what, which stress limits it, what would help."""
+        said = [WORDS[self.region].format(method=self.method)]
+        if self.failing is not None:
+            said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
+        if self.region in (Region.NEAR, Region.OUTSIDE):
+            said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
+        return tuple(f"{s}." for s in said)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the verdict for a file."""
+        return {
+            "region": str(self.region),
+            "method": self.method,
+            "failing": self.failing,
+            "sentences": list(self.sentences),
+            "findings": [asdict(f) for f in self.findings],
+            "evidence": dict(self.evidence),
+            "basis": self.basis,
+        }
+
+
+MOST = 2
+"""Stresses that are named."""

@@ -1,0 +1,97 @@
+"""Evidence says what was put in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import InputError, reconstruct, reconstruct_volume
+from recon.scenes import SceneSpec, make_scene
+from recon.solvers.stopping import IterationRecord, StopReason
+from recon.verdict.collect import DIVERGED, unsettled_by
+from recon.verdict.evidence import measure
+
+RNG = np.random.default_rng(1)
+
+
+def evidence(scale: float = 1.0, residual: float = 1.0, valid: float = 1.0):
+    data = scale * RNG.normal(size=(40, 50))
+    mask = RNG.random(data.shape) < valid
+    volume = np.zeros((1, 40, 50))
+    volume[0, 10:20, 10:20] = 1.0
+    psf = np.zeros((1, 40, 50))
+    psf[0, 20, 25] = 1.0
+    norm = residual * np.sqrt(np.count_nonzero(mask))
+    return measure(data, mask, volume, psf, 0.1, norm, saturated=0.0, unsettled=0.0), mask
+
+
+def test_signal_and_misfit_are_what_exceeds_the_noise() -> None:
+    found, _ = evidence(scale=np.sqrt(1 + 3.0**2), residual=np.sqrt(1 + 1.5**2))
+    assert found.signal == pytest.approx(3.0, rel=0.1)
+    assert found.unexplained == pytest.approx(0.5, rel=0.1)
+    assert evidence(residual=0.9)[0].unexplained == 0
+
+
+def test_unknowns_are_counted_against_the_pixels_that_are_used() -> None:
+    found, mask = evidence(valid=0.5)
+    assert found.erased == pytest.approx(1 - mask.mean())
+    assert found.lit == pytest.approx(100 / 2000)
+    # Steps along rows and columns about a square of 10 x 10: fewer than its pixels.
+    assert found.edges < found.lit
+    assert found.load == pytest.approx(found.edges * 2000 / mask.sum())
+
+
+def test_details_count_in_units_of_the_noise() -> None:
+    ring = np.zeros((1, 60, 60))
+    x = np.mgrid[:60, :60][1]
+    ring[0] = 1 + np.cos(2 * np.pi * x / 6)
+    flat = np.ones((1, 60, 60))
+    psf = np.zeros((1, 60, 60))
+    psf[0, 30, 30] = 1
+    data, valid = RNG.normal(size=(60, 60)), np.ones((60, 60), bool)
+
+    def detail(volume: np.ndarray, noise: float) -> float:
+        return measure(data, valid, volume, psf, noise, 60.0, saturated=0, unsettled=0).detail
+
+    assert detail(ring, 0.1) == pytest.approx(10 * detail(ring, 1.0))
+    assert detail(ring, 0.1) > 2 * detail(flat, 0.1)
+
+
+def test_only_a_limit_leaves_a_run_unsettled() -> None:
+    history = (IterationRecord(9, 1.0, change=0.05),)
+    assert unsettled_by(history, StopReason.ITERATIONS, 1e-3) == pytest.approx(5)
+    assert unsettled_by(history, StopReason.CONVERGED, 1e-3) == 0
+    assert unsettled_by((), None, 1e-3) == 0
+    assert unsettled_by(history, StopReason.NOT_FINITE, 1e-3) == DIVERGED
+
+
+def test_every_reconstruction_carries_its_evidence() -> None:
+    scene = make_scene(SceneSpec("sparse-picture", size=32, photons=1000, erased=0.3))
+    for method, prior in (("admm", "tv"), ("wiener", "none")):
+        result = reconstruct(
+            scene.measurement,
+            scene.calibration,
+            erasures=scene.erasures,
+            method=method,
+            prior=prior,
+            iterations=30 if method == "admm" else None,
+        )
+        assert result.verdict is not None
+        assert result.verdict.evidence["erased"] == pytest.approx(scene.erasures.mean())
+        assert result.verdict.evidence["planes"] == 1
+    unasked = reconstruct(scene.measurement, scene.calibration, iterations=5, judged=False)
+    assert unasked.verdict is None
+    volume = make_scene(SceneSpec("beads", size=32, depths=3))
+    judged = reconstruct_volume(volume.measurement, volume.calibration, prior="l1", iterations=20)
+    assert judged.verdict is not None
+    assert judged.verdict.evidence["planes"] == 3
+    assert 0.5 < judged.verdict.evidence["similarity"] <= 1
+
+
+def test_colour_and_misfits_are_judged_by_the_worst_channel() -> None:
+    scene = make_scene(SceneSpec("sparse-picture", size=32, channels=3, colourful=True))
+    result = reconstruct(scene.measurement, scene.calibration, iterations=20)
+    assert result.verdict is not None
+    assert np.isfinite(list(result.verdict.evidence.values())).all()
+    with pytest.raises(InputError):
+        reconstruct(scene.measurement, scene.calibration, method="nothing")

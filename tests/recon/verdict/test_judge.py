@@ -1,0 +1,82 @@
+"""Verdicts are what the maps saw of similar cases."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from recon.verdict import cases, judge
+from recon.verdict.evidence import Evidence
+from recon.verdict.verdict import Region
+
+
+def evidence(detail: float = 20.0, unexplained: float = 0.02, **others: float) -> Evidence:
+    numbers = {
+        "signal": detail,
+        "erased": 0.0,
+        "saturated": 0.0,
+        "lit": 0.05,
+        "edges": 0.06,
+        "load": 0.05,
+        "planes": 1,
+        "similarity": 0.0,
+        "unsettled": 0.0,
+    }
+    return Evidence(**{**numbers, "detail": detail, "unexplained": unexplained, **others})  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def planted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps in which a picture fails below a detail of 5, and above 20 % unexplained."""
+    entries = []
+    for detail in np.geomspace(0.5, 50, 15):
+        for unexplained in np.geomspace(0.01, 1, 15):
+            failed = detail < 5 or unexplained > 0.2
+            numbers = evidence(float(detail), float(unexplained)).as_json()
+            entries.append({"ix": 0, "iy": 0, "severity": 2.0 if failed else 0.5, **numbers})
+    maps = {"planted": {"methods": {"admm tv, left out": {"evidence": entries}}}}
+    cases.cases_of.cache_clear()
+    monkeypatch.setattr(cases, "shipped_maps", lambda: maps)
+    yield
+    cases.cases_of.cache_clear()
+
+
+def test_regions_are_where_they_were_planted() -> None:
+    assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.INSIDE
+    assert judge.verdict_on(evidence(1, 0.03), "admm tv").region is Region.OUTSIDE
+    assert judge.verdict_on(evidence(30, 0.8), "admm tv").region is Region.OUTSIDE
+    assert judge.verdict_on(evidence(6, 0.03), "admm tv").region is Region.NEAR
+    # The same minimiser fails alike, whichever solver finds it.
+    assert judge.verdict_on(evidence(30, 0.03), "fista tv").region is Region.INSIDE
+
+
+def test_the_limiting_stress_is_named_with_what_helps() -> None:
+    dim = judge.verdict_on(evidence(1, 0.03), "admm tv")
+    assert dim.findings[0].stress in ("detail", "signal")
+    assert "light" in " ".join(dim.sentences)
+    moved = judge.verdict_on(evidence(30, 0.8), "admm tv")
+    assert moved.findings[0].stress == "unexplained"
+    assert "diffuserbench compare" in " ".join(moved.sentences)
+    assert len(judge.verdict_on(evidence(30, 0.03), "admm tv").sentences) == 1
+
+
+def test_what_no_map_saw_is_not_called_reliable() -> None:
+    assert judge.verdict_on(evidence(30, 0.03), "admm nonnegative").region is Region.UNKNOWN
+    strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
+    assert strange.region is not Region.INSIDE
+    assert "none of them" in strange.basis
+    assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
+
+
+def test_a_verdict_is_a_record() -> None:
+    record = judge.verdict_on(evidence(1, 0.03), "admm tv").as_json()
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert record["region"] == "outside"
+
+
+def test_methods_have_the_names_of_the_maps() -> None:
+    assert judge.method_name("admm", "tv-isotropic") == "admm tv"
+    assert judge.method_name("wiener", "none") == "wiener"
+    assert judge.method_name("volume", "l1") == "volume l1"
