@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -66,6 +66,10 @@ class HologramRequest:
     envelope: Envelope = "shade"
     budget: Budget = field(default_factory=lambda: Budget(iterations=100))
     seed: int = 0
+
+    def display_of(self, display: Display) -> Display:
+        """Return the display as it is modelled for this request: without the envelope where it is ignored."""
+        return replace(display, mask_fill=0.0) if self.envelope == "ignore" else display
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +170,24 @@ def prepare_target(
     envelope : "shade", "correct" or "ignore"
         "shade" multiplies the target by the display's envelope.
     """
+    image = field_picture(pixels, fit=fit, srgb=srgb)
+    small = make_band(display.slm_shape, display.factor, "alias_free").seen_shape
+    if image.shape[0] < small[0] or image.shape[1] < small[1]:
+        wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
+        image = cv2.resize(image, (wide, high), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    if envelope == "shade":
+        ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
+        image = image * ey[:, None] * ex
+    return Target(image, z_mm, white=1.0)
+
+
+def field_picture(
+    pixels: npt.NDArray[Any], *, fit: Fit = "cover", srgb: bool = False
+) -> npt.NDArray[np.float64]:
+    """Return a picture as it fills the square field, intensity in 0 to 1; parameters as ``prepare_target``.
+
+    Stretched, it keeps its own number of pixels.
+    """
     image = np.asarray(pixels, np.float64)
     if image.ndim == 3:
         image = image.mean(axis=2)
@@ -180,14 +202,7 @@ def prepare_target(
     elif fit == "contain":
         top, left = (side - height) // 2, (side - width) // 2
         image = np.pad(image, ((top, side - height - top), (left, side - width - left)))
-    small = make_band(display.slm_shape, display.factor, "alias_free").seen_shape
-    if image.shape[0] < small[0] or image.shape[1] < small[1]:
-        wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
-        image = cv2.resize(image, (wide, high), interpolation=cv2.INTER_CUBIC).clip(0, 1)
-    if envelope == "shade":
-        ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
-        image = image * ey[:, None] * ex
-    return Target(image, z_mm, white=1.0)
+    return image
 
 
 def _white(pixels: npt.NDArray[Any]) -> float:

@@ -40,6 +40,13 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+6",
         "Pictures and volumes: look, reconstruct, export",
     ),
+    "holograms": PanelEntry(
+        "Holograms",
+        "gui.panels.holograms:HologramsPanel",
+        "centre",
+        "Ctrl+Shift+H",
+        "Compute a hologram, show it, photograph it",
+    ),
     "live_reconstruction": PanelEntry(
         "Live reconstruction",
         "gui.panels.live_reconstruction:LiveReconstructionPanel",

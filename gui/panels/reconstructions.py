@@ -253,7 +253,7 @@ class ReconstructionsPanel(Panel):
     def _suggest_out(self) -> None:
         """Name the result after the photograph, where nothing is written yet; a name that was typed stays."""
         field = self.form.out
-        if field.isModified():
+        if field.text() not in ("", str(self._suggested)):
             return
         folder = self.session.runs_folder / "reconstructions"
         stem = Path(self.form.image.text()).stem or "reconstruction"
@@ -315,7 +315,6 @@ class ReconstructionsPanel(Panel):
     def _reconstructed(self, path: Path) -> None:
         self.form.show_progress(1.0, f"Wrote {path.name}")
         self.session.log("info", f"Reconstructed: {path}")
-        self.form.out.setModified(False)
         self._suggest_out()
         self.open(path)
         self.refresh()

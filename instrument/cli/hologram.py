@@ -12,10 +12,11 @@ import typer
 
 from instrument.alignment_file import load_alignment
 from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
-from instrument.cli.hologram_output import Writer, tell
+from instrument.cli.hologram_output import tell
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.display_setup import bench_display, slm_size
 from instrument.errors import BenchError
+from instrument.hologram_file import HologramFiles
 from instrument.hologram_job import (
     HologramRequest,
     HologramResult,
@@ -199,11 +200,16 @@ def hologram(
     pictures = _pictures(target, video=video)
     depths = _depths(z_mm, 1 if video else len(target))
     lasers = wavelengths if color else (None,)
-    displays = [_display(config, size, expansion, nm, envelope) for nm in lasers]
+    displays = [
+        request.display_of(bench_display(config, size, expansion=expansion, wavelength_nm=nm))
+        for nm in lasers
+    ]
     if alignment is not None:
         found = load_alignment(alignment)
         displays = [found.of(display) for display in displays]
-    writer = Writer(out, config.display.slm_binning, request, displays, video=len(pictures) if video else 0)
+    writer = HologramFiles(
+        out, config.display.slm_binning, request, displays, video=len(pictures) if video else 0
+    )
     writer.check(overwrite=force)
     with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
         initial: list[Any] = [None] * len(displays)
@@ -245,15 +251,6 @@ def _compute(
             bar.update(task, completed=done, note=f"{record.psnr_db:.2f} dB")
 
         return run_request(display, targets, request, initial=initial, callback=show, cancel=cancel)
-
-
-def _display(
-    config: Any, size: Any, expansion: int | None, wavelength_nm: float | None, envelope: EnvelopeName
-) -> Display:
-    from dataclasses import replace
-
-    display = bench_display(config, size, expansion=expansion, wavelength_nm=wavelength_nm)
-    return replace(display, mask_fill=0.0) if envelope is EnvelopeName.IGNORE else display
 
 
 def _weights(

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 
-from calibration_routines.camera_in_the_loop import refine_hologram
 from calibration_routines.display_io import DisplayBench, bring_mask
-from calibration_routines.hologram_capture import Capture, capture_hologram, find_camera
+from calibration_routines.hologram_photograph import (
+    display_of_pattern,
+    envelope_of_pattern,
+    photograph_hologram,
+    write_capture,
+    write_refined,
+)
 from instrument.alignment_file import Alignment, load_alignment
 from instrument.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
-from instrument.display_setup import bench_display
 from instrument.errors import BenchError, FileError
 from instrument.hologram_job import prepare_target
-from instrument.images import read_image, write_image
+from instrument.images import read_image
 from instrument.slm_correction import load_slm_correction
-from instrument.slm_image import levels_phase, phase_levels, read_slm_image, write_slm_image
-from recon.holography import Display, Target
-from recon.holography.camera_map import CameraMap
+from instrument.slm_image import levels_phase, read_slm_image
 
 app = command_app()
 
@@ -144,8 +145,8 @@ def show(
         if capture is None or target is None:
             _hold(io, fields, seconds)
             return
-        job = _CaptureJob(opened, io, read[0][1], capture, target, average, place)
-        job.run(fields, pattern[0], refine)
+        files = _CaptureFiles(pattern[0], capture, target)
+        _capture(opened, io, fields, read[0][1], files, average=average, refine=refine, place=place)
 
 
 def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
@@ -164,87 +165,50 @@ def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
         time.sleep(min(0.02, max(end - time.monotonic(), 0)))
 
 
-@dataclass(frozen=True, slots=True)
-class _CaptureJob:
-    """Photographs fields and says how good they are; refines one where asked to."""
+def _capture(
+    opened: Bench,
+    io: DisplayBench,
+    fields: list[Any],
+    facts: dict[str, Any],
+    files: _CaptureFiles,
+    *,
+    average: int,
+    refine: int,
+    place: Alignment | None,
+) -> None:
+    """Photograph, say how good it is, write."""
+    assert opened.slm is not None
+    display = display_of_pattern(opened.config, (opened.slm.shape, opened.slm.pixel_pitch_um), facts, place)
+    found = photograph_hologram(
+        io,
+        fields,
+        display,
+        prepare_target(read_image(files.target).pixels, display, envelope=envelope_of_pattern(facts)),
+        average=average,
+        refine=refine,
+        progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+    )
+    mark = " (SIMULATED)" if found.simulated else ""
+    typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
+    if found.background_estimated:
+        typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
+    if found.refined is not None:
+        path = write_refined(files.pattern, found.refined, facts, io.binning)
+        first, best = found.refined.psnr_db[0], found.capture.scores.psnr_db
+        typer.echo(f"camera in the loop: {first:.2f} dB -> {best:.2f} dB; {path}")
+    write_capture(files.out, found)
+    score = found.capture.scores
+    typer.echo(
+        f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
+        f"middle quarter {score.crop_psnr_db:.2f} dB"
+    )
+    if found.capture.saturated_fraction > 1e-3:
+        percent = 100 * found.capture.saturated_fraction
+        typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
+    typer.echo(f"Wrote {files.out}")
 
-    opened: Bench
-    io: DisplayBench
-    facts: dict[str, Any]
+
+class _CaptureFiles(NamedTuple):
+    pattern: Path
     out: Path
     target: Path
-    average: int
-    place: Alignment | None
-
-    def run(self, fields: list[Any], pattern: Path, refine: int) -> None:
-        """Photograph, compare, write; with the camera in the loop ``refine`` times."""
-        opened = self.opened
-        assert opened.slm is not None
-        display = bench_display(
-            opened.config,
-            (opened.slm.shape, opened.slm.pixel_pitch_um),
-            expansion=self.facts.get("expansion"),
-        )
-        display = self.place.of(display) if self.place else display
-        envelope = self.facts.get("metrics_computed_for", {}).get("envelope", "shade")
-        wanted = prepare_target(read_image(self.target).pixels, display, envelope=envelope)
-        camera, mean_per_ms = find_camera(self.io, display)
-        simulated = bool(opened.simulated_kinds)
-        mark = " (SIMULATED)" if simulated else ""
-        typer.echo(f"camera registered to {camera.residual_px:.2f} px{mark}")
-        if self.io.estimates_background:
-            typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
-        if refine:
-            found = self._refine(fields[0], display, wanted, camera, mean_per_ms, refine, pattern)
-        else:
-            found = capture_hologram(
-                self.io, fields, display, wanted, camera, mean_per_ms=mean_per_ms, average=self.average
-            )
-        background = "estimated" if self.io.estimates_background else "measured"
-        _write(found, self.out, camera.residual_px, {"simulated": simulated, "background": background})
-        score = found.scores
-        typer.echo(
-            f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
-            f"middle quarter {score.crop_psnr_db:.2f} dB"
-        )
-        if found.saturated_fraction > 1e-3:
-            percent = 100 * found.saturated_fraction
-            typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
-        typer.echo(f"Wrote {self.out}")
-
-    def _refine(
-        self,
-        field: Any,
-        display: Display,
-        wanted: Target,
-        camera: CameraMap,
-        mean_per_ms: float,
-        rounds: int,
-        pattern: Path,
-    ) -> Capture:
-        found = refine_hologram(
-            self.io,
-            field[None],
-            display,
-            wanted,
-            camera,
-            mean_per_ms=mean_per_ms,
-            rounds=rounds,
-            average=self.average,
-            progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
-        )
-        path = pattern.with_name(f"{pattern.stem}-refined.png")
-        facts = {**self.facts, "refined_by_camera": True, "captured_psnr_db": list(found.psnr_db)}
-        facts.pop("format", None)
-        facts.pop("levels_per_turn", None)
-        write_slm_image(path, phase_levels(np.angle(found.slm[0]), self.io.binning), facts)
-        typer.echo(
-            f"camera in the loop: {found.psnr_db[0]:.2f} dB -> {found.best.scores.psnr_db:.2f} dB; {path}"
-        )
-        return found.best
-
-
-def _write(found: Capture, out: Path, residual_px: float, origin: dict[str, Any]) -> None:
-    pixels = np.clip(np.rint(found.seen * 255), 0, 255).astype(np.uint8)
-    facts = {**origin, "metrics": asdict(found.scores), "camera_residual_px": residual_px}
-    write_image(out, pixels, {**facts, "low_passed": True, "white": 255})

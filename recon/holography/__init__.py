@@ -22,7 +22,7 @@ from recon.holography.optimise import (
     compute_hologram,
     one_step,
 )
-from recon.holography.target import Loss, Target, foveal_weights
+from recon.holography.target import Loss, Target, foveal_weights, painted_weights
 
 __all__ = [
     "Budget",
@@ -45,6 +45,7 @@ __all__ = [
     "foveal_weights",
     "judge",
     "one_step",
+    "painted_weights",
     "pixels_for",
     "random_mask",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -140,3 +141,34 @@ def foveal_weights(
     distance = np.hypot(y[:, None] - centre[0], x[None, :] - centre[1])
     falling = np.clip((distance - radius) / edge, 0.0, 1.0)
     return periphery + (1 - periphery) * (0.5 + 0.5 * np.cos(np.pi * falling))
+
+
+def painted_weights(
+    shape: tuple[int, int],
+    strokes: Sequence[tuple[float, float, float, float]],
+    *,
+    background: float = 0.1,
+) -> npt.NDArray[np.float64]:
+    """Return weights painted with a round brush: later strokes cover earlier ones.
+
+    Parameters
+    ----------
+    shape : (int, int)
+    strokes : sequence of (y, x, radius, weight)
+        Centre and radius in fractions of the field, (0, 0) the top left corner; weight in 0 to 1. The rim,
+        a quarter of the radius wide, is soft.
+    background : float
+        Weight where nothing was painted.
+    """
+    values = [background, *(weight for _, _, _, weight in strokes)]
+    if not all(0 <= value <= 1 for value in values) or max(values) == 0:
+        raise InputError("Painted weights lie in 0 to 1, and not all of them are 0.")
+    weights = np.full(shape, background, np.float64)
+    y, x = ((np.arange(n) + 0.5) / n for n in shape)
+    for row, column, radius, weight in strokes:
+        if not radius > 0:
+            raise InputError(f"A brush has a radius above 0, not {radius:g}.")
+        distance = np.hypot(y[:, None] - row, x[None, :] - column) / radius
+        cover = np.clip((1.0 - distance) / 0.25, 0.0, 1.0)
+        weights += cover * (weight - weights)
+    return weights

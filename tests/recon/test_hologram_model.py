@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
-from recon.holography import DcTerm, Display, HologramModel, Loss, Target, foveal_weights, random_mask
+from recon.holography import (
+    DcTerm,
+    Display,
+    HologramModel,
+    Loss,
+    Target,
+    foveal_weights,
+    painted_weights,
+    random_mask,
+)
 from recon.holography.judge import intensity, judge, low_pass, seen_image
 from recon.threads import get_threads, set_threads
 
@@ -152,3 +161,17 @@ def test_work_arrays_are_allocated_once_and_counted(loss):
 def test_impossible_requests_are_refused_in_words(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+def test_painted_weights_are_the_brush_where_it_went_and_background_elsewhere():
+    strokes = [(0.25, 0.5, 0.1, 1.0), (0.75, 0.5, 0.1, 0.5), (0.75, 0.5, 0.04, 0.0)]
+    weights = painted_weights((64, 96), strokes, background=0.2)
+    assert weights[16, 48] == 1.0
+    assert weights[48, 48] == pytest.approx(0.0)
+    assert weights[48, 53] == pytest.approx(0.5)
+    assert weights[32, 4] == 0.2
+    assert weights.min() >= 0
+    with pytest.raises(InputError, match="0 to 1"):
+        painted_weights((8, 8), [(0.5, 0.5, 0.1, 2.0)])
+    with pytest.raises(InputError, match="radius"):
+        painted_weights((8, 8), [(0.5, 0.5, 0.0, 1.0)])

@@ -1,0 +1,219 @@
+"""Holograms as jobs: computed, shown on the SLM, photographed."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display_io import DisplayBench, bring_mask
+from calibration_routines.hologram_photograph import (
+    Photographed,
+    photograph_hologram,
+    write_capture,
+)
+from gui.jobs import JobCancelledError, JobContext
+from gui.python_lines import expression
+from instrument.alignment_file import load_alignment
+from instrument.bench import Bench
+from instrument.config import BenchConfig
+from instrument.display_setup import bench_display
+from instrument.hologram_file import HologramFiles
+from instrument.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
+from instrument.images import read_image
+from instrument.slm_correction import load_slm_correction
+from recon.holography import Display, HologramRecord, Target
+
+_INTERVAL_S = 0.25
+_FRAME_S = 0.02
+"""How long each of several frames is shown before the next is sent; the SLM's settling comes on top."""
+
+
+@dataclass(frozen=True, slots=True)
+class HologramOrder:
+    """A hologram of one picture, as the panel's fields have it.
+
+    Attributes
+    ----------
+    picture : Path
+    out : Path
+    z_mm : float
+        Depth behind the focal plane.
+    fit : "cover", "contain" or "stretch"
+    srgb : bool
+    expansion : int or None
+        None: the bench's.
+    alignment : Path or None
+        From ``align mask``.
+    request : HologramRequest
+    """
+
+    picture: Path
+    out: Path
+    z_mm: float = 0.0
+    fit: Fit = "cover"
+    srgb: bool = False
+    expansion: int | None = None
+    alignment: Path | None = None
+    request: HologramRequest = field(default_factory=HologramRequest)
+
+    def display(self, config: BenchConfig, size: tuple[tuple[int, int], float]) -> Display:
+        """Return the display that it is computed for; errors as ``bench_display`` and ``load_alignment``."""
+        display = self.request.display_of(bench_display(config, size, expansion=self.expansion))
+        return display if self.alignment is None else load_alignment(self.alignment).of(display)
+
+    def target(self, display: Display) -> Target:
+        """Return the picture as a target; errors as ``read_image``."""
+        return prepare_target(
+            read_image(self.picture).pixels,
+            display,
+            z_mm=self.z_mm,
+            fit=self.fit,
+            srgb=self.srgb,
+            envelope=self.request.envelope,
+        )
+
+    def files(self, config: BenchConfig, display: Display) -> HologramFiles:
+        """Return the files that are written."""
+        return HologramFiles(self.out, config.display.slm_binning, self.request, [display])
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a hologram is: iterations so far, and how much of the budget is used up, 0 to 1."""
+
+    share: float
+    history: tuple[HologramRecord, ...]
+    phase_rad: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """A hologram with what it was computed for, and its patterns' files (none of a preview)."""
+
+    order: HologramOrder
+    display: Display
+    target: Target
+    result: HologramResult
+    patterns: tuple[Path, ...]
+
+
+def compute(
+    order: HologramOrder,
+    config: BenchConfig,
+    size: tuple[tuple[int, int], float],
+    context: JobContext,
+    *,
+    write: bool = True,
+) -> Computed:
+    """Compute a hologram as the command line does, and write its files."""
+    display = order.display(config, size)
+    files = order.files(config, display)
+    if write:
+        files.check(overwrite=False)
+    target = order.target(display)
+    budget = order.request.budget
+    history: list[HologramRecord] = []
+    told_s = 0.0
+
+    def watch(record: HologramRecord, slm: Any) -> None:
+        nonlocal told_s
+        history.append(record)
+        if time.monotonic() - told_s < _INTERVAL_S:
+            return
+        share = record.iteration / max(budget.iterations, 1)
+        if budget.time_s is not None:
+            share = max(share, record.seconds / budget.time_s)
+        phase = np.mod(np.angle(np.asarray(slm).reshape(-1, *display.slm_shape)[0]), 2 * np.pi)
+        with contextlib.suppress(JobCancelledError):  # the optimiser hears of it by itself
+            context.report(Progress(min(share, 1.0), tuple(history), phase.astype(np.float32)))
+        told_s = time.monotonic()
+
+    result = run_request(display, [target], order.request, callback=watch, cancel=context.cancel)
+    if write:
+        files.write(0, 0, result)
+    return Computed(order, display, target, result, tuple(files.patterns(0, 0)) if write else ())
+
+
+def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, context: JobContext) -> None:
+    """Show a hologram: one frame stays; several follow each other until the job is cancelled."""
+    io = _display_bench(bench, correction)
+    frames = computed.result.hologram.slm
+    io.show(frames[0])
+    number = 0
+    while len(frames) > 1 and not context.cancel.wait(_FRAME_S):
+        number = (number + 1) % len(frames)
+        io.show(frames[number])
+
+
+def photograph(
+    bench: Bench, computed: Computed, correction: Path | None, average: int, context: JobContext
+) -> tuple[Photographed, Path]:
+    """Show a hologram, photograph it, compare it with its target, and write what was seen."""
+    if computed.order.alignment is not None:
+        bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
+    context.check()
+    found = photograph_hologram(
+        _display_bench(bench, correction),
+        list(computed.result.hologram.slm),
+        computed.display,
+        computed.target,
+        average=average,
+    )
+    out = computed.order.out.with_name(f"{computed.order.out.stem}-seen.png")
+    write_capture(out, found)
+    return found, out
+
+
+def _display_bench(bench: Bench, correction: Path | None) -> DisplayBench:
+    loaded = None if correction is None else load_slm_correction(correction)
+    return DisplayBench(bench, bench.config.display.slm_binning, loaded)
+
+
+def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None) -> str:
+    """Return the Python that computes and writes a hologram.
+
+    ``weights`` is the expression that makes the request's weights; None where there are none.
+    """
+    request = expression(_without_weights(order.request))
+    if weights is not None:
+        request = f"replace({request}, loss_kind='spatial', weights={weights})"
+    imports = [
+        "from instrument.config_file import load_config",
+        "from instrument.display_setup import bench_display, slm_size",
+        "from instrument.hologram_file import HologramFiles",
+        "from instrument.hologram_job import HologramRequest, prepare_target, run_request",
+        "from instrument.images import read_image",
+        "from recon.holography import Budget, foveal_weights, painted_weights",
+    ]
+    lines = [
+        f"config = load_config({'None' if config.path is None else expression(config.path)})",
+        f"request = {request}",
+        f"display = request.display_of(bench_display(config, slm_size(config), expansion={order.expansion}))",
+    ]
+    if order.alignment is not None:
+        imports.append("from instrument.alignment_file import load_alignment")
+        lines.append(f"display = load_alignment({expression(order.alignment)}).of(display)")
+    lines += [
+        f"pixels = read_image({expression(order.picture)}).pixels",
+        f"target = prepare_target(pixels, display, z_mm={order.z_mm!r}, fit={order.fit!r}, "
+        f"srgb={order.srgb}, envelope=request.envelope)",
+        "result = run_request(display, [target], request)",
+        f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, request, [display])",
+        "files.write(0, 0, result)",
+    ]
+    head = ["from dataclasses import replace", "from pathlib import Path", "", *sorted(imports), ""]
+    return "\n".join([*head, *lines, ""])
+
+
+def _without_weights(request: HologramRequest) -> HologramRequest:
+    from dataclasses import replace
+
+    if request.loss_kind != "spatial":
+        return request
+    return replace(request, loss_kind="frequency", weights=None)

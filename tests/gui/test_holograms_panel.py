@@ -1,0 +1,222 @@
+"""Holograms by mouse: what counts, computing, showing, photographing, the lines of Python."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+import instrument
+from gui.panels.holograms import HologramsPanel
+from gui.session import BenchSession
+from gui.views.view_grid import best_columns
+from instrument.images import read_image, write_image
+from instrument.slm_image import levels_phase, read_slm_image
+
+WAIT_MS = 30_000
+
+
+def aligned() -> str:
+    """Return the display bench that ships, small, its mask where it belongs."""
+    text = (Path(instrument.__file__).parent / "display_bench.toml").read_text()
+    changes = {
+        "shape": "[200, 280]",
+        "expansion": "4",
+        "settle_ms": "0.0",
+        "dc_power": "0.0",
+        "shift_um": "[0.0, 0.0]",
+        "z_um": "0.0",
+        "roll_mrad": "0.0",
+        "pitch_mrad": "0.0",
+        "yaw_mrad": "0.0",
+        "magnification": "0.0",
+        "relay_distortion_um": "0.0",
+        "mask_pitch_um": "8.0",
+    }
+    for key, value in changes.items():
+        text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
+        assert count, key
+    return text
+
+
+@pytest.fixture
+def bench_text() -> str:
+    return aligned()
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path) -> HologramsPanel:
+    session = make_session()
+    Path(session.config.path).write_text(aligned())
+    session._live_wanted = False
+    with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
+        session.open()
+    assert session.is_open("slm"), session.state("slm").text
+    assert session.is_open("camera"), session.state("camera").text
+    y, x = np.mgrid[:80, :120]
+    picture = np.where((y - 40) ** 2 + (x - 60) ** 2 < 500, 220, 60 + x // 2)
+    write_image(tmp_path / "picture.png", picture.astype(np.uint8))
+    panel = HologramsPanel(session)
+    panel.resize(1000, 700)
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    panel.picture.setText(str(tmp_path / "picture.png"))
+    qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+    panel.iterations.setText("12")
+    return panel
+
+
+def click(qtbot: QtBot, button) -> None:
+    qtbot.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def computed(qtbot: QtBot, panel: HologramsPanel, button) -> None:
+    click(qtbot, button)
+    assert panel.job is not None, panel._note.toolTip()
+    with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+        pass
+    assert panel.computed is not None, panel._note.toolTip()
+
+
+def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> None:
+    session = panel.session
+    computed(qtbot, panel, panel.compute_button)
+    pattern = session.runs_folder / "holograms" / "picture.png"
+    levels, facts = read_slm_image(pattern)
+    assert facts["iterations"] == 12
+    assert panel.out.text().endswith("picture-2.png")
+    click(qtbot, panel.show_button)
+    with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+        pass
+    assert panel.job.error is None
+    np.testing.assert_array_equal(session.bench.slm.displayed, levels)
+    click(qtbot, panel.capture_button)
+    with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+        pass
+    assert panel.job.error is None, panel._note.toolTip()
+    seen = json.loads(pattern.with_name("picture-seen.json").read_text())
+    assert seen["simulated"]
+    assert seen["metrics"]["psnr_db"] > 12
+    text = panel.metrics.toPlainText()
+    assert "SIMULATED" in text
+    assert f"{seen['metrics']['psnr_db']:.2f} dB" in text
+    assert panel.captured.image is not None
+
+
+def test_a_preview_writes_nothing(qtbot: QtBot, panel: HologramsPanel) -> None:
+    computed(qtbot, panel, panel.preview_button)
+    assert panel.seen.image is not None
+    assert not (panel.session.runs_folder / "holograms").exists()
+
+
+def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: HologramsPanel) -> None:
+    panel.weights_mode.setCurrentText("a fovea, dragged")
+    before = panel.target.weights()
+    view = panel.target.graphics
+    middle = view.mapFromScene(
+        panel.target.box.mapViewToScene(panel.target.fovea.pos() + panel.target.fovea.size() / 2)
+    )
+    port = view.viewport()
+    qtbot.mousePress(port, Qt.MouseButton.LeftButton, pos=middle)
+    for step in range(1, 6):
+        qtbot.mouseMove(port, middle + QPoint(-4 * step, 3 * step))
+    qtbot.mouseRelease(port, Qt.MouseButton.LeftButton, pos=middle + QPoint(-20, 15))
+    y, x = panel.target.centre
+    assert y > 0.51
+    assert x < 0.49
+    after = panel.target.weights()
+    assert np.abs(after - before).max() > 0.1
+    np.testing.assert_array_equal(panel.order().request.weights, after)
+
+
+def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:
+    panel.weights_mode.setCurrentText("painted")
+    target = panel.target
+    port = target.graphics.viewport()
+
+    def at(y: float, x: float) -> QPoint:
+        from PySide6.QtCore import QPointF
+
+        size = target.extent[0]
+        return target.graphics.mapFromScene(target.box.mapViewToScene(QPointF(x * size, y * size)))
+
+    qtbot.mousePress(port, Qt.MouseButton.LeftButton, pos=at(0.5, 0.2))
+    for x in np.linspace(0.2, 0.8, 30):
+        qtbot.mouseMove(port, at(0.5, x))
+    qtbot.mouseRelease(port, Qt.MouseButton.LeftButton, pos=at(0.5, 0.8))
+    weights = target.weights()
+    assert (weights[128, 60:200] > 0.9).all()
+    assert weights[30, 128] == pytest.approx(0.1)
+    qtbot.mouseClick(port, Qt.MouseButton.RightButton, pos=at(0.5, 0.5))
+    assert target.weights()[128, 128] < 0.05
+    click(qtbot, panel.clear)
+    assert (target.weights() == 0.1).all()
+
+
+@pytest.mark.parametrize("counts", ["all alike", "a fovea, dragged", "painted"])
+def test_the_copied_lines_make_the_same_pattern(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path, counts: str
+) -> None:
+    panel.weights_mode.setCurrentText(counts)
+    panel.target.set_fovea((0.4, 0.55), 0.2)
+    panel.target.strokes = [(0.4, 0.5, 0.2, 1.0), (0.5, 0.5, 0.1, 0.5)]
+    panel.iterations.setText("4")
+    panel.out.setText(str(tmp_path / "script.png"))
+    click(qtbot, panel.copy_button)
+    code = QApplication.clipboard().text()
+    panel.session.bench.close()  # a script opens the bench for itself
+    exec(code, {})
+    panel.session._states["slm"] = type(panel.session._states["slm"])("open")
+    panel.out.setText(str(tmp_path / "mouse.png"))
+    computed(qtbot, panel, panel.compute_button)
+    script, mouse = (levels_phase(read_slm_image(tmp_path / f"{n}.png")[0]) for n in ("script", "mouse"))
+    assert np.abs(np.angle(np.exp(1j * (script - mouse)))).mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "reason"),
+    [
+        ("picture", "absent.png", "no such file"),
+        ("z_mm", "far", "no number of mm"),
+        ("frames", "0", "above 0"),
+        ("periphery", "2", "0 to 1"),
+        ("out", "slm.jpg", ".png"),
+        ("alignment", "absent.json", "no such file"),
+    ],
+)
+def test_a_wrong_entry_is_refused_at_its_field(
+    qtbot: QtBot, panel: HologramsPanel, field, text, reason
+) -> None:
+    entry = getattr(panel, field)
+    entry.setText(text)
+    qtbot.keyClick(entry, Qt.Key.Key_Return)
+    assert entry.property("refused")
+    assert reason in entry.toolTip()
+    click(qtbot, panel.compute_button)
+    assert panel.job is None
+
+
+def test_an_expansion_that_is_no_square_is_told(qtbot: QtBot, panel: HologramsPanel) -> None:
+    panel.expansion.setText("5")
+    click(qtbot, panel.compute_button)
+    qtbot.waitUntil(lambda: "square" in panel._note.toolTip(), timeout=WAIT_MS)
+
+
+def test_views_stand_so_that_they_are_largest() -> None:
+    assert best_columns(4, 1600, 400) == 4
+    assert best_columns(4, 800, 800) == 2
+    assert best_columns(4, 200, 900) == 1
+
+
+def test_the_target_is_shown_as_it_fills_the_field(panel: HologramsPanel, tmp_path: Path) -> None:
+    picture = read_image(tmp_path / "picture.png").pixels / 255
+    np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
+    panel.fit.setCurrentText("stretch")
+    np.testing.assert_allclose(panel.target.image, picture)
