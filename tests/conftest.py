@@ -6,3 +6,11 @@ from hypothesis import HealthCheck, settings
 
 settings.register_profile("diffuserbench", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("diffuserbench")
+
+try:
+    import PySide6.QtWidgets  # noqa: F401 # needs libraries of the system, too
+    import pytestqt  # noqa: F401
+except ImportError:
+    pass  # tests/gui says so, test by test
+else:
+    pytest_plugins = ["pytestqt.plugin"]

@@ -9,16 +9,18 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
-pytest.importorskip("PySide6.QtWidgets", reason="needs the extra [gui]", exc_type=ImportError)
-pytest.importorskip("pytestqt", reason="needs pytest-qt")
 
-from PySide6.QtCore import QSettings
-from PySide6.QtWidgets import QApplication
-from pytestqt.qtbot import QtBot
-
-from gui.main_window import MainWindow
-from gui.session import BenchSession
-from gui.theme import apply_theme
+try:
+    from PySide6.QtCore import QSettings
+    from PySide6.QtWidgets import QApplication
+    from pytestqt.qtbot import QtBot
+except ImportError as error:
+    WITHOUT_QT = f"the desktop program: {error}"
+else:
+    WITHOUT_QT = ""
+    from gui.main_window import MainWindow
+    from gui.session import BenchSession
+    from gui.theme import apply_theme
 from instrument.config_file import parse_config
 
 WAIT_MS = 20_000
@@ -48,6 +50,18 @@ control = "simulated"
 preset = "tiny"
 scene_rgb = [30.0, 30.0, 30.0]
 """
+
+
+class _SkippedModule(pytest.Module):
+    """In place of a module that cannot be imported here."""
+
+    def collect(self) -> list[pytest.Item]:
+        pytest.skip(f"cannot be tested here: {WITHOUT_QT}", allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+    """Say of each module why it is not run where Qt is not."""
+    return _SkippedModule.from_parent(parent, path=module_path) if WITHOUT_QT else None
 
 
 @pytest.fixture(scope="session")
