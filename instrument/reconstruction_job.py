@@ -35,6 +35,32 @@ from recon.noise import NoiseModel
 from recon.refocus import at_depth
 from recon.types import Calibration
 
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """How a photograph became a measurement, to be done again to others of the same camera.
+
+    Attributes
+    ----------
+    first_binning : int
+        To the calibration's pixels, before everything else.
+    dark : float or ndarray
+        Subtracted then, counts.
+    crop : Crop or None
+    binning : int
+        Last.
+    """
+
+    first_binning: int
+    dark: float | FloatImage
+    crop: Crop | None
+    binning: int
+
+    def apply(self, pixels: npt.NDArray[Any]) -> FloatImage:
+        """Return a photograph (height, width[, 3]) as a measurement."""
+        return reduce(bin_image(pixels, self.first_binning), self.dark, self.crop, self.binning)
+
+
 DarkChoice = Literal["auto"] | float | Path
 Binning = int | None
 """Pixels to average along each axis; None chooses automatically."""
@@ -67,6 +93,7 @@ class Job:
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     simulated: bool = False
+    reduction: Reduction | None = None
 
     def binned_noise(self, noise: NoiseModel | float | None) -> NoiseModel | float | None:
         """Return what is left of a single pixel's noise after the averaging that made the measurement."""
@@ -132,6 +159,7 @@ def job_from_files(
             "erased": erased.reason,
         },
         psf.is_simulated or image.is_simulated,
+        Reduction(1, level.image, crop, factor),
     )
 
 
@@ -207,6 +235,7 @@ def job_with(
             "erased": erased.reason,
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
+        Reduction(match, level.image, crop, factor),
     )
 
 

@@ -1,4 +1,4 @@
-"""``diffuserbench reconstruct``: from a PSF and a photograph to the scene."""
+"""``diffuserbench reconstruct``: from a PSF and a photograph, or a recording, to the scene."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from instrument.cli.reconstruct_options import (
     AllowSaturatedOption,
     BackgroundOption,
     BinningOption,
+    BlockOption,
     CalibrationOption,
     CropOption,
     DarkOption,
@@ -16,7 +17,9 @@ from instrument.cli.reconstruct_options import (
     DistanceOption,
     ErasuresOption,
     FigureOption,
+    FilmOption,
     ForceOption,
+    FpsOption,
     ImageOption,
     IterationsOption,
     MemoryOption,
@@ -30,11 +33,16 @@ from instrument.cli.reconstruct_options import (
     PsfOption,
     RotateOption,
     Rotation,
+    RunArgument,
+    SchedulerOption,
     ScratchOption,
     TauOption,
     TimeOption,
     ToleranceOption,
+    VideoOption,
     VolumeOption,
+    WarmOption,
+    WorkersOption,
     parse_settings,
 )
 from instrument.errors import BenchError
@@ -53,10 +61,12 @@ app = command_app()
         "diffuserbench reconstruct --volume psfs/ --image raw.tif --out volume.tif",
         "diffuserbench reconstruct --calibration demo/calibration --image photo.tif --z-mm 30 --rotate 180",
         "diffuserbench reconstruct --calibration field/ --image photo.tif --model local",
+        "diffuserbench reconstruct runs/2026-11-21-recording --video --calibration demo/calibration",
     )
 )
 def reconstruct(
-    image: ImageOption,
+    run: RunArgument = None,
+    image: ImageOption = None,
     psf: PsfOption = None,
     calibration: CalibrationOption = None,
     volume: VolumeOption = None,
@@ -76,20 +86,28 @@ def reconstruct(
     iterations: IterationsOption = None,
     time_s: TimeOption = None,
     tolerance: ToleranceOption = None,
-    out: OutOption = Path("reconstruction.tif"),
+    out: OutOption = None,
     rotate: RotateOption = Rotation.NONE,
     figure: FigureOption = None,
     device: DeviceOption = "cpu",
     force: ForceOption = False,
     allow_saturated: AllowSaturatedOption = False,
     mixed_depth: MixedDepthOption = False,
+    video: VideoOption = False,
+    warm: WarmOption = None,
+    block: BlockOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    fps: FpsOption = None,
+    film: FilmOption = True,
 ) -> None:
     """Reconstruct the scene from a PSF and a photograph: TIFF, PNG, JPEG, BMP or NumPy files from anywhere.
 
     Both must come from the same camera with the same region of interest and binning, 8 to 16 bit or float,
     grey or colour. Ctrl-C ends the work and keeps the picture so far; a second Ctrl-C gives it up.
+
+    With --video, every frame of a recording; an interrupted video is taken up again by the same command.
     """
-    outputs = Outputs.named(out, figure, volume=volume is not None)
     settings = parse_settings(
         model=model,
         dark=dark,
@@ -103,6 +121,57 @@ def reconstruct(
         time_s=time_s,
         tolerance=tolerance,
     )
+    videos_only = {
+        "RUN": run is not None,
+        "--warm": warm is not None,
+        "--block": block is not None,
+        "--workers": workers is not None,
+        "--scheduler": scheduler is not None,
+        "--fps": fps is not None,
+        "--no-mp4": not film,
+    }
+    if video:
+        no_videos = {
+            "--image": image is not None,
+            "--volume": volume is not None,
+            "--figure": figure is not None,
+            "--method": method is not Method.ADMM,
+            "--no-background": not background,
+            "--scratch": scratch is not None,
+            "--memory": memory_gib is not None,
+            "--device": device != "cpu",
+            "--workers and --scheduler together": workers is not None and scheduler is not None,
+        }
+        if given := [option for option, is_given in no_videos.items() if is_given]:
+            raise BenchError(f"With --video these do not apply: {', '.join(given)}. Leave them out.")
+        if run is None:
+            raise BenchError("--video needs a recording: diffuserbench reconstruct RUN --video ...")
+        from instrument.cli.video import reconstruct_to_video
+        from instrument.video.reconstruction import VideoRequest
+
+        reconstruct_to_video(
+            VideoRequest(
+                run=run,
+                out=out or Path("video.ome.zarr"),
+                psf=psf,
+                calibration=calibration,
+                z_um=None if z_mm is None else 1e3 * z_mm,
+                settings=settings,
+                rotate_deg=int(rotate),
+                fps=fps,
+                film=film,
+                **{k: v for k, v in (("warm_iterations", warm), ("block", block)) if v is not None},
+            ),
+            workers=workers,
+            scheduler=scheduler,
+            force=force,
+        )
+        return
+    if given := [option for option, is_given in videos_only.items() if is_given]:
+        raise BenchError(f"{', '.join(given)}: for videos; give --video as well, or leave it out.")
+    if image is None:
+        raise BenchError("Give a photograph with --image FILE, or a recording: RUN --video.")
+    outputs = Outputs.named(out or Path("reconstruction.tif"), figure, volume=volume is not None)
     if volume is not None:
         pictures_only = {
             "--psf": psf is not None,

@@ -43,9 +43,67 @@ class Rotation(enum.StrEnum):
     THREE_QUARTERS = "270"
 
 
-ImageOption = Annotated[
-    Path, typer.Option("--image", "-i", metavar="FILE", help="The photograph (raw frame).")
+RunArgument = Annotated[
+    Path | None,
+    typer.Argument(metavar="[RUN]", help="With --video: the recording's folder.", show_default=False),
 ]
+ImageOption = Annotated[
+    Path | None,
+    typer.Option("--image", "-i", metavar="FILE", help="The photograph (raw frame).", show_default=False),
+]
+VideoOption = Annotated[
+    bool, typer.Option("--video", help="Every frame of the recording RUN; --out NAME.ome.zarr.")
+]
+WarmOption = Annotated[
+    int | None,
+    typer.Option(
+        "--warm",
+        min=1,
+        metavar="N",
+        help="Of a video: iterations of frames that go on from the one before. Default: 6.",
+        show_default=False,
+    ),
+]
+BlockOption = Annotated[
+    int | None,
+    typer.Option(
+        "--block",
+        min=1,
+        metavar="N",
+        help="Of a video: frames that hang together. Default: 32.",
+        show_default=False,
+    ),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=1,
+        metavar="N",
+        help="Of a video: a Dask cluster of N processes here. Default: threads.",
+        show_default=False,
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="tcp://...",
+        help="Of a video: a Dask scheduler whose workers see the same files.",
+        show_default=False,
+    ),
+]
+FpsOption = Annotated[
+    float | None,
+    typer.Option(
+        "--fps",
+        min=0.1,
+        metavar="N",
+        help="Of a video: frames a second of the film. Default: the recording's.",
+        show_default=False,
+    ),
+]
+FilmOption = Annotated[bool, typer.Option("--mp4/--no-mp4", help="Of a video: a film, too.")]
 PsfOption = Annotated[
     Path | None, typer.Option("--psf", "-p", metavar="FILE", help="The PSF image.", show_default=False)
 ]
@@ -191,12 +249,14 @@ ToleranceOption = Annotated[
     ),
 ]
 OutOption = Annotated[
-    Path,
+    Path | None,
     typer.Option(
         "--out",
         "-o",
         metavar="FILE",
-        help="float32 TIFF (volumes: or .ome.zarr); .png and .json go beside it.",
+        help="float32 TIFF (volumes: or, videos: .ome.zarr); .png and .json go beside it. "
+        "Default: reconstruction.tif, video.ome.zarr.",
+        show_default=False,
     ),
 ]
 RotateOption = Annotated[

@@ -1,0 +1,102 @@
+"""A worker's part: one block of a video, from the recording's frames to pictures on the disk."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from instrument.store.frame_array import FrameArray
+from instrument.store.layout import FRAMES
+from instrument.video.job import VideoJob
+from instrument.video.output import VideoPictures
+from recon.threads import set_threads
+from recon.video import VideoSolver
+
+_kept = threading.local()
+"""A thread's last job with its solver, whose arrays are dear to make: ``(folder, plan, job, solver)``."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockReport:
+    """What a worker did: a block's number, how many frames it solved and wrote, and in how long."""
+
+    block: int
+    solved: int
+    written: int
+    seconds: float
+
+
+class CancelledError(Exception):
+    """The block was left unfinished because somebody wanted the end."""
+
+
+def solve_block(
+    job_folder: str,
+    output: str,
+    number: int,
+    *,
+    threads: int | None = None,
+    ended: Callable[[], bool] = lambda: False,
+) -> BlockReport:
+    """Solve a block, write those of its pictures that are not there, and note that it is done.
+
+    Runs anywhere where the recording and the output are under the same paths. Done already, it does nothing.
+
+    Parameters
+    ----------
+    job_folder, output : str
+        The job's folder, and the OME-Zarr folder.
+    number : int
+        The block.
+    threads : int, optional
+        FFT and kernel threads of this process.
+    ended : callable
+        Asked before each frame; True ends the work.
+
+    Raises
+    ------
+    FileError, OSError
+        When a file cannot be read or written.
+    CancelledError
+    """
+    began_s = time.perf_counter()
+    if threads is not None:
+        set_threads(threads)
+    job, solver = _solver_for(Path(job_folder))
+    if job.is_done(number):
+        return BlockReport(number, 0, 0, time.perf_counter() - began_s)
+    pictures = VideoPictures(Path(output), write=True)
+    frames = FrameArray(Path(job.plan.run) / FRAMES)
+    reduction = job.reduction
+    block = job.blocks[number]
+    solver.begin()
+    written = 0
+    for index in block:
+        if ended():
+            raise CancelledError
+        picture = solver.next(reduction.apply(frames.read(index)))
+        if not pictures.is_written(index):
+            pictures.write(index, np.ascontiguousarray(np.rot90(picture, job.plan.rotate_deg // 90)))
+            written += 1
+    job.mark_done(number)
+    return BlockReport(number, len(block), written, time.perf_counter() - began_s)
+
+
+def _solver_for(folder: Path) -> tuple[VideoJob, VideoSolver]:
+    job = VideoJob(folder)
+    kept: tuple[Path, object, VideoJob, VideoSolver] | None = getattr(_kept, "value", None)
+    if kept is not None and kept[0] == folder and kept[1] == job.plan:
+        return kept[2], kept[3]
+    _kept.value = None  # its memory is needed
+    solver = VideoSolver(
+        job.camera,
+        cold_iterations=job.plan.cold_iterations,
+        warm_iterations=job.plan.warm_iterations,
+    )
+    _kept.value = (folder, job.plan, job, solver)
+    return job, solver

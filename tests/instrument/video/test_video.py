@@ -1,0 +1,268 @@
+"""A recording becomes a video: every frame once, the same whoever computes it, whatever is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import zarr
+from ome_zarr_models.v05 import Image
+
+from instrument.cli import main
+from instrument.errors import BenchError, FileError
+from instrument.reconstruction_request import Settings
+from instrument.video import block as block_module
+from instrument.video.block import BlockReport
+from instrument.video.crew import cluster, on_cluster
+from instrument.video.mp4 import as_shown, levels_of
+from instrument.video.output import VideoPictures
+from instrument.video.reconstruction import (
+    PreparedVideo,
+    VideoRequest,
+    finish_video,
+    prepare_video,
+    solve_video,
+)
+from recon import reconstruct
+from recon.metrics import psnr
+from tests.mocks.recordings import write_recording
+
+SHAPE = (40, 52)
+LENSES = np.random.default_rng(0).uniform(-14, 14, (30, 2))
+MISSING = 5
+
+
+def cast(points: list[tuple[float, float, float]]) -> np.ndarray:
+    """What points (row, column, light) cast through lenslets, spot by spot: no FFT, no grid."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    image = np.zeros(SHAPE)
+    for row, column, light in points:
+        for dy, dx in LENSES:
+            distance = (y - 20 - row - dy) ** 2 + (x - 26 - column - dx) ** 2
+            image += light * np.exp(-distance / (2 * 1.2**2))
+    return image
+
+
+def scene(t: int) -> np.ndarray:
+    clean = cast([(-4, -6 + 0.3 * t, 1.0), (5, 3, 0.6 + 0.3 * np.sin(t))])
+    rng = np.random.default_rng(t)
+    return np.clip(rng.poisson(clean * 500) + rng.normal(20, 2, SHAPE), 0, 4095).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    np.save(folder / "psf.npy", cast([(0, 0, 100.0)]).astype(np.float32))
+    frames = {t: scene(t) for t in range(11) if t != MISSING}
+    return write_recording(folder, frames)
+
+
+def request(recording: Path, folder: Path, **changes: object) -> VideoRequest:
+    settings = Settings(dark=20.0, binning=1, iterations=25)
+    given = VideoRequest(
+        run=recording,
+        out=folder / "v.ome.zarr",
+        psf=recording.parent / "psf.npy",
+        settings=settings,
+        block=4,
+        warm_iterations=5,
+    )
+    return replace(given, **changes)  # type: ignore[arg-type]
+
+
+def solved(wanted: VideoRequest, **how: object) -> list[BlockReport]:
+    reports: list[BlockReport] = []
+    prepared = prepare_video(wanted)
+    assert solve_video(prepared, reports.append, threading.Event(), **how)  # type: ignore[arg-type]
+    finish_video(prepared)
+    return reports
+
+
+@pytest.fixture(scope="module")
+def video(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("video")
+    solved(request(recording, folder))
+    return folder
+
+
+def pictures(folder: Path) -> np.ndarray:
+    return np.asarray(zarr.open_array(folder / "v.ome.zarr" / "0", mode="r")[:])
+
+
+def assert_same(one: np.ndarray, other: np.ndarray) -> None:
+    """To the tolerance that docs/video.md states."""
+    np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * float(np.nanmax(other)))
+
+
+def test_every_frame_is_there_and_like_its_own_reconstruction(recording: Path, video: Path) -> None:
+    stack = pictures(video)
+    assert stack.shape == (11, *SHAPE)
+    assert [t for t in range(11) if np.isnan(stack[t]).any()] == [MISSING]
+    for t in (0, 3, 10):  # cold, warm, and the last of a block
+        alone = reconstruct(
+            scene(t), np.load(recording.parent / "psf.npy"), method="admm-sensor", background=20.0,
+            iterations=200, tolerance=0,
+        ).image  # fmt: skip
+        assert psnr(stack[t], alone) > 30
+
+
+def test_others_read_it_with_its_times_and_it_plays(video: Path) -> None:
+    group = zarr.open_group(video / "v.ome.zarr", mode="r")
+    scale = Image.from_zarr(group).ome_attributes.multiscales[0].datasets[0].coordinateTransformations[0]
+    assert scale.scale == pytest.approx([0.04, 1, 1])
+    assert group.attrs["diffuserbench"]["missing"] == [MISSING]
+    film = cv2.VideoCapture(str(video / "v.mp4"))
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(25)
+    stack, shown = pictures(video), []
+    while True:
+        there, frame = film.read()
+        if not there:
+            break
+        shown.append(frame[..., 0].astype(float))
+    assert len(shown) == 10
+    indices = [t for t in range(11) if t != MISSING]
+    black, white = levels_of(stack[t] for t in indices)
+    for index, picture in zip(indices, shown, strict=True):
+        meant = as_shown(stack[index], black, white)[..., 0].astype(float)
+        assert np.corrcoef(picture.ravel(), meant.ravel())[0, 1] > 0.95
+    record = json.loads((video / "v.json").read_text())
+    assert (record["frames"], record["prior"], record["simulated"]) == (10, "tv", True)
+    assert not list(video.glob(".v.job"))
+
+
+def test_a_video_cut_off_goes_on_and_ends_the_same(
+    recording: Path, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = request(recording, tmp_path)
+    prepared = prepare_video(wanted)
+    cancel = threading.Event()
+    monkeypatch.setattr("instrument.video.crew.get_threads", lambda: 1)
+    assert not solve_video(prepared, lambda _: cancel.set(), cancel)
+    first = {0, 1, 2, 3}
+    written = {t for t in range(11) if VideoPictures(wanted.out).is_written(t)}
+    assert first <= written < set(range(11)) - {MISSING}
+    stamps = {t: VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in written}
+    again = prepare_video(wanted)
+    assert again.resumed
+    assert 0 not in again.left
+    reports: list[BlockReport] = []
+    assert solve_video(again, reports.append, threading.Event())
+    assert sum(report.written for report in reports) == 10 - len(written)
+    assert {t: VideoPictures(wanted.out)._file(t).stat().st_mtime_ns for t in written} == stamps
+    assert_same(pictures(tmp_path), pictures(video))
+
+
+def test_a_kill_between_pictures_and_mark_loses_nothing(
+    recording: Path, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class KilledError(BaseException):
+        pass
+
+    def die(*_: object) -> None:
+        raise KilledError
+
+    wanted = request(recording, tmp_path)
+    prepared = prepare_video(wanted)
+    with monkeypatch.context() as patch:
+        patch.setattr("instrument.video.job.VideoJob.mark_done", die)
+        with pytest.raises(KilledError):
+            block_module.solve_block(str(prepared.job.folder), str(wanted.out), 1)
+    reports = solved(wanted)
+    assert sorted((r.block, r.solved, r.written) for r in reports) == [(0, 4, 4), (1, 3, 0), (2, 3, 3)]
+    assert_same(pictures(tmp_path), pictures(video))
+
+
+def test_other_settings_do_not_go_on_and_finished_videos_stay(
+    recording: Path, video: Path, tmp_path: Path
+) -> None:
+    prepare_video(request(recording, tmp_path))
+    with pytest.raises(FileError, match=r"other settings or frames \(warm_iterations\)"):
+        prepare_video(request(recording, tmp_path, warm_iterations=7))
+    assert not prepare_video(request(recording, tmp_path, warm_iterations=7), force=True).resumed
+    with pytest.raises(FileError, match="exists"):
+        prepare_video(request(recording, video))
+
+
+@pytest.mark.slow
+def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path, tmp_path: Path) -> None:
+    wanted = request(recording, tmp_path)
+    prepared = prepare_video(wanted)
+    reports: list[BlockReport] = []
+    with cluster(workers=2) as client:
+        pids = client.run(os.getpid)
+
+        def told(report: BlockReport) -> None:
+            reports.append(report)
+            if len(reports) == 1:
+                os.kill(next(iter(pids.values())), signal.SIGKILL)
+
+        on_cluster(client, prepared.job.folder, wanted.out, prepared.left, told, threading.Event())
+    assert sorted(report.block for report in reports) == [0, 1, 2]
+    assert sum(report.written for report in reports) <= 10
+    assert not prepared.left
+    finish_video(prepared)
+    assert_same(pictures(tmp_path), pictures(video))
+
+
+def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("instrument.video.crew.CONNECT_S", 1)
+    with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
+        pass
+
+
+def test_turned_cropped_binned(recording: Path, tmp_path: Path) -> None:
+    settings = Settings(dark=20.0, binning=2, iterations=3)
+    solved(request(recording, tmp_path, rotate_deg=90, film=False, settings=settings, warm_iterations=1))
+    assert pictures(tmp_path).shape == (11, 26, 20)
+    assert not (tmp_path / "v.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"settings": Settings(tolerance=1e-3)}, "--warm"),
+        ({"settings": Settings(prior="tv-haar")}, "not for videos"),
+        ({"settings": Settings(model="local")}, "one PSF"),
+        ({"out": Path("v.tif")}, "OME-Zarr"),
+        ({"out": Path("/nowhere/v.ome.zarr")}, "does not exist"),
+        ({"run": Path("/nowhere")}, "no such folder"),
+        ({"psf": None}, "--psf"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_made(
+    recording: Path, tmp_path: Path, changes: dict[str, object], says: str
+) -> None:
+    with pytest.raises(BenchError, match=says):
+        prepare_video(request(recording, tmp_path, **changes))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "film.ome.zarr"
+    psf = recording.parent / "psf.npy"
+    arguments = ["reconstruct", str(recording), "--video", "--psf", str(psf), "--out", str(out)]
+    options = ["--dark", "20", "--bin", "2", "--iterations", "4", "--warm", "1", "--block", "4"]
+    assert main([*arguments, *options]) == 0
+    text = capsys.readouterr().out
+    assert "10 frames in 3 blocks of 4" in text
+    assert "frames/s" in text
+    assert {p.name for p in tmp_path.iterdir()} == {"film.ome.zarr", "film.mp4", "film.json"}
+    assert main([*arguments, *options]) == 2
+    assert main(["reconstruct", "--image", str(psf), "--psf", str(psf), "--warm", "3"]) == 2
+    assert "--video" in capsys.readouterr().err
+    assert main(["reconstruct", "--video"]) == 2
+
+
+def test_prepared_is_what_the_window_shows(recording: Path, tmp_path: Path) -> None:
+    prepared = prepare_video(request(recording, tmp_path))
+    assert isinstance(prepared, PreparedVideo)
+    assert prepared.left == [0, 1, 2]
+    assert any("1 of 11 frames were lost" in warning for warning in prepared.warnings)
+    assert prepared.notes["Dark"].startswith("20 counts")
