@@ -1,0 +1,184 @@
+"""Live pictures: frames per second, latency and quality, with a camera that is faster than the computer.
+
+    python benchmarks/live.py [--sizes 270x480 512x640 1024x1280] [--seconds 15] [--out live.csv]
+
+Frames are cut from light that was computed on a grid three times finer than the sensor's, blurred there and
+binned, with photon noise (see dense_2d.py): a picture larger than the field that pans for a third of the
+time, by half a pixel a frame, and stands still for the rest. They come at 60 frames/s through the same stream
+and thread as a real camera's. Latency is from a frame's arrival to its picture. Quality is against what
+200 iterations of the exact-data ADMM make of the same frame at full resolution, in dB, the live picture
+enlarged to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+import sys
+import threading
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+from dense_2d import FINE, binned, caustic, dense_scene
+from scipy import fft
+
+from drivers.errors import DeviceTimeoutError
+from drivers.frame import FrameMetadata
+from drivers.stream import FrameStream
+from instrument.live import LiveView
+from recon import fft as project_fft
+from recon import reconstruct
+from recon.live import LiveReconstructor
+from recon.metrics import psnr
+
+PHOTONS = 1e4
+FULL = 3000
+BUDGETS_MS = {(270, 480): 33.0, (512, 640): 66.0, (1024, 1280): 125.0}
+
+
+class Playback:
+    """A camera that plays frames at a fixed rate; a frame nobody fetched in time is lost and counted."""
+
+    name = "playback"
+    trigger_mode = "free_run"
+    frames_in_flight = 0
+    exposure_ms = 5.0
+
+    def __init__(self, frames: list[np.ndarray], rate: float) -> None:
+        self.frames, self.rate = frames, rate
+        self.frame_shape, self.frame_dtype = frames[0].shape, frames[0].dtype
+        self.shown: list[tuple[int, int]] = []
+        self._stopped = threading.Event()
+
+    def stream(self, n_buffers: int) -> FrameStream:
+        """Return a stream."""
+        return FrameStream(self, n_buffers)
+
+    def start_sequence(self, n_buffers: int) -> None:
+        """Begin to count time."""
+        self._began_s, self._next = time.monotonic(), 0
+        self._stopped.clear()
+
+    def stop_sequence(self) -> None:
+        """End."""
+        self._stopped.set()
+
+    def next_frame_into(self, buffer: np.ndarray, timeout_s: float) -> FrameMetadata:
+        """Wait until the next frame is due."""
+        due_s = self._began_s + self._next / self.rate
+        if self._stopped.wait(max(0.0, min(timeout_s, due_s - time.monotonic()))):
+            raise DeviceTimeoutError(self.name, "stopped.")
+        if time.monotonic() < due_s:
+            raise DeviceTimeoutError(self.name, "no frame yet.")
+        number = max(self._next, int((time.monotonic() - self._began_s) * self.rate))
+        buffer[...] = self.frames[number % len(self.frames)]
+        dropped, self._next = number - self._next, number + 1
+        height, width = self.frame_shape
+        return FrameMetadata(
+            number, None, time.monotonic_ns(), datetime.now(UTC), 5.0, 1.0, "Mono12", 12, 0.0,
+            (0, 0, height, width), 1, dropped_before=dropped,
+        )  # fmt: skip
+
+
+def video(height: int, width: int, count: int):
+    """Return frames and PSF: the first third pans, the rest stands still."""
+    fine = (2 * FINE * height, 2 * FINE * width)
+    scene = dense_scene(*fine, seed=0)
+    psf = caustic(FINE * height, FINE * width, seed=1)
+    psf /= psf.sum(dtype=np.float64)
+    padded = np.zeros(fine, np.float32)
+    padded[: FINE * height, : FINE * width] = psf
+    padded = np.roll(padded, [-(FINE * (n // 2)) for n in (height, width)], (0, 1))
+    light = fft.irfft2(fft.rfft2(padded, workers=2) * fft.rfft2(scene, workers=2), s=fine, workers=2)
+    rng = np.random.default_rng(2)
+    frames = []
+    for number in range(count):
+        # Half a sensor pixel a frame is one and a half fine ones.
+        column = FINE * (width // 2) + int(1.5 * min(number, count // 3))
+        row = FINE * (height // 2)
+        clean = binned(light[row : row + FINE * height, column : column + FINE * width])
+        counts = rng.poisson(clean * PHOTONS / clean.mean()) / PHOTONS * 0.3 * FULL
+        frames.append(np.clip(np.round(counts), 0, 4095).astype(np.uint16))
+    return frames, binned(psf).astype(np.float32)
+
+
+def run(height: int, width: int, seconds: float, budget_ms: float) -> dict[str, object]:
+    """Watch one size for a time; returns the figures."""
+    frames, psf = video(height, width, 45)
+    camera = Playback(frames, 60.0)
+    kept = {}
+    with LiveView(camera.stream(4), LiveReconstructor(psf, budget_ms=budget_ms)) as view:
+        seen = view.wait_newer(None, 120.0)
+        began_s = time.monotonic()
+        used = os.times()
+        binnings, iterations, late = [], [], 0
+        while time.monotonic() - began_s < seconds:
+            seen = view.wait_newer(seen, 1.0) or seen
+            if seen.refined:
+                continue
+            binnings.append(seen.picture.binning)
+            iterations.append(seen.picture.iterations)
+            late += seen.picture.work_ms > 1.5 * budget_ms
+            phase = seen.metadata.frame_id % len(frames)
+            for name, wanted in (("moving", 12), ("still", len(frames) - 3)):
+                if abs(phase - wanted) <= 2:
+                    kept[name] = (phase, seen.picture)
+        elapsed_s = time.monotonic() - began_s
+        now = os.times()
+        status = view.status
+    row: dict[str, object] = {
+        "size": f"{width} x {height}",
+        "budget_ms": budget_ms,
+        "pictures_per_s": round(status.pictures_per_s, 1),
+        "latency_median_ms": round(status.latency_median_ms, 1),
+        "latency_p99_ms": round(status.latency_p99_ms, 1),
+        "late_share": round(late / len(binnings), 3),
+        "binning": int(np.median(binnings)),
+        "iterations": float(np.median(iterations)),
+        "cores_used": round((now.user + now.system - used.user - used.system) / elapsed_s, 2),
+        "cpu_ms_per_picture": round(
+            1e3 * (now.user + now.system - used.user - used.system) / max(len(binnings), 1), 1
+        ),
+        "passed_over": status.passed_over,
+    }
+    for name, (phase, picture) in kept.items():
+        converged = reconstruct(
+            frames[phase].astype(np.float32), psf, method="admm-sensor", iterations=200, tolerance=0
+        ).image
+        shown = cv2.resize(picture.image, (width, height), interpolation=cv2.INTER_CUBIC)
+        row[f"{name}_db"] = round(float(psnr(shown, converged)), 1)
+        row[f"{name}_quality"] = picture.quality
+    return row
+
+
+def main() -> None:
+    """Measure each size and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sizes", nargs="+", default=[f"{h}x{w}" for h, w in BUDGETS_MS])
+    parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--out", type=Path, help="also as CSV")
+    options = parser.parse_args()
+    if options.threads:
+        project_fft.set_threads(options.threads)
+    when, load = datetime.now(UTC), os.getloadavg()[0]
+    print(f"{when:%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}, load {load:.1f}")
+    rows = []
+    for size in options.sizes:
+        height, width = (int(n) for n in size.split("x"))
+        rows.append(run(height, width, options.seconds, BUDGETS_MS.get((height, width), 100.0)))
+        print(rows[-1], flush=True)
+    if options.out:
+        with options.out.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(dict.fromkeys(k for row in rows for k in row)))
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
