@@ -49,7 +49,8 @@ def light_of(bench: Bench) -> Light:
 
 def photograph_name() -> str:
     """Return a file name for a photograph taken now."""
-    return f"photo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.tif"
+    now = datetime.now(UTC)
+    return f"photo-{now:%Y%m%dT%H%M%S}{now.microsecond // 1000:03d}Z.tif"
 
 
 def check_target(target: Path, average: int, *, force: bool = False) -> None:

@@ -34,7 +34,7 @@ from instrument.snapshot import Light, check_target, light_of, photograph_name, 
 
 FRAME_MS = 32
 """Between two looks at the newest frame: thirty a second on the screen."""
-_STATISTICS_MS = 250
+_STATISTICS_MS = 333
 _RATE_WINDOW_S = 2.0
 LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0, 99.0), "by hand": None}
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import Qt, Signal
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QGraphicsItem, QVBoxLayout, QWidget
 
 from gui.theme import colours
 from gui.widgets.plot import curve_pen, plot_widget, restyle
@@ -30,10 +30,14 @@ class HistogramPlot(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.plot = plot_widget("counts", "pixels")
+        self.plot = plot_widget("counts", "pixels", grid=False)
+        self.plot.setAntialiasing(False)
+        for axis in ("bottom", "left"):  # their texts cost more than the curve, and seldom change
+            self.plot.getAxis(axis).setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
         self.plot.setMouseEnabled(x=False, y=False)
         self.plot.hideButtons()
         self.plot.setLogMode(y=True)
+        self.plot.disableAutoRange()
         self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0, brush=(74, 163, 223, 60))
         self.region: Any = pg.LinearRegionItem(brush=(255, 255, 255, 18))
         self.region.sigRegionChanged.connect(self._dragged)
@@ -42,6 +46,7 @@ class HistogramPlot(QWidget):
         self.full_scale.setToolTip("full scale of the sensor")
         self.plot.addItem(self.full_scale)
         self._quiet = False
+        self._ranges = (0, 0.0)
         self.setToolTip("Histogram of the raw data. Drag the borders to choose levels; red: full scale")
         self.setMinimumHeight(130)
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -54,8 +59,12 @@ class HistogramPlot(QWidget):
         bins = grouped(counts, full_scale, BINS)
         step = (full_scale + 1) / BINS
         self.curve.setData(np.arange(BINS) * step, np.maximum(bins, 0.5))
-        self.plot.setXRange(0, full_scale * 1.02, padding=0)
-        self.full_scale.setValue(full_scale)
+        decades = float(np.ceil(np.log10(max(float(bins.max()), 10.0))))
+        if (full_scale, decades) != self._ranges:
+            self._ranges = (full_scale, decades)
+            self.plot.setXRange(0, full_scale * 1.02, padding=0)
+            self.plot.setYRange(-0.3, decades, padding=0)
+            self.full_scale.setValue(full_scale)
         self._quiet = True
         self.region.setRegion((low, high))
         self._quiet = False

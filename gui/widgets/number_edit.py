@@ -164,11 +164,14 @@ class NumberEdit(QLineEdit):
         return f"{digits} {self.unit}".strip()
 
     def _show(self) -> None:
-        self.setText("" if self._value is None else self._text(self._value))
+        text = "" if self._value is None else self._text(self._value)
+        if text != self.text():
+            self.setText(text)
         self.setModified(False)
-        self.setProperty("refused", False)
-        self.setToolTip(self._limits_tip())
-        self._restyle()
+        if self.property("refused") is not False:
+            self.setProperty("refused", False)
+            self.setToolTip(self._limits_tip())
+            self._restyle()
 
     def _mark(self, why: str) -> None:
         self.setProperty("refused", True)

@@ -1,0 +1,370 @@
+"""A long day in short: live view, live reconstruction, jogging, and runs that start and stop.
+
+The whole window on the simulated bench, offscreen. Every few seconds something is done as an operator does:
+the stage is jogged, an LED lit, a photograph taken, a recording started and ended, a plan run, STOP pressed.
+Written: a figure of memory, frame rates and latency over time, and all samples as JSON. Fails (status 1) when
+memory grows, a warning or an error is logged, or the frame rate does not hold.
+
+    python benchmarks/gui_soak.py --minutes 30
+    python benchmarks/gui_soak.py --minutes 2 --figure /tmp/soak.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+
+import numpy as np
+from PySide6.QtCore import QSettings, Qt
+from PySide6.QtTest import QTest
+
+from gui.app import application
+from gui.main_window import MainWindow
+from gui.panels.led_array import LedPanel
+from gui.panels.live import LivePanel
+from gui.panels.live_reconstruction import LiveReconstructionPanel
+from gui.panels.slm import SlmPanel
+from gui.panels.stage import StagePanel
+from gui.session import BenchSession
+from gui.theme import apply_theme
+from instrument.acquire import prepare
+from instrument.calibration_file import save_calibration
+from instrument.config_file import parse_config
+from instrument.plan.file import load_plan
+from recon.types import Calibration
+
+BENCH = """
+[bench]
+name = "soak"
+data_folder = "runs"
+[camera]
+driver = "simulated"
+exposure_ms = 10.0
+frames_per_s = 30.0
+replay_frames = 16
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+leds = 89
+[slm]
+driver = "simulated"
+shape = [360, 640]
+settle_ms = 5.0
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+scene_rgb = [30.0, 30.0, 30.0]
+"""
+PLAN = """
+label = "soak plan"
+[[parts]]
+label = "scene"
+scene_lit = true
+repeats = 6
+"""
+SAMPLE_S = 10.0
+SETTLING = 0.2
+"""Of the time at the beginning, in which caches fill and the solver is timed: not judged."""
+MOST_GROWTH_MB = 25.0
+"""Over the judged time: the noise of a process of several hundred MB with two allocators."""
+LEAST_RATE = 0.8
+"""Of the first half's frames on the screen, which the second half has to show."""
+
+
+def main() -> int:
+    """Run, judge, write; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--figure", type=Path, default=Path("docs/images/gui-soak.png"))
+    parser.add_argument("--out", type=Path, help="samples as JSON; default: beside the figure")
+    parser.add_argument("--seed", type=int, default=0, help="of what is done when")
+    arguments = parser.parse_args()
+    app = application()
+    apply_theme(app, "dark")
+    with tempfile.TemporaryDirectory() as folder:
+        soak = Soak(Path(folder), np.random.default_rng(arguments.seed))
+        try:
+            soak.run(60 * arguments.minutes)
+        finally:
+            soak.close()
+    findings = soak.judge()
+    out = arguments.out or arguments.figure.with_suffix(".json")
+    facts = {"date": datetime.now(UTC).isoformat(), "minutes": arguments.minutes, "findings": findings}
+    out.write_text(json.dumps({**facts, "done": soak.done, "samples": soak.samples}) + "\n")
+    draw(soak, arguments.minutes, arguments.figure)
+    print(f"Done: {', '.join(f'{n} {what}' for what, n in sorted(soak.done.items()))}")
+    print(f"Wrote {arguments.figure} and {out}")
+    for finding in findings or ["Memory flat, no warnings, frame rate held."]:
+        print(finding)
+    return 1 if findings else 0
+
+
+class Soak:
+    """The window, what is done with it, and the samples."""
+
+    def __init__(self, folder: Path, rng: np.random.Generator) -> None:
+        self.folder, self.rng = folder, rng
+        self.samples: list[dict[str, Any]] = []
+        self.done: Counter[str] = Counter()
+        self.complaints: list[str] = []
+        warnings.simplefilter("always")
+        warnings.showwarning = self._warned
+        threading.excepthook = lambda what: self.complaints.append(f"thread: {what.exc_value!r}")
+        sys.excepthook = lambda _kind, error, _trace: self.complaints.append(f"window: {error!r}")
+        (folder / "plan.toml").write_text(PLAN)
+        self.session = BenchSession(parse_config(BENCH, folder / "bench.toml"))
+        self.session.logged.connect(self._logged)
+        self.window = MainWindow(
+            self.session, QSettings(str(folder / "window.ini"), QSettings.Format.IniFormat)
+        )
+        self.window.show()
+        self.window.resize(1600, 980)
+        self.session.open()
+        self.live = self._panel("live", LivePanel)
+        until(lambda: self.live._shown is not None)
+        self.preview = self._panel("live_reconstruction", LiveReconstructionPanel)
+        self.stage = self._panel("stage", StagePanel)
+        self.leds = self._panel("led_array", LedPanel)
+        self.slm = self._panel("slm", SlmPanel)
+        until(lambda: not self.session.jobs.device_jobs)
+        self.preview.file.setText(str(self._calibrate()))
+        self.preview.load()
+        until(lambda: self.preview._shown is not None)
+        self.window.show_panel("stage")
+        stage = self.session.bench.stage
+        assert stage is not None
+        homing = self.session.device_job("home", lambda _: stage.home(), {"stage"})
+        until(lambda: homing.is_over)
+        self._n_shown = 0
+        show = self.live.view.show_image
+
+        def counted(*what: Any) -> None:
+            self._n_shown += 1
+            show(*what)
+
+        self.live.view.show_image = counted  # type: ignore[method-assign]
+
+    def run(self, seconds: float) -> None:
+        """Do things and take samples until the time is over."""
+        actions = [
+            self.jog,
+            self.jog,
+            self.light,
+            self.photograph,
+            self.record,
+            self.plan,
+            self.panels,
+            self.stop,
+        ]
+        began_s = time.monotonic()
+        next_sample_s, next_action_s = began_s + SAMPLE_S, began_s + 3.0
+        self._mark()
+        while (now_s := time.monotonic()) - began_s < seconds:
+            QTest.qWait(20)
+            if now_s >= next_sample_s:
+                self.sample(now_s - began_s)
+                next_sample_s += SAMPLE_S
+            if now_s >= next_action_s and self.session.jobs.exclusive_job is None:
+                action = actions[int(self.rng.integers(len(actions)))]
+                action()
+                self.done[action.__name__] += 1
+                next_action_s = now_s + float(self.rng.uniform(2.0, 6.0))
+
+    # What an operator does -----------------------------------------------------------------------
+    def jog(self) -> None:
+        """Jog by a key."""
+        keys = (Qt.Key.Key_Left, Qt.Key.Key_Right, Qt.Key.Key_Up, Qt.Key.Key_Down, Qt.Key.Key_PageUp)
+        QTest.keyClick(self.stage.pad, keys[int(self.rng.integers(len(keys)))])
+
+    def light(self) -> None:
+        """Another LED pattern, then the scene again."""
+        names = list(self.leds.pattern_buttons)
+        self.leds.show_pattern(names[int(self.rng.integers(len(names)))])
+        QTest.qWait(500)
+        QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
+
+    def photograph(self) -> None:
+        """Take a photograph by its key; kept files are removed, as they would fill the disk."""
+        QTest.keyClick(self.window, Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
+        until(lambda: not self.session.jobs.device_jobs)
+        shutil.rmtree(self.session.runs_folder / "photographs", ignore_errors=True)
+
+    def record(self) -> None:
+        """Record for about two seconds, by its key."""
+        QTest.keyClick(self.window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+        QTest.qWait(2000)
+        if self.live.record_bar.job is not None:
+            QTest.keyClick(self.window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+        until(lambda: self.session.jobs.exclusive_job is None)
+        self._clear_runs()
+
+    def plan(self) -> None:
+        """Carry a plan out to its end; then the scene is lit again, as a run ends in the dark."""
+        plan = load_plan(self.folder / "plan.toml")
+        session = self.session
+
+        def work(context: Any) -> None:
+            prepare(session.bench, plan, session.runs_folder, on_progress=context.report).execute()
+
+        job = session.exclusive_job("A plan", work)
+        until(lambda: job.is_over)
+        QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
+        self._clear_runs()
+
+    def panels(self) -> None:
+        """Look at the other panels and come back."""
+        for name in ("slm", "led_array", "stage"):
+            self.window.show_panel(name)
+            QTest.qWait(150)
+
+    def stop(self) -> None:
+        """STOP, then light again."""
+        QTest.keyClick(self.window, Qt.Key.Key_Escape)
+        until(lambda: not self.session._stopping)
+        QTest.mouseClick(self.live.light_buttons.buttons()[0], Qt.MouseButton.LeftButton)
+
+    # Samples -------------------------------------------------------------------------------------
+    def sample(self, at_s: float) -> None:
+        """Take a sample: memory, rates, latency, threads, objects."""
+        now = time.perf_counter()
+        live, preview = self.session.live.status(), self.preview.follower.status
+        seconds = now - self._marked_s
+        self.samples.append(
+            {
+                "s": round(at_s, 1),
+                "memory_mb": resident_mb(),
+                "screen_per_s": self._n_shown / seconds,
+                "camera_per_s": live.frames_per_s,
+                "running": live.running,
+                "dropped": live.dropped,
+                "latency_ms": None if preview is None else preview.latency_median_ms,
+                "pictures_per_s": None if preview is None else preview.pictures_per_s,
+                "threads": threading.active_count(),
+                "objects": len(gc.get_objects()),
+                "cpu_share": (time.process_time() - self._marked_cpu_s) / seconds,
+                "complaints": len(self.complaints),
+            }
+        )
+        self._mark()
+
+    def judge(self) -> list[str]:
+        """Return what is not as it should be."""
+        findings = [f"Logged: {text}" for text in self.complaints[:20]]
+        judged = [s for s in self.samples if s["s"] >= SETTLING * self.samples[-1]["s"]]
+        t, memory = (np.array([s[name] for s in judged]) for name in ("s", "memory_mb"))
+        growth = float(np.polyfit(t, memory, 1)[0] * (t[-1] - t[0])) if len(judged) > 2 else 0.0
+        print(f"Memory {memory[0]:.0f} to {memory[-1]:.0f} MB, trend {growth:+.1f} MB over the judged time")
+        if growth > MOST_GROWTH_MB:
+            findings.append(f"Memory grew by {growth:.0f} MB.")
+        half = len(judged) // 2
+        first, second = (
+            float(np.median([s["screen_per_s"] for s in part])) for part in (judged[:half], judged[half:])
+        )
+        print(f"On the screen: median {first:.1f} frames/s in the first half, {second:.1f} in the second")
+        if second < LEAST_RATE * first:
+            findings.append(f"The rate on the screen fell from {first:.1f} to {second:.1f} frames/s.")
+        return findings
+
+    def close(self) -> None:
+        """Close the session and wait for its threads."""
+        for panel in self.window._panels.values():
+            panel.shutdown()
+        self.session.close()
+        until(lambda: self.session.is_closed)
+        self.session.join()
+
+    # Pieces --------------------------------------------------------------------------------------
+    def _panel(self, name: str, kind: Any) -> Any:
+        panel = self.window.show_panel(name)
+        assert isinstance(panel, kind)
+        return panel
+
+    def _mark(self) -> None:
+        self._marked_s, self._marked_cpu_s, self._n_shown = time.perf_counter(), time.process_time(), 0
+
+    def _calibrate(self) -> Path:
+        """Photograph the point source: the calibration that the preview uses."""
+        bench = self.session.bench
+        with self.session.live.paused():
+            bench.scene_off()
+            dark = bench.snap(4).image.astype(np.float32)
+            bench.source_on()
+            psf = np.clip(bench.snap(4).image - dark.mean() - 3, 0, None)
+            bench.source_off()
+            bench.scene_on()
+        place = np.array([[0.0, 0.0, 1e5]])
+        return save_calibration(
+            Calibration(psf[None, None].astype(np.float32), place, dark[None]), self.folder / "calibration"
+        )
+
+    def _clear_runs(self) -> None:
+        for run in self.session.runs_folder.glob("*_*"):
+            shutil.rmtree(run, ignore_errors=True)
+
+    def _logged(self, level: str, text: str) -> None:
+        if level in ("warning", "error") and text != "STOP":
+            self.complaints.append(f"{level}: {text}")
+
+    def _warned(self, message: Warning | str, category: type[Warning], *_rest: Any, **_named: Any) -> None:
+        self.complaints.append(f"{category.__name__}: {message}")
+
+
+def resident_mb() -> float:
+    """Return the process's memory that is in use, megabytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def until(done: Any, timeout_s: float = 120.0) -> None:
+    """Let the window work until something is done."""
+    deadline_s = time.monotonic() + timeout_s
+    while not done():
+        if time.monotonic() > deadline_s:
+            raise SystemExit("Waited two minutes in vain.")
+        QTest.qWait(20)
+
+
+def draw(soak: Soak, minutes: float, path: Path) -> None:
+    """Draw memory, rates and latency over time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    t = [s["s"] / 60 for s in soak.samples]
+    figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, constrained_layout=True)
+    axes[0].plot(t, [s["memory_mb"] for s in soak.samples], color="#2b6cb0")
+    axes[0].set(ylabel="memory (MB)", ylim=(0, None))
+    axes[1].plot(t, [s["screen_per_s"] for s in soak.samples], label="on the screen", color="#2f855a")
+    axes[1].plot(t, [s["camera_per_s"] for s in soak.samples], label="of the camera", color="#b7791f", lw=0.9)
+    axes[1].set(ylabel="frames a second", ylim=(0, None))
+    axes[1].legend(loc="lower right")
+    axes[2].plot(t, [s["latency_ms"] or np.nan for s in soak.samples], color="#9b2c2c")
+    axes[2].set(ylabel="median latency of the\nreconstruction (ms)", xlabel="minutes", ylim=(0, None))
+    done = ", ".join(f"{n} {what}" for what, n in sorted(soak.done.items()))
+    figure.suptitle(f"Desktop program for {minutes:g} minutes, SIMULATED bench\n{done}", fontsize=10)
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
