@@ -106,7 +106,7 @@ MAPS = (
         PICTURE,
         ERASED,
         ELECTRONS,
-        ("admm tv", "fista tv"),
+        ("admm tv", "admm l1"),
     ),
     scene_map(
         "saturation",
