@@ -51,6 +51,9 @@ COMMANDS: Mapping[str, Command] = {
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"
     ),
+    "activity": Command(
+        RECONSTRUCTION, "fluorescence over time: dF/F, regions, traces", "instrument.cli.activity"
+    ),
     "analyze": Command(
         ANALYSIS, "what a calibration's optics can do: one page and JSON", "instrument.cli.analyze"
     ),

@@ -1,0 +1,146 @@
+"""Fluorescence over time: what moved, the baseline, and the change (Kuo 2020, Sec. 6.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+
+PERCENTILE = 20.0
+"""Of a pixel's values that its baseline is (Kuo 2020, Fig. 6.5)."""
+
+FLOOR_SHARE = 0.1
+"""Least baseline that a change is divided by, relative to the bright part of the picture: where there is
+next to nothing, a relative change means nothing."""
+
+BRIGHT_PERCENTILE = 99.0
+
+_ANCHORS_A_WINDOW = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How far each frame lies off the first part of the video.
+
+    Attributes
+    ----------
+    shifts : ndarray, (n_frames, 2)
+        Rows and columns, pixels.
+    largest_px : float
+        Of the frames' distances from their median place.
+    """
+
+    shifts: npt.NDArray[np.float64]
+    largest_px: float
+
+    @property
+    def is_still(self) -> bool:
+        """Whether dF/F of a pixel means the same place throughout: no frame is off by half a pixel."""
+        return self.largest_px < 0.5
+
+
+def motion(frames: Floats) -> Motion:
+    """Register each frame to the mean of all, by phase-only correlation refined to a fraction of a pixel.
+
+    Parameters
+    ----------
+    frames : ndarray, (n_frames, height, width)
+    """
+    reference = np.mean(frames, axis=0)
+    window = np.outer(np.hanning(frames.shape[1]), np.hanning(frames.shape[2]))
+    spectrum = np.fft.rfft2((reference - reference.mean()) * window)
+    shifts = np.array([_shift(frame, window, spectrum) for frame in frames])
+    shifts -= np.median(shifts, axis=0)
+    return Motion(shifts, float(np.hypot(*shifts.T).max(initial=0.0)))
+
+
+def aligned(frames: Floats, found: Motion) -> Floats:
+    """Return the frames moved back to their median place, cubic splines, float32."""
+    from scipy import ndimage
+
+    moved = [
+        ndimage.shift(frame, -shift, order=3, mode="nearest")
+        for frame, shift in zip(frames, found.shifts, strict=True)
+    ]
+    return np.stack(moved).astype(np.float32)
+
+
+def _shift(frame: Floats, window: Array, reference: Array) -> tuple[float, float]:
+    """Return rows and columns by which a frame lies off the reference, from the correlation's peak."""
+    spectrum = np.fft.rfft2((frame - frame.mean()) * window)
+    correlation = np.fft.irfft2(spectrum * np.conj(reference), s=window.shape)
+    peak = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
+    place = []
+    for axis, n in enumerate(correlation.shape):
+        index = list(peak)
+        values = []
+        for step in (-1, 0, 1):
+            index[axis] = (peak[axis] + step) % n
+            values.append(float(correlation[tuple(index)]))
+        bend = values[0] - 2 * values[1] + values[2]
+        offset = 0.5 * (values[0] - values[2]) / bend if bend < 0 else 0.0
+        whole = int(peak[axis])
+        place.append((whole - n if whole > n // 2 else whole) + float(np.clip(offset, -0.5, 0.5)))
+    return place[0], place[1]
+
+
+def baseline(frames: Floats, window: int, percentile: float = PERCENTILE) -> Floats:
+    """Return each pixel's baseline F0: a sliding percentile, (n_frames, height, width), float32.
+
+    The percentile is taken in windows centred on frames a quarter of a window apart and drawn linearly
+    between them: it is smooth by nature, and this is many times faster. A window at the ends is as long as
+    any other, shifted inwards.
+
+    Parameters
+    ----------
+    frames : ndarray, (n_frames, height, width)
+    window : int
+        Frames that a baseline looks at. Much longer than activity, shorter than bleaching.
+    percentile : float
+    """
+    count = len(frames)
+    if not 0 <= percentile <= 100:
+        raise InputError(f"percentile must lie between 0 and 100, not {percentile:g}.")
+    if window < 3:
+        raise InputError(f"A baseline needs a window of at least 3 frames, not {window}.")
+    window = min(window, count)
+    step = max(window // _ANCHORS_A_WINDOW, 1)
+    anchors = np.unique([*range(0, count, step), count - 1])
+    levels = []
+    for anchor in anchors:
+        first = int(np.clip(anchor - window // 2, 0, count - window))
+        levels.append(np.percentile(frames[first : first + window], percentile, axis=0))
+    # Where the shifted windows of the ends are centred, the level is their own.
+    centres = np.clip(anchors, window // 2, count - window + window // 2)
+    _, kept = np.unique(centres, return_index=True)
+    known, where = np.stack(levels).astype(np.float32)[kept], centres[kept]
+    result = np.empty(frames.shape, np.float32)
+    for index in range(count):
+        right = int(np.clip(np.searchsorted(where, index), 1, max(len(where) - 1, 1)))
+        if len(where) == 1:
+            result[index] = known[0]
+            continue
+        left = right - 1
+        share = np.clip((index - where[left]) / (where[right] - where[left]), 0, 1)
+        result[index] = (1 - share) * known[left] + share * known[right]
+    return result
+
+
+def change(frames: Floats, base: Floats) -> Floats:
+    """Return dF/F, ``(F - F0) / max(F0, floor)``; the floor keeps what hardly shines from looking active.
+
+    Parameters
+    ----------
+    frames, base : ndarray, (n_frames, height, width)
+    """
+    floor = FLOOR_SHARE * float(np.percentile(base, BRIGHT_PERCENTILE))
+    if not floor > 0:
+        raise InputError("The video is dark: its baseline is zero nearly everywhere.")
+    return ((frames - base) / np.maximum(base, np.float32(floor))).astype(np.float32)

@@ -1,0 +1,98 @@
+"""From a video to traces, regions, dF/F, a page and a film; mistakes in words."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from instrument.activity import ActivitySettings, find_activity
+from instrument.cli import main
+from instrument.errors import BenchError
+from instrument.video.output import VideoPictures, create_output
+
+COUNT, SHAPE, MISSING = 120, (32, 40), 7
+
+
+def course() -> np.ndarray:
+    spikes = np.zeros(COUNT)
+    spikes[[20, 55, 90]] = 1
+    return np.convolve(spikes, np.exp(-np.arange(40) / 8))[:COUNT]
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    path = tmp_path / "film.ome.zarr"
+    create_output(path, COUNT, SHAPE, period_s=0.1, pitch_um=None, attributes={"simulated": True})
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    spot = np.exp(-((y - 12) ** 2 + (x - 25) ** 2) / 8)
+    rng = np.random.default_rng(0)
+    pictures = VideoPictures(path, write=True)
+    for index, active in enumerate(course()):
+        if index != MISSING:
+            noise = 0.02 * rng.standard_normal(SHAPE)
+            pictures.write(index, (0.4 + spot * (1 + active) + noise).astype(np.float32))
+    return path
+
+
+def test_the_command_writes_what_it_found(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "found"
+    assert main(["activity", str(film), "--out", str(out), "--window", "6"]) == 0
+    assert "Regions     1" in capsys.readouterr().out
+    with (out / "traces.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frame"]) for row in rows] == [t for t in range(COUNT) if t != MISSING]
+    assert float(rows[10]["time_s"]) == pytest.approx(1.1)
+    trace = np.array([float(row["region_0_dff"]) for row in rows])
+    assert np.corrcoef(trace, np.delete(course(), MISSING))[0, 1] > 0.98
+    (region,) = csv.DictReader((out / "regions.csv").read_text().splitlines())
+    assert (float(region["row"]), float(region["column"])) == pytest.approx((12, 25), abs=0.5)
+    dff = VideoPictures(out / "dff.ome.zarr")
+    assert np.isnan(dff.read(MISSING)).all()
+    assert dff.read(20)[12, 25] > 0.4
+    assert cv2.imread(str(out / "activity.png")).shape[1] > 1000
+    shown = cv2.VideoCapture(str(out / "activity.mp4"))
+    frames = [shown.read()[1] for _ in range(COUNT - 1)]
+    active, calm = (frames[t][12, 25].astype(int) for t in (20, 15))
+    assert active[2] - active[0] > calm[2] - calm[0] + 60  # red over grey (OpenCV: blue, green, red)
+    record = json.loads((out / "activity.json").read_text())
+    assert record["regions"] == 1
+    assert record["simulated"]
+
+
+def test_results_are_not_replaced_and_mistakes_are_said(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "activity.json").write_text("{}")
+    for arguments, says in (
+        ([str(film), "--out", str(tmp_path / "full")], "holds results"),
+        ([str(tmp_path / "none.ome.zarr")], "does not exist"),
+        ([str(tmp_path / "full")], "neither"),
+        ([str(film), "--psf", str(film)], "for recordings"),
+    ):
+        assert main(["activity", *arguments]) == 2
+        assert says in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_too_large_for_the_memory_is_refused(film: Path) -> None:
+    with pytest.raises(BenchError, match="GiB of memory"):
+        find_activity(VideoPictures(film), ActivitySettings(), free_bytes=1000)
+
+
+def test_alignment_is_offered_where_frames_move(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "moving.ome.zarr"
+    create_output(path, 12, SHAPE, period_s=None, pitch_um=None, attributes={})
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    pictures = VideoPictures(path, write=True)
+    for index in range(12):
+        spot = np.exp(-((y - 12 - 0.3 * index) ** 2 + (x - 20) ** 2) / 20)
+        pictures.write(index, (0.2 + spot).astype(np.float32))
+    assert main(["activity", str(path), "--out", str(tmp_path / "found")]) == 0
+    assert "--align" in capsys.readouterr().err
