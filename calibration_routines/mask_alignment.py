@@ -72,6 +72,8 @@ class AlignmentReport:
     directions : dict of axis name to 1 or -1
         As tested; -1 goes against its name.
     frames : int
+    mask_shape : (int, int)
+        Of the mask, in its pixels.
     camera : CameraMap
     brightness_per_ms : float
         Camera counts a millisecond for the mean intensity.
@@ -89,6 +91,7 @@ class AlignmentReport:
     found_at: Pose
     directions: dict[str, int]
     frames: int
+    mask_shape: tuple[int, int]
     camera: CameraMap
     brightness_per_ms: float
     log: list[str] = field(default_factory=list)
@@ -182,6 +185,7 @@ class MaskAlignment:
             found_at,
             self._directions,
             self.io.frames,
+            session.display.mask.shape,
             session.spots.camera,
             session.spots.mean_per_ms,
             session.log,

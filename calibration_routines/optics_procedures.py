@@ -8,7 +8,6 @@ from pathlib import Path
 from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
 from calibration_routines.angular_response import CUT_OFF, AngularResponse
 from calibration_routines.beads import (
-    Ask,
     BeadCalibration,
     BeadSlides,
     bench_geometry,
@@ -192,6 +191,8 @@ def surface_line(surface: DiffuserSurface) -> str:
 class BeadProcedure:
     """Photograph bead slides and recover PSFs from them, without a stage.
 
+    The slide is moved in between by the simulated bench, or by the operator, who is asked.
+
     Attributes
     ----------
     slides : BeadSlides
@@ -199,14 +200,11 @@ class BeadProcedure:
         The calibration's folder; None: a dated name beside the runs.
     overwrite : bool
         Replace a calibration that exists.
-    ask : callable, optional
-        Asks the operator to move the slide; the simulated bench does it itself.
     """
 
     slides: BeadSlides
     out: Path | None = None
     overwrite: bool = False
-    ask: Ask | None = None
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse what cannot be solved because the optics are not known, or saved."""
@@ -240,7 +238,7 @@ class BeadProcedure:
         with under_control(bench, control) as control:
             heard.step("photographing bead slides")
             taken = photograph_slides(
-                bench, self.slides, folder, ask=self.ask, on_progress=heard.frame, control=control
+                bench, self.slides, folder, ask=bench.ask, on_progress=heard.frame, control=control
             )
             heard.step("blind deconvolution")
 

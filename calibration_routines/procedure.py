@@ -17,7 +17,7 @@ from calibration_routines.spot_camera import SpotLook
 from calibration_routines.sweep_watch import SweepEvent
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
-from instrument.plan import Plan, PlanEstimate, estimate
+from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.run_control import RunControl
 from instrument.runner import RunStatus
 
@@ -148,12 +148,17 @@ def path_of(plan: Plan) -> tuple[dict[str, float], ...]:
     """Return the places that a plan visits, one after the other; empty where nothing moves."""
     places: list[dict[str, float]] = []
     for step in plan.steps():
-        place = dict(step.stage)
-        if step.source_um is not None:
-            place = dict(zip(("x_um", "y_um", "z_um"), step.source_um, strict=True))
+        place = place_of(step)
         if place and (not places or places[-1] != place):
             places.append(place)
     return tuple(places)
+
+
+def place_of(step: Step) -> dict[str, float]:
+    """Return where a step puts the source (``x_um``, ``y_um``, ``z_um``) or the stage; empty: nowhere."""
+    if step.source_um is not None:
+        return dict(zip(("x_um", "y_um", "z_um"), step.source_um, strict=True))
+    return dict(step.stage)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -226,6 +227,27 @@ class VolumeRequest(_GridRequest):
 
 
 SweepRequest = AxialRequest | LateralRequest | VolumeRequest
+
+
+def reachable_depths_um(bench: Bench) -> tuple[float, float]:
+    """Return a near and a far depth that the stage reaches, to begin with: the far third of its travel.
+
+    Where the bench has no stage, both are one hundred times the diffuser's distance from the sensor (or 100
+    mm), which a photographic camera may call far.
+    """
+    if bench.stage is None or "z_um" not in bench.stage.limits:
+        distance_mm = bench.geometry.diffuser_distance_mm or 1.0
+        return 1e5 * distance_mm, 1e5 * distance_mm
+    offset_um = bench.config.source.offset_um[2]
+    low, high = (end + offset_um for end in bench.stage.limits["z_um"])
+    far_um = _rounded_down(high)
+    return max(_rounded_down(far_um / 3), math.ceil(max(low, 1.0))), far_um
+
+
+def _rounded_down(length_um: float) -> float:
+    """Return a length with two digits, not longer."""
+    unit = 10.0 ** (math.floor(math.log10(length_um)) - 1)
+    return unit * math.floor(length_um / unit + 1e-9)
 
 
 def _planes(

@@ -325,6 +325,11 @@ class Bench:
         leds = self.led_array
         return leds is not None and leds.is_open and not leds.pattern.is_dark
 
+    @property
+    def ask(self) -> Ask | None:
+        """Asks the operator to do something by hand; None where nobody can be asked."""
+        return self._lights.ask
+
     # Safety ------------------------------------------------------------------------------------
     def stop(self) -> None:
         """Stop whatever runs and make the bench safe, from any thread; see ``safe_state``."""

@@ -45,18 +45,18 @@ class Lights:
         self._led_array = led_array
         self._by_operator = scene.control == "operator"
         self.scene_switch = scene_switch
-        self._ask = ask
+        self.ask = ask
         self._asked: dict[str, bool] = {}
 
     @property
     def can_switch_source(self) -> bool:
         """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
-        return self._led_array is not None or self._ask is not None
+        return self._led_array is not None or self.ask is not None
 
     @property
     def can_switch_scene(self) -> bool:
         """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
-        return self._ask is not None if self._by_operator else self.scene_switch is not None
+        return self.ask is not None if self._by_operator else self.scene_switch is not None
 
     @property
     def scene_lit(self) -> bool:
@@ -100,9 +100,9 @@ class Lights:
         if self._asked.get(what) == lit:
             return
         request = f"Please {'light' if lit else 'darken'} {what}."
-        if self._ask is None:
+        if self.ask is None:
             raise OperatorNeededError(
                 f"{request} Nobody can be asked here: use a terminal (in Python: open_bench(..., ask=))."
             )
-        self._ask(request)
+        self.ask(request)
         self._asked[what] = lit

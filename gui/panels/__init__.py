@@ -33,6 +33,23 @@ class PanelEntry(NamedTuple):
 
 PANELS: Mapping[str, PanelEntry] = {
     "live": PanelEntry("Live view", "gui.panels.live:LivePanel", "centre", "Ctrl+1", "The camera, running"),
+    "sweeps": PanelEntry(
+        "Sweeps",
+        "gui.panels.sweeps:SweepsPanel",
+        "centre",
+        "Ctrl+4",
+        "Calibration routines and plans: plan, carry out, judge",
+    ),
+    "runs": PanelEntry(
+        "Runs", "gui.panels.runs:RunsPanel", "centre", "Ctrl+5", "Past runs: look at them, or go on"
+    ),
+    "alignment": PanelEntry(
+        "Alignment",
+        "gui.panels.alignment:AlignmentPanel",
+        "centre",
+        "Ctrl+9",
+        "Find the scattering mask and bring it to its place",
+    ),
     "reconstructions": PanelEntry(
         "Reconstructions",
         "gui.panels.reconstructions:ReconstructionsPanel",

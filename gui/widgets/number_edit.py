@@ -33,6 +33,8 @@ class NumberEdit(QLineEdit):
         Whether only whole numbers are numbers.
     tip : str
         The tool tip; the limits are added.
+    empty : str
+        What an empty field means, shown in it; where this is empty, a number is needed.
     parent : QWidget, optional
     """
 
@@ -48,6 +50,7 @@ class NumberEdit(QLineEdit):
         maximum: float = math.inf,
         integer: bool = False,
         tip: str = "",
+        empty: str = "",
         parent: QWidget | None = None,
     ) -> None:
         super().__init__(parent)
@@ -56,6 +59,7 @@ class NumberEdit(QLineEdit):
         self._integer = integer
         self._tip = tip
         self._value = value
+        self.setPlaceholderText(empty)
         self.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.returnPressed.connect(self.submit)
         self._show()
@@ -65,10 +69,17 @@ class NumberEdit(QLineEdit):
         """The last number that was accepted or set."""
         return self._value
 
-    def set_value(self, value: float | None) -> None:
-        """Show a number, e.g. as a device reads back; what is being typed is left alone."""
+    def typed(self) -> tuple[float | None, str]:
+        """Return the number as it stands in the field, submitted or not, and why it is refused if it is.
+
+        None for a number, and no reason, where the field may be empty and is.
+        """
+        return self._read()
+
+    def set_value(self, value: float | None, *, overwrite: bool = False) -> None:
+        """Show a number, e.g. as a device reads back; only ``overwrite`` replaces what is being typed."""
         self._value = value
-        if not self.isModified():
+        if overwrite or not self.isModified():
             self._show()
 
     def set_limits(self, minimum: float, maximum: float) -> None:
@@ -93,11 +104,10 @@ class NumberEdit(QLineEdit):
             self._mark(problem)
             self.refused.emit(problem)
             return
-        assert number is not None
         changed = number != self._value
         self._value = number
         self._show()
-        if changed:
+        if changed and number is not None:
             self.submitted.emit(number)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
@@ -132,6 +142,8 @@ class NumberEdit(QLineEdit):
 
     def _read(self) -> tuple[float | None, str]:
         text = self.text().strip()
+        if not text:
+            return None, "" if self.placeholderText() else "A number is needed."
         if self.unit and text.endswith(self.unit):
             text = text.removesuffix(self.unit).strip()
         try:

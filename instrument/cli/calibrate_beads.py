@@ -14,7 +14,7 @@ import typer
 from calibration_routines.beads import BeadCalibration, BeadSlides, calibrate_beads, mean_images
 from calibration_routines.optics_procedures import BeadProcedure, bead_lines
 from instrument.calibration_file import save_calibration
-from instrument.cli.app import BenchOption, examples, open_and_say, operator
+from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.progress import one_task
 from instrument.cli.sweeping import Told
 from instrument.errors import BenchError, FileError
@@ -91,7 +91,7 @@ def beads(
         ),
     )
     if not files:
-        procedure = BeadProcedure(slides=slides, out=out, overwrite=force, ask=operator())
+        procedure = BeadProcedure(slides=slides, out=out, overwrite=force)
         with open_and_say(bench) as opened:
             simulated = bool(opened.simulated_kinds)
             with Told() as told:

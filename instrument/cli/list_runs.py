@@ -12,8 +12,7 @@ from rich.table import Table
 from instrument.cli.app import BenchOption, command_app, examples
 from instrument.config_file import load_config
 from instrument.errors import FileError
-from instrument.store import Run, RunError
-from instrument.store.layout import STATE
+from instrument.store.catalogue import run_paths, summary
 
 app = command_app()
 
@@ -33,7 +32,7 @@ def list_runs(
     if not folder.is_dir():
         typer.echo(f"{folder}: no such folder, so no runs yet.")
         return
-    paths = sorted(p for p in folder.iterdir() if not p.name.startswith(".") and (p / STATE).is_file())
+    paths = run_paths(folder)
     if not paths:
         typer.echo(f"{folder}: no runs.")
         return
@@ -41,12 +40,11 @@ def list_runs(
     for heading in ("run", "became", "frames", "kind", "bench"):
         table.add_column(heading, overflow="fold", justify="right" if heading == "frames" else "left")
     for path in paths:
-        try:
-            run = Run.open(path)
-        except RunError as error:
-            table.add_row(path.name, "UNREADABLE", "", "", error.problem)
+        found = summary(path)
+        if found.condition is None:
+            table.add_row(path.name, "UNREADABLE", "", "", found.problem)
             continue
-        kind = "recording" if run.plan is None else "plan"
-        mark = "SIMULATED" if run.is_simulated else ""
-        table.add_row(path.name, run.condition, f"{len(run.records)} of {run.n_frames}", kind, mark)
+        kind = "recording" if found.is_recording else "plan"
+        mark = "SIMULATED" if found.is_simulated else ""
+        table.add_row(path.name, found.condition, f"{found.stored} of {found.frames}", kind, mark)
     Console(width=None if Console().is_terminal else 160).print(table, markup=False)

@@ -12,11 +12,11 @@ import typer
 from instrument.acquire import abilities_of
 from instrument.atomic import write_text
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.cli.words import duration, size
 from instrument.errors import FileError
 from instrument.plan import BenchAbilities, Plan, check, estimate
 from instrument.plan.drawing import draw_path
 from instrument.plan.file import load_plan
+from instrument.words import duration, size
 
 app = command_app("Look at a plan before anything moves, or write one to start from.")
 

@@ -10,10 +10,10 @@ import typer
 from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
-from instrument.cli.words import duration, size
 from instrument.recorder import RecordingStatus
 from instrument.recording import prepare_recording
 from instrument.store import Run
+from instrument.words import duration, size
 
 app = command_app()
 

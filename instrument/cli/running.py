@@ -10,11 +10,11 @@ from instrument.acquire import free_bytes
 from instrument.bench import Bench
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
-from instrument.cli.words import duration, size
 from instrument.plan import Plan
 from instrument.runner import Runner, RunState, RunStatus
 from instrument.safety import StepsFailedError
 from instrument.store import Run, RunCondition
+from instrument.words import duration, size
 
 
 def home_if_needed(bench: Bench, plan: Plan) -> None:

@@ -27,9 +27,9 @@ from calibration_routines.sweep_words import event_lines, event_note, exposure_l
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
 from instrument.cli.progress import progress_bar
-from instrument.cli.words import count
 from instrument.plan import Plan, estimate
 from instrument.runner import RunStatus
+from instrument.words import count
 
 
 class Told(Listener):

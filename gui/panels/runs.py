@@ -1,0 +1,372 @@
+"""Past runs: what became of each, its frames, its calibration's verdict; those that did not end go on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PySide6.QtCore import QFileSystemWatcher, Qt, QTimer, QUrl
+from PySide6.QtGui import QColor, QDesktopServices
+from PySide6.QtWidgets import (
+    QHBoxLayout,
+    QHeaderView,
+    QLabel,
+    QPlainTextEdit,
+    QPushButton,
+    QSlider,
+    QSplitter,
+    QTableWidget,
+    QTableWidgetItem,
+    QVBoxLayout,
+    QWidget,
+)
+
+from calibration_routines.plan_procedures import ResumeProcedure
+from calibration_routines.procedure import Outcome
+from calibration_routines.sweep import FOLDER
+from calibration_routines.sweep_record import is_sweep
+from gui.forms.as_python import script
+from gui.jobs import BusyError, Job, JobContext
+from gui.panel import Panel
+from gui.procedure_run import Ended, ProcedureRun
+from gui.session import BenchSession
+from gui.theme import colours
+from gui.widgets.image_view import ImageView
+from gui.widgets.run_bar import RunBar
+from instrument.store import Run, RunCondition
+from instrument.store.catalogue import RunSummary, run_paths, summary
+
+_COLUMNS = ("run", "became", "frames", "kind", "bench")
+_LEVELS = (0.1, 99.9)
+_REST_MS = 500
+"""Rest after a change in the folder before it is read."""
+
+
+class RunsPanel(Panel):
+    """A list of runs, the newest first; a click opens one."""
+
+    title = "Runs"
+    table: QTableWidget
+    where: QLabel
+    view: ImageView
+    slider: QSlider
+    frame_words: QLabel
+    about: QPlainTextEdit
+    bar: RunBar
+    folder_button: QPushButton
+    _left: QWidget
+    _right: QSplitter
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(session, parent)
+        self.run = ProcedureRun(session, self)
+        self.summaries: list[RunSummary] = []
+        self.opened: Run | None = None
+        self._listing: Job | None = None
+        self._again = False
+        self._wanted: Path | None = None
+        self._make_list()
+        self._make_details()
+        split = QSplitter()
+        split.addWidget(self._left)
+        split.addWidget(self._right)
+        split.setSizes([560, 640])
+        split.setChildrenCollapsible(False)
+        layout = QVBoxLayout(self.body)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(split)
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.setInterval(_REST_MS)
+        self._rest.timeout.connect(self.read_folder)
+        self._watcher = QFileSystemWatcher(self)
+        self._watcher.directoryChanged.connect(lambda _: self._rest.start())
+        session.run_finished.connect(self._run_finished)
+        self.run.looked.connect(self.bar.show_situation)
+        self.run.said.connect(lambda line: self.session.log("info", line))
+        self.run.succeeded.connect(self._succeeded)
+        self.run.ended_early.connect(self._ended_early)
+        self.run.failed.connect(lambda why: self.refused(None, why))
+        self.run.over.connect(self._over)
+        self.read_folder()
+
+    # The list ------------------------------------------------------------------------------------
+    def read_folder(self) -> None:
+        """Read the folder of runs again, in a job."""
+        if self._listing is not None:
+            self._again = True
+            return
+        folder = self.session.runs_folder
+        if folder.is_dir() and str(folder) not in self._watcher.directories():
+            self._watcher.addPath(str(folder))
+
+        def work(context: JobContext) -> list[RunSummary]:
+            found = []
+            for path in reversed(run_paths(folder)):
+                context.check()
+                found.append(summary(path))
+            return found
+
+        self._listing = self.jobs.compute("Reading the list of runs", work)
+        self._listing.succeeded.connect(self._show_list)
+        self._listing.ended.connect(self._listed)
+
+    def open_run(self, path: Path) -> None:
+        """Show a run."""
+        try:
+            run = Run.open(path)
+        except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
+            self._close_run(str(error))
+            return
+        self.opened = run
+        stored = sorted(run.records)
+        self.slider.setEnabled(len(stored) > 1)
+        self.slider.setRange(0, max(0, len(stored) - 1))
+        self.slider.setValue(0)
+        self.about.setPlainText("\n".join(_about(run)))
+        goes_on = run.plan is not None and run.condition not in (RunCondition.RUNNING,)
+        self._can_resume = goes_on and (bool(run.missing()) or _lacks_calibration(run.path))
+        self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
+        self.folder_button.setEnabled(True)
+        self._show_frame(0)
+
+    def as_python(self) -> str:
+        """Return lines that read the run, or go on with it where it did not end."""
+        if self.opened is None:
+            return (
+                "from pathlib import Path\n\nfrom instrument.store.catalogue import run_paths, summary\n\n"
+                f"for path in run_paths(Path({str(self.session.runs_folder)!r})):\n    print(summary(path))\n"
+            )
+        if self._can_resume:
+            return script(ResumeProcedure(self.opened.path), self.session.config.path)
+        return (
+            "from instrument.store import Run\n\n"
+            f"run = Run.open({str(self.opened.path)!r})\n"
+            "print(run)\n"
+            "for index in sorted(run.records):\n"
+            "    frame, metadata = run.frame(index), run.metadata(index)\n"
+        )
+
+    def resume(self) -> None:
+        """Go on with the run that is shown."""
+        if self.opened is None or self.run.is_running:
+            return
+        path = self.opened.path
+        try:
+            self.run.start(f"Resuming {path.name}", ResumeProcedure(path))
+        except BusyError as error:
+            self.refused(None, str(error))
+            return
+        self.bar.set_running(True)
+        self.table.setEnabled(False)
+
+    def shutdown(self) -> None:
+        """End the timers."""
+        self._rest.stop()
+        self.run.shutdown()
+
+    # Making --------------------------------------------------------------------------------------
+    def _make_list(self) -> None:
+        self.table = QTableWidget(0, len(_COLUMNS))
+        self.table.setHorizontalHeaderLabels(_COLUMNS)
+        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
+        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
+        self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
+        self.table.setTabKeyNavigation(False)
+        self.table.setToolTip("Click a run to open it")
+        self.table.verticalHeader().hide()
+        self.table.verticalHeader().setDefaultSectionSize(26)
+        header = self.table.horizontalHeader()
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
+        self.where = QLabel()
+        self.where.setObjectName("dim")
+        self.where.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.where.setWordWrap(True)
+        self._left = QWidget()
+        column = QVBoxLayout(self._left)
+        column.setContentsMargins(0, 0, 6, 0)
+        column.addWidget(self.where)
+        column.addWidget(self.table, 1)
+
+    def _make_details(self) -> None:
+        self._can_resume = False
+        self.view = ImageView()
+        self.slider = QSlider(Qt.Orientation.Horizontal)
+        self.slider.setToolTip("Frame of the run (arrow keys)")
+        self.slider.setAccessibleName("Frame of the run")
+        self.slider.valueChanged.connect(self._show_frame)
+        self.frame_words = QLabel()
+        self.frame_words.setObjectName("dim")
+        self.about = QPlainTextEdit()
+        self.about.setReadOnly(True)
+        self.about.setPlainText("Click a run to open it.")
+        self.bar = RunBar("Resume")
+        self.bar.set_startable("No run is open.")
+        self.bar.start.connect(self.resume)
+        self.bar.pause.connect(self.run.pause)
+        self.bar.resume.connect(self.run.resume)
+        self.bar.abort.connect(self.run.abort)
+        self.folder_button = QPushButton("Open folder")
+        self.folder_button.setToolTip("Show the run's files in the file manager")
+        self.folder_button.setEnabled(False)
+        self.folder_button.clicked.connect(self._open_folder)
+        foot = QHBoxLayout()
+        foot.addWidget(self.bar, 1)
+        foot.addWidget(self.folder_button, 0, Qt.AlignmentFlag.AlignTop)
+        self._right = QSplitter(Qt.Orientation.Vertical)
+        top = QWidget()
+        column = QVBoxLayout(top)
+        column.setContentsMargins(6, 0, 0, 0)
+        column.addWidget(self.view, 1)
+        column.addWidget(self.slider)
+        column.addWidget(self.frame_words)
+        below = QWidget()
+        column = QVBoxLayout(below)
+        column.setContentsMargins(6, 0, 0, 0)
+        column.addWidget(self.about, 1)
+        column.addLayout(foot)
+        self._right.addWidget(top)
+        self._right.addWidget(below)
+        self._right.setSizes([480, 260])
+
+    # Inside --------------------------------------------------------------------------------------
+    def _show_list(self, summaries: list[RunSummary]) -> None:
+        wanted = self._wanted or (self.opened.path if self.opened is not None else None)
+        self.summaries = summaries
+        self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
+        blocked = self.table.blockSignals(True)
+        self.table.setRowCount(len(summaries))
+        chosen = -1
+        for row, found in enumerate(summaries):
+            became = found.condition.value if found.condition is not None else "UNREADABLE"
+            texts = (
+                found.path.name,
+                became,
+                f"{found.stored} of {found.frames}",
+                "recording" if found.is_recording else "plan",
+                "SIMULATED" if found.is_simulated else "",
+            )
+            for column, text in enumerate(texts):
+                item = QTableWidgetItem(text)
+                if found.condition is not RunCondition.COMPLETED and column == 1:
+                    item.setForeground(QColor(colours().warning))
+                item.setToolTip(found.problem or text)
+                self.table.setItem(row, column, item)
+            if found.path == wanted:
+                chosen = row
+        self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
+        self.table.blockSignals(blocked)
+        if chosen >= 0 and self._wanted is not None:
+            self._wanted = None
+            self.open_run(summaries[chosen].path)
+
+    def _listed(self) -> None:
+        self._listing = None
+        if self._again:
+            self._again = False
+            self.read_folder()
+
+    def _run_finished(self, _path: Path) -> None:
+        self._rest.start()
+
+    def _row_chosen(self, row: int) -> None:
+        if 0 <= row < len(self.summaries) and not self.run.is_running:
+            found = self.summaries[row]
+            if found.condition is None:
+                self._close_run(f"{found.path}: {found.problem}")
+            else:
+                self.open_run(found.path)
+
+    def _close_run(self, why: str) -> None:
+        self.opened = None
+        self.view.clear()
+        self.slider.setEnabled(False)
+        self.frame_words.clear()
+        self.about.setPlainText(why)
+        self.bar.set_startable("No run is open.")
+        self.folder_button.setEnabled(False)
+
+    def _show_frame(self, number: int) -> None:
+        run = self.opened
+        stored = sorted(run.records) if run is not None else []
+        if run is None or not stored:
+            self.view.clear()
+            self.frame_words.setText("No frames." if run is not None else "")
+            return
+        index = stored[min(number, len(stored) - 1)]
+        try:
+            image, metadata = run.frame(index), run.metadata(index)
+        except Exception as error:  # noqa: BLE001 - a damaged file is told, whatever it raises
+            self.frame_words.setText(str(error))
+            return
+        low, high = np.percentile(image[::4, ::4], _LEVELS)
+        full_scale = (1 << metadata.significant_bits) - 1
+        self.view.show_image(image, float(low), float(max(high, low + 1)), full_scale)
+        words = [
+            f"Frame {index} of {run.n_frames}",
+            f"{metadata.exposure_ms:.4g} ms",
+            metadata.led_pattern or "",
+        ]
+        place = ", ".join(f"{axis} {value:g}" for axis, value in (metadata.stage_position or {}).items())
+        self.frame_words.setText(", ".join(word for word in (*words, place) if word))
+
+    def _open_folder(self) -> None:
+        if self.opened is not None:
+            QDesktopServices.openUrl(QUrl.fromLocalFile(str(self.opened.path)))
+
+    def _succeeded(self, outcome: Outcome) -> None:
+        self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
+        for line in outcome.verdict:
+            self.session.log("info" if outcome.good else "warning", line)
+
+    def _ended_early(self, ended: Ended) -> None:
+        self.session.log("warning", ended.words)
+
+    def _over(self) -> None:
+        self.bar.set_running(False)
+        self.table.setEnabled(True)
+        if self.opened is not None:
+            self._wanted = self.opened.path
+        self.read_folder()
+
+
+def _lacks_calibration(run: Path) -> bool:
+    return is_sweep(run) and not (run / FOLDER).exists()
+
+
+def _about(run: Run) -> list[str]:
+    """Return what is known of a run, a line each."""
+    lines = [str(run.path), f"{run.condition}: {len(run.records)} of {run.n_frames} frames"]
+    lines[1] += "  SIMULATED" if run.is_simulated else ""
+    if run.error:
+        lines.append(run.error)
+    if run.plan is not None:
+        parts: dict[str, int] = {}
+        for part in run.plan.parts:
+            parts[part.label] = parts.get(part.label, 0) + len(part)
+        lines.append(f"Plan {run.plan.label}: " + ", ".join(f"{n} {label}" for label, n in parts.items()))
+    devices = run.provenance.get("devices")
+    if isinstance(devices, Mapping):
+        lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
+    if is_sweep(run.path):
+        lines += _calibration_lines(run.path)
+    return lines
+
+
+def _calibration_lines(run: Path) -> list[str]:
+    file = run / FOLDER / "calibration.json"
+    if not file.is_file():
+        return ["A sweep without its calibration: Resume makes it."]
+    try:
+        quality: dict[str, Any] = json.loads(file.read_text("utf-8"))["quality"]
+        psfs = quality["psfs"]
+        found = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
+        verdict = "good" if quality["good"] else "with findings"
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return [f"Calibration {file.parent} cannot be read: {error!r}"]
+    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *found]

@@ -1,0 +1,151 @@
+"""Calibration routines and plans: form, planned path, progress, last frame, quality per PSF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QPixmap
+from PySide6.QtWidgets import QLabel, QSplitter, QTabWidget, QVBoxLayout, QWidget
+
+from calibration_routines import SweepCalibration
+from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.sweep_watch import PointTaken
+from gui.forms.routines import ROUTINES
+from gui.procedure_panel import ProcedurePanel
+from gui.procedure_run import Situation
+from gui.session import BenchSession
+from gui.widgets.image_view import ImageView
+from gui.widgets.path_plot import PathPlot
+from gui.widgets.picture import Picture
+from gui.widgets.psf_table import PsfTable
+from instrument.errors import FileError
+from instrument.photograph import Snapshot
+from instrument.plan.file import load_plan, plan_toml
+
+Image = npt.NDArray[Any]
+_LEVELS = (0.1, 99.9)
+"""Percentiles that frames are stretched to."""
+
+
+class SweepsPanel(ProcedurePanel):
+    """Sweeps and plans."""
+
+    title = "Sweeps"
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        self.path = PathPlot()
+        self.frame = ImageView()
+        self.frame_words = QLabel("No frame yet.")
+        self.frame_words.setObjectName("dim")
+        self.psfs = PsfTable()
+        self.picture = Picture()
+        super().__init__(session, ROUTINES, "Start", parent)
+        shown = QWidget()
+        column = QVBoxLayout(shown)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.addWidget(self.frame, 1)
+        column.addWidget(self.frame_words)
+        self.tabs = QTabWidget()
+        self.tabs.setDocumentMode(True)
+        self.tabs.addTab(self.psfs, "Quality of PSFs")
+        self.tabs.addTab(self.picture, "Result")
+        below = QSplitter()
+        below.addWidget(shown)
+        below.addWidget(self.tabs)
+        below.setSizes([420, 560])
+        split = QSplitter(Qt.Orientation.Vertical)
+        split.addWidget(self.path)
+        split.addWidget(below)
+        split.setSizes([300, 460])
+        split.setChildrenCollapsible(False)
+        layout = QVBoxLayout(self.right)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(split)
+        self._shown: Snapshot | None = None
+        self._images: dict[int, Image] = {}
+        self.run.judged.connect(self._heard)
+        self.psfs.chosen.connect(self._show_psf)
+        self.views["plan"].changed.connect(self._read_plan)
+        self._plan_file: Path | None = None
+
+    def show_outlook(self, outlook: Outlook) -> None:
+        """Draw the path besides the words."""
+        super().show_outlook(outlook)
+        self.path.show_path(outlook.path)
+
+    def began(self) -> None:
+        """Clear the last sweep."""
+        self.psfs.clear()
+        self.picture.clear()
+        self._images = {}
+        self.tabs.setCurrentWidget(self.psfs)
+
+    def looked(self, now: Situation) -> None:
+        """Show the newest frame and where the run is."""
+        self.path.show_now(now.place)
+        if now.newest is not None and now.newest is not self._shown:
+            self._shown = now.newest
+            self._show_frame(now.newest)
+
+    def finished(self, outcome: Outcome) -> None:
+        """Show the last judgement, or the routine's picture."""
+        if isinstance(outcome.result, SweepCalibration):
+            self.psfs.show_all(outcome.result.quality)
+        pictures = [file for file in outcome.files if file.suffix == ".png"]
+        if pictures:
+            self.picture.show_pixmap(QPixmap(str(pictures[0])))
+            self.tabs.setCurrentWidget(self.picture)
+
+    def theme_changed(self) -> None:
+        """Restyle the plots."""
+        self.path.restyle()
+        self.psfs.restyle()
+
+    def _heard(self, event: object) -> None:
+        if isinstance(event, PointTaken):
+            self._images[event.number - 1] = event.image
+            self.psfs.arrived(event)
+
+    def _show_psf(self, row: int) -> None:
+        quality = self.psfs.qualities[row] if 0 <= row < len(self.psfs.qualities) else None
+        if quality is None or row not in self._images:
+            return
+        self._show_image(self._images[row])
+        x_mm, y_mm, z_mm = (value / 1e3 for value in quality.source_um)
+        self.frame_words.setText(
+            f"PSF {row + 1} at ({x_mm:.4g}, {y_mm:.4g}, {z_mm:.4g}) mm, dark frame taken off"
+        )
+
+    def _show_frame(self, newest: Snapshot) -> None:
+        metadata = newest.metadata
+        full_scale = (1 << metadata.significant_bits) - 1
+        self._show_image(newest.image, full_scale)
+        words = [f"Last frame: {metadata.exposure_ms:.4g} ms", f"light {metadata.led_pattern or 'unknown'}"]
+        if metadata.saturated_fraction:
+            words.append(f"SATURATED {metadata.saturated_fraction:.2%}")
+        self.frame_words.setText(", ".join(words))
+
+    def _show_image(self, image: Image, full_scale: int | None = None) -> None:
+        low, high = np.percentile(image[::4, ::4], _LEVELS)
+        self.frame.show_image(image, float(low), float(max(high, low + 1)), full_scale)
+
+    def _read_plan(self) -> None:
+        """Show the plan of a file that was chosen."""
+        view = self.views["plan"]
+        values = view.values()
+        file = None if values is None else values["file"]
+        if file == self._plan_file:
+            return
+        self._plan_file = file
+        if file is None or not file.is_file():
+            return
+        try:
+            text = file.read_text() if file.suffix == ".toml" else plan_toml(load_plan(file))
+        except (FileError, UnicodeDecodeError, OSError) as error:
+            view.refuse("file", str(error))
+            return
+        view.set_values({"text": text})

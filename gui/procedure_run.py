@@ -1,0 +1,261 @@
+"""A procedure that is carried out for a panel: started, paused, ended, and looked at by a timer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from PySide6.QtCore import QObject, QTimer, Signal
+
+from calibration_routines.axial_exposure import SweepExposures
+from calibration_routines.errors import RunEndedError
+from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
+from calibration_routines.spot_camera import SpotLook
+from calibration_routines.sweep_watch import SweepEvent
+from calibration_routines.sweep_words import event_lines, exposure_lines
+from gui.jobs import Job, JobContext
+from gui.session import BenchSession
+from instrument.photograph import Snapshot
+from instrument.run_control import EndedEarlyError, RunControl
+from instrument.runner import RunState, RunStatus
+
+_LOOK_MS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """How a procedure goes on, to be shown.
+
+    Attributes
+    ----------
+    step : str
+        What it does now.
+    done, total : float
+        Of the step; total 0: not known.
+    seconds, seconds_left : float
+        Of the step; None: not known.
+    paused : bool
+        Whether it really waits.
+    newest : Snapshot or None
+        The last frame.
+    place : mapping or None
+        Where the source (``x_um``, ``y_um``, ``z_um``) or the stage is, as planned.
+    """
+
+    step: str = ""
+    done: float = 0.0
+    total: float = 0.0
+    seconds: float = 0.0
+    seconds_left: float | None = None
+    paused: bool = False
+    newest: Snapshot | None = None
+    place: Mapping[str, float] | None = None
+
+
+class _Heard(Listener):
+    """Keeps the newest situation, in the job's thread, and what must not get lost until it is fetched."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._situation = Situation()
+        self._began_s = time.monotonic()
+        self._lines: list[str] = []
+        self._events: list[SweepEvent] = []
+        self._looks: list[SpotLook] = []
+
+    # In the job's thread -------------------------------------------------------------------------
+    def step(self, words: str) -> None:
+        with self._lock:
+            self._began_s = time.monotonic()
+            self._situation = Situation(step=words, newest=self._situation.newest)
+
+    def share(self, done: float, total: float) -> None:
+        seconds = time.monotonic() - self._began_s
+        left = seconds * (total - done) / done if done > 0 else None
+        with self._lock:
+            self._situation = replace(
+                self._situation, done=done, total=total, seconds=seconds, seconds_left=left
+            )
+
+    def said(self, words: str) -> None:
+        with self._lock:
+            self._lines.append(words)
+
+    def exposures(self, found: SweepExposures) -> None:
+        with self._lock:
+            self._lines += exposure_lines(found)
+
+    def frame(self, status: RunStatus) -> None:
+        with self._lock:
+            self._situation = replace(
+                self._situation,
+                done=status.done,
+                total=status.total,
+                seconds=status.seconds,
+                seconds_left=status.seconds_left,
+                paused=status.state is RunState.PAUSED,
+                newest=status.newest or self._situation.newest,
+                place=None if status.step is None else place_of(status.step),
+            )
+
+    def event(self, event: SweepEvent) -> None:
+        with self._lock:
+            self._events.append(event)
+            self._lines += event_lines(event)
+
+    def look(self, look: SpotLook) -> None:
+        with self._lock:
+            self._looks.append(look)
+
+    # In the window's thread ----------------------------------------------------------------------
+    @property
+    def situation(self) -> Situation:
+        with self._lock:
+            return self._situation
+
+    def fetch(self) -> tuple[list[str], list[SweepEvent], list[SpotLook]]:
+        with self._lock:
+            fetched = self._lines, self._events, self._looks
+            self._lines, self._events, self._looks = [], [], []
+        return fetched
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A procedure that was aborted or stopped.
+
+    Attributes
+    ----------
+    words : str
+        What is left, in words.
+    run : Path or None
+        A run that can go on.
+    """
+
+    words: str
+    run: Path | None = None
+
+
+class ProcedureRun(QObject):
+    """Carries out one procedure after the other on a session's bench; all signals in the window's thread.
+
+    Signals
+    -------
+    began
+    looked : Situation
+        Ten times a second while it goes on, and once at its end.
+    said : str
+        A line for people.
+    judged : PointTaken or SourceVisit
+    look : SpotLook
+    succeeded : Outcome
+    ended_early : Ended
+        Somebody aborted or stopped it.
+    failed : str
+    over
+        After one of these three.
+    """
+
+    began = Signal()
+    looked = Signal(object)
+    said = Signal(str)
+    judged = Signal(object)
+    look = Signal(object)
+    succeeded = Signal(object)
+    ended_early = Signal(object)
+    failed = Signal(str)
+    over = Signal()
+
+    def __init__(self, session: BenchSession, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._session = session
+        self._job: Job | None = None
+        self._control = RunControl()
+        self._heard = _Heard()
+        self._timer = QTimer(self)
+        self._timer.setInterval(_LOOK_MS)
+        self._timer.timeout.connect(self._look)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a procedure goes on."""
+        return self._job is not None
+
+    @property
+    def is_pausing(self) -> bool:
+        """Whether it is paused or will be before its next step."""
+        return self._control.is_pausing
+
+    def start(self, title: str, procedure: Procedure) -> None:
+        """Carry out a procedure.
+
+        Raises
+        ------
+        BusyError
+            When something else holds the bench.
+        """
+        control, heard, bench = RunControl(), _Heard(), self._session.bench
+
+        def work(context: JobContext) -> Outcome | Ended:
+            context.on_cancel(lambda: threading.Thread(target=control.stop, name="STOP").start())
+            try:
+                return procedure.carry_out(bench, control=control, listener=heard)
+            except RunEndedError as error:
+                return Ended(str(error), error.run.path)
+            except EndedEarlyError as error:
+                return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
+
+        self._job = self._session.exclusive_job(title, work)
+        self._control, self._heard = control, heard
+        self._job.succeeded.connect(self._succeeded)
+        self._job.failed.connect(self.failed)
+        self._job.cancelled.connect(lambda words: self.ended_early.emit(Ended(words)))
+        self._job.ended.connect(self._over)
+        self._timer.start()
+        self.began.emit()
+
+    def pause(self) -> None:
+        """Wait before the next step, light off."""
+        self._control.pause()
+
+    def resume(self) -> None:
+        """Go on."""
+        self._control.resume()
+
+    def abort(self) -> None:
+        """End before the next step."""
+        self._control.abort()
+
+    def shutdown(self) -> None:
+        """End the timer."""
+        self._timer.stop()
+
+    def _look(self) -> None:
+        lines, events, looks = self._heard.fetch()
+        for line in lines:
+            self.said.emit(line)
+        for event in events:
+            self.judged.emit(event)
+        for look in looks:
+            self.look.emit(look)
+        self.looked.emit(self._heard.situation)
+
+    def _succeeded(self, result: Outcome | Ended) -> None:
+        self._look()
+        if isinstance(result, Ended):
+            self.ended_early.emit(result)
+            if result.run is not None:
+                self._session.run_finished.emit(result.run)
+            return
+        for path in dict.fromkeys((*result.runs, *([result.calibration] if result.calibration else []))):
+            self._session.run_finished.emit(path)
+        self.succeeded.emit(result)
+
+    def _over(self) -> None:
+        self._look()
+        self._timer.stop()
+        self._job = None
+        self.over.emit()

@@ -1,0 +1,107 @@
+"""Forms: what they make, what they refuse and where, and that their Python really runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibration_routines.plan_procedures import PlanProcedure
+from calibration_routines.sweep_procedure import SweepProcedure
+from calibration_routines.sweep_request import AxialRequest
+from gui.forms.alignment import ALIGNMENT
+from gui.forms.as_python import script
+from gui.forms.routines import AXIAL, BEADS, LATERAL, PLAN, ROUTINES
+from instrument.errors import BenchError, SettingsError
+
+Z = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3}
+
+
+def values_of(form: Any, **changed: Any) -> dict[str, Any]:
+    values = form.defaults()
+    return {name: Z.get(name, value) if value is None else value for name, value in values.items()} | changed
+
+
+@pytest.mark.parametrize("form", [*ROUTINES, ALIGNMENT], ids=lambda form: form.name)
+def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
+    procedure = form.make(values_of(form))
+    assert procedure == form.make(values_of(form))
+    for field in form.fields:
+        assert field.label
+        assert field.tip
+        assert field.default is not None or field.optional or field.name in Z
+    compile(script(procedure, None), form.name, "exec")
+
+
+def test_settings_reach_the_request_in_its_units() -> None:
+    procedure = AXIAL.make(values_of(AXIAL, planes=3, average=2))
+    assert procedure == SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=150e3, planes=3, average=2))
+
+
+@pytest.mark.parametrize(
+    ("form", "changed", "field"),
+    [
+        (LATERAL, {"target": 3.0}, "target"),
+        (LATERAL, {"half_field_y_um": 1e3}, "half_field_x_um"),
+        (BEADS, {"images": 1}, "images"),
+        (BEADS, {"rank": 0}, "rank"),
+        (PLAN, {"text": "label = "}, "text"),
+    ],
+)
+def test_a_mistake_names_its_field(form: Any, changed: dict[str, Any], field: str) -> None:
+    with pytest.raises(SettingsError) as refused:
+        form.make(values_of(form, **changed))
+    assert [name for name, _ in refused.value.problems] == [field]
+
+
+def test_the_example_plan_is_a_plan_and_a_wrong_one_is_refused_in_words() -> None:
+    procedure = PLAN.make(PLAN.defaults())
+    assert isinstance(procedure, PlanProcedure)
+    assert len(procedure.plan) > 0
+    with pytest.raises(BenchError, match="parts"):
+        PLAN.make(PLAN.defaults() | {"text": 'label = "empty"'})
+
+
+BENCH = """
+[bench]
+data_folder = "runs"
+[camera]
+driver = "simulated"
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+"""
+POINT = """
+label = "two places"
+[[parts]]
+label = "psf"
+light = "source"
+positions = { kind = "points", points_um = [[0, 0, 8e4], [0, 0, 9e4]] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("form", "changed"),
+    [
+        (AXIAL, {"planes": 2, "average": 1, "dark_frames": 1}),
+        (PLAN, {"text": POINT}),
+    ],
+    ids=["axial", "plan"],
+)
+def test_the_python_of_a_form_runs(
+    form: Any, changed: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = tmp_path / "bench.toml"
+    bench.write_text(BENCH)
+    lines = script(form.make(values_of(form, **changed)), bench)
+    names: dict[str, Any] = {}
+    exec(lines, names)
+    assert names["done"].runs[0].parent == tmp_path / "runs"
+    assert names["done"].verdict[0] in capsys.readouterr().out
