@@ -14,6 +14,7 @@ from calibration_routines.procedure import Listener, Outcome, Outlook, home_if_n
 from calibration_routines.slm_calibration import SlmCalibration, measure_flatness, measure_look_up_table
 from drivers.slm import Slm
 from instrument.alignment_file import Alignment, load_alignment, save_alignment
+from instrument.atomic import check_writable
 from instrument.bench import Bench
 from instrument.display_setup import bench_display
 from instrument.errors import BenchError, FileError, SettingsError
@@ -74,6 +75,7 @@ class SlmProcedure:
         """Measure, and save what ``align mask`` and ``show`` take."""
         heard, slm = listener or Listener(), _require_slm(bench)
         refuse_existing(self.out, overwrite=self.overwrite)
+        out = _writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
         io = DisplayBench(bench, bench.config.display.slm_binning)
         with under_control(bench, control) as control:
@@ -90,7 +92,6 @@ class SlmProcedure:
                 display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
                 found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=tell)
             bench.safe_state()
-        out = self.out or _dated(bench, folder, "slm calibration")
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)
         return Outcome(
@@ -162,6 +163,7 @@ class AlignmentProcedure:
         """Align, and save the alignment with its picture."""
         heard, slm, settings = listener or Listener(), _require_slm(bench), self.settings
         self._refuse_existing()
+        out = _writable(bench, folder, self.out, "alignment")
         correction = load_slm_correction(self.slm_calibration) if self.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
         io = DisplayBench(bench, bench.config.display.slm_binning, correction)
@@ -178,7 +180,6 @@ class AlignmentProcedure:
             report = MaskAlignment(io, display, settings, progress=tell, on_look=heard.look).run()
             alignment = _alignment(report, bench, display.mask.shape)
             bench.safe_state()
-        out = self.out or _dated(bench, folder, "alignment")
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
         from instrument.alignment_figure import write_alignment_figure  # matplotlib, only where it is drawn
@@ -273,5 +274,11 @@ def refuse_existing(file: Path | None, *, overwrite: bool) -> None:
         raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
 
 
-def _dated(bench: Bench, folder: Path | None, label: str) -> Path:
-    return free_name(folder or bench.config.data_folder, dated_name(label), ".json")
+def _writable(bench: Bench, folder: Path | None, out: Path | None, label: str) -> Path:
+    """Return the file to write in the end, by default one with a date, sure now that it can be written."""
+    if out is None:
+        where = folder or bench.config.data_folder
+        where.mkdir(parents=True, exist_ok=True)
+        out = free_name(where, dated_name(label), ".json")
+    check_writable(out)
+    return out

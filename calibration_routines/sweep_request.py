@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +42,9 @@ class _Taking:
     binning: int = 1
     x_um: float = 0.0
     y_um: float = 0.0
+
+    def _lateral(self) -> dict[str, tuple[int, float]]:
+        return {"x_um": (0, self.x_um), "y_um": (1, self.y_um)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +102,9 @@ class AxialRequest(_Taking):
             by_hand=self.by_hand,
             reference_every=self.reference_every,
         )
+        if not self.by_hand:
+            far = {} if self.z_max_um is None else {"z_max_um": (2, self.z_max_um)}
+            _require_reach(bench, {"z_min_um": (2, self.z_min_um), **far, **self._lateral()})
         return PlannedSweep(sweep, reasons)
 
 
@@ -193,6 +200,7 @@ class LateralRequest(_GridRequest):
         if not 0 < self.z_um < np.inf:
             words = f"a depth must be a finite number above 0 mm, not {self.z_um / 1e3:g}"
             raise SettingsError([("z_um", words)])
+        _require_reach(bench, {"z_um": (2, self.z_um), **self._lateral()})
         grid = self._grid(bench, (self.z_um,))
         return PlannedSweep(self._sweep("lateral", grid.points_um), _said(grid))
 
@@ -218,6 +226,7 @@ class VolumeRequest(_GridRequest):
                 f"{far_um / 1e3:g} mm"
             )
             raise SettingsError([("z_max_um" if not in_order else "planes", words)])
+        _require_reach(bench, {"z_min_um": (2, near_um), "z_max_um": (2, far_um), **self._lateral()})
         reasons: tuple[str, ...] = ()
         if planes is None:
             planes, reasons = _planes(bench, near_um, far_um, self.lenslet_um, self.wavelength_nm)
@@ -227,6 +236,33 @@ class VolumeRequest(_GridRequest):
 
 
 SweepRequest = AxialRequest | LateralRequest | VolumeRequest
+
+
+def _require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:
+    """Refuse settings that put the source beyond the stage's travel.
+
+    Parameters
+    ----------
+    bench : Bench
+    places : mapping
+        Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
+    """
+    if bench.stage is None:
+        return  # what needs one says so
+    problems = []
+    for name, (axis, place_um) in places.items():
+        limits = bench.stage.limits.get(f"{'xyz'[axis]}_um")
+        if limits is None:
+            continue
+        low_mm, high_mm = ((end + bench.config.source.offset_um[axis]) / 1e3 for end in limits)
+        if not low_mm <= place_um / 1e3 <= high_mm:
+            words = (
+                f"{'xyz'[axis]} = {place_um / 1e3:g} mm is outside the stage's limits, {low_mm:g} to "
+                f"{high_mm:g} mm"
+            )
+            problems.append((name, words))
+    if problems:
+        raise SettingsError(problems)
 
 
 def reachable_depths_um(bench: Bench) -> tuple[float, float]:

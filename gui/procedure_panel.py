@@ -192,8 +192,9 @@ class ProcedurePanel(Panel):
     def show_problem(self, error: BenchError) -> None:
         """Show a mistake: at the fields that it names, and below the form."""
         if isinstance(error, SettingsError):
-            for name, why in error.problems:
-                self.view.refuse(name, why)
+            refused = [name for name, why in error.problems if self.view.refuse(name, why)]
+            if refused:
+                self.view.show_field(refused[0])
         self._say(str(error), wrong=True)
 
     def show_outlook(self, outlook: Outlook) -> None:

@@ -211,8 +211,8 @@ class ProcedureRun(QObject):
         self._job = self._session.exclusive_job(title, work)
         self._control, self._heard = control, heard
         self._job.succeeded.connect(self._succeeded)
-        self._job.failed.connect(self.failed)
-        self._job.cancelled.connect(lambda words: self.ended_early.emit(Ended(words)))
+        self._job.failed.connect(self._failed)
+        self._job.cancelled.connect(self._cancelled)
         self._job.ended.connect(self._over)
         self._timer.start()
         self.began.emit()
@@ -254,8 +254,15 @@ class ProcedureRun(QObject):
             self._session.run_finished.emit(path)
         self.succeeded.emit(result)
 
-    def _over(self) -> None:
+    def _failed(self, why: str) -> None:
         self._look()
+        self.failed.emit(why)
+
+    def _cancelled(self, words: str) -> None:
+        self._look()
+        self.ended_early.emit(Ended(words))
+
+    def _over(self) -> None:
         self._timer.stop()
         self._job = None
         self.over.emit()

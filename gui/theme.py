@@ -119,6 +119,7 @@ QLineEdit:focus, QComboBox:focus, QPlainTextEdit:focus, QListView:focus {{ borde
 QComboBox::drop-down {{ border: none; width: 18px; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 *[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
+QLabel#reason {{ color: {c.error}; font-size: 9pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
 QLabel[role="value"] {{ color: {c.text}; font-weight: 600; }}

@@ -12,6 +12,7 @@ from PySide6.QtWidgets import (
     QHBoxLayout,
     QLabel,
     QPushButton,
+    QSizePolicy,
     QSplitter,
     QTabWidget,
     QVBoxLayout,
@@ -49,6 +50,7 @@ class AlignmentPanel(ProcedurePanel):
         self.spots = ImageView()
         self.spot_words = QLabel("No picture yet.")
         self.spot_words.setObjectName("dim")
+        self.spot_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self.score: Any = plot_widget("hypothesis", "spot / ideal")
         self.progress: Any = plot_widget("frames with spots", "brightest spot / ideal")
         self.before = DisplacementPlot("Before")
@@ -134,10 +136,10 @@ class AlignmentPanel(ProcedurePanel):
         self.tabs.setDocumentMode(True)
         self.tabs.addTab(search, "Score against hypothesis")
         self.tabs.addTab(found, "Displacement and pose")
-        split = QSplitter(Qt.Orientation.Vertical)
+        split = QSplitter()
         split.addWidget(picture)
         split.addWidget(self.tabs)
-        split.setSizes([340, 420])
+        split.setSizes([480, 620])
         split.setChildrenCollapsible(False)
         return split
 

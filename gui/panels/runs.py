@@ -16,6 +16,7 @@ from PySide6.QtWidgets import (
     QLabel,
     QPlainTextEdit,
     QPushButton,
+    QSizePolicy,
     QSlider,
     QSplitter,
     QTableWidget,
@@ -202,6 +203,7 @@ class RunsPanel(Panel):
         self.slider.valueChanged.connect(self._show_frame)
         self.frame_words = QLabel()
         self.frame_words.setObjectName("dim")
+        self.frame_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self.about = QPlainTextEdit()
         self.about.setReadOnly(True)
         self.about.setPlainText("Click a run to open it.")

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QPixmap
-from PySide6.QtWidgets import QLabel, QSplitter, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxLayout, QWidget
 
 from calibration_routines import SweepCalibration
 from calibration_routines.procedure import Outcome, Outlook
@@ -22,7 +22,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.path_plot import PathPlot
 from gui.widgets.picture import Picture
 from gui.widgets.psf_table import PsfTable
-from instrument.errors import FileError
+from instrument.errors import BenchError, FileError
 from instrument.photograph import Snapshot
 from instrument.plan.file import load_plan, plan_toml
 
@@ -41,6 +41,7 @@ class SweepsPanel(ProcedurePanel):
         self.frame = ImageView()
         self.frame_words = QLabel("No frame yet.")
         self.frame_words.setObjectName("dim")
+        self.frame_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self.psfs = PsfTable()
         self.picture = Picture()
         super().__init__(session, ROUTINES, "Start", parent)
@@ -76,6 +77,11 @@ class SweepsPanel(ProcedurePanel):
         """Draw the path besides the words."""
         super().show_outlook(outlook)
         self.path.show_path(outlook.path)
+
+    def show_problem(self, error: BenchError) -> None:
+        """Take the path away besides saying why."""
+        super().show_problem(error)
+        self.path.clear("No path: this cannot be carried out as it stands.")
 
     def began(self) -> None:
         """Clear the last sweep."""

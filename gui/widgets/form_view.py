@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QSignalBlocker, Signal
+from PySide6.QtCore import QSignalBlocker, QTimer, Signal
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import (
     QCheckBox,
@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
     QLineEdit,
     QPlainTextEdit,
     QPushButton,
+    QScrollArea,
     QToolButton,
     QVBoxLayout,
     QWidget,
@@ -51,6 +52,7 @@ class FormView(QWidget):
         self.form = form
         self.widgets: dict[str, QWidget] = {}
         self._reasons: dict[str, QLabel] = {}
+        self._state: list[tuple[Any, str]] = []
         usual, seldom = self._rows(advanced=False), self._rows(advanced=True)
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
@@ -67,6 +69,7 @@ class FormView(QWidget):
             layout.addWidget(self.more)
             layout.addWidget(box)
         layout.addStretch(1)
+        self._state = [self._read(field) for field in form.fields]
 
     # Values --------------------------------------------------------------------------------------
     def values(self) -> dict[str, Any] | None:
@@ -87,6 +90,7 @@ class FormView(QWidget):
         for field in self.form.fields:
             if field.name in values:
                 self._show(field, values[field.name])
+        self._edited()
 
     def begin_with(self, values: Mapping[str, Any]) -> None:
         """Show settings in the fields that are empty."""
@@ -108,6 +112,18 @@ class FormView(QWidget):
         reason.show()
         _mark(widget, refused=True)
         return True
+
+    def show_field(self, name: str) -> None:
+        """Bring a field into sight, also from among those that seldom change."""
+        if any(field.name == name and field.advanced for field in self.form.fields):
+            self.more.setChecked(True)
+        scroll = self.parent()
+        while scroll is not None and not isinstance(scroll, QScrollArea):
+            scroll = scroll.parent()
+        if scroll is not None:
+            # After the layout has made room for the reason.
+            reason = self._reasons[name]
+            QTimer.singleShot(0, reason, lambda: scroll.ensureWidgetVisible(reason))
 
     def clear_reasons(self) -> None:
         """Take all reasons away."""
@@ -155,19 +171,19 @@ class FormView(QWidget):
             number = NumberEdit(
                 field.unit, integer=field.kind == "whole", tip=field.tip, empty=field.optional
             )
-            number.textEdited.connect(lambda _: self.changed.emit())
-            number.submitted.connect(lambda _: self.changed.emit())
+            number.textEdited.connect(self._edited)
+            number.submitted.connect(self._edited)
             return number, number
         if field.kind == "switch":
             box = QCheckBox()
             box.setToolTip(field.tip)
-            box.toggled.connect(lambda _: self.changed.emit())
+            box.toggled.connect(self._edited)
             return box, box
         if field.kind == "choice":
             choice = QComboBox()
             choice.addItems(list(field.choices))
             choice.setToolTip(field.tip)
-            choice.currentIndexChanged.connect(lambda _: self.changed.emit())
+            choice.currentIndexChanged.connect(self._edited)
             return choice, choice
         if field.kind == "text":
             text = QPlainTextEdit()
@@ -176,12 +192,12 @@ class FormView(QWidget):
             text.setMinimumHeight(_TEXT_HEIGHT_PX)
             text.setToolTip(field.tip)
             text.setTabChangesFocus(True)
-            text.textChanged.connect(self.changed.emit)
+            text.textChanged.connect(self._edited)
             return text, text
         line = QLineEdit()
         line.setPlaceholderText(field.optional)
         line.setToolTip(field.tip)
-        line.textChanged.connect(lambda _: self.changed.emit())
+        line.textChanged.connect(self._edited)
         browse = QPushButton("…")
         browse.setToolTip(f"Choose: {field.tip}")
         browse.setAccessibleName(f"Choose {field.label}")
@@ -193,6 +209,13 @@ class FormView(QWidget):
         inner.addWidget(line, 1)
         inner.addWidget(browse)
         return line, row
+
+    def _edited(self, _value: object = None) -> None:
+        """Tell of a change; a field that is merely left, and shows its number anew, has not changed."""
+        state = [self._read(field) for field in self.form.fields]
+        if state != self._state:
+            self._state = state
+            self.changed.emit()
 
     def _browse(self, field: Field, line: QLineEdit) -> None:
         name, _ = QFileDialog.getOpenFileName(self, field.label, line.text())

@@ -56,6 +56,11 @@ class PathPlot(QWidget):
         for view in self.views:
             view.draw(places)
 
+    def clear(self, words: str) -> None:
+        """Show no path, and why."""
+        self.show_path(())
+        self.nothing.setText(words)
+
     def show_now(self, place: Place | None) -> None:
         """Mark where the run is."""
         for view in self.views:

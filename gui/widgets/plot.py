@@ -25,6 +25,8 @@ def plot_widget(
     plot.setLabel("left", _label(y_label, y_unit))
     plot.showGrid(x=grid, y=grid, alpha=0.15)
     plot.setMenuEnabled(False)
+    for axis in ("bottom", "left"):
+        plot.getAxis(axis).enableAutoSIPrefix(False)  # units are in the labels as people here say them
     return plot
 
 

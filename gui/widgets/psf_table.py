@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ _COLUMNS = (
     ("off (px)", "Distance from where the others, or the stage, say the pattern is"),
     ("verdict", "What is wrong; the whole text as tool tip"),
 )
+_LEAST_SHOWN = 0.1
+"""Signal to noise has a logarithmic axis."""
 _VERDICT = len(_COLUMNS) - 1
 
 
@@ -120,11 +123,13 @@ class PsfTable(QWidget):
             self.table.setItem(row, column, item)
 
     def _draw(self) -> None:
-        known = [(row + 1, q) for row, q in enumerate(self._qualities) if q is not None]
+        # A single frame without noise has no figure.
+        known = [(row + 1, q) for row, q in enumerate(self._qualities) if q is not None and isfinite(q.snr)]
+        self.plot.setVisible(bool(known))
         brushes = [pg.mkBrush(colours().warning if q.findings else colours().ok) for _, q in known]
         self._points.setData(
             [number for number, _ in known],
-            [min(max(q.snr, 0.1), 1e6) for _, q in known],
+            [max(q.snr, _LEAST_SHOWN) for _, q in known],
             pen=pg.mkPen(colours().line),
             symbol="o",
             symbolSize=7,

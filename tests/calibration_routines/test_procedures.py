@@ -118,9 +118,14 @@ def test_a_mistake_names_its_setting(
     assert field in [name for name, _ in refused.value.problems]
 
 
-def test_what_leaves_the_stage_is_refused_by_the_plan(bench: Bench) -> None:
-    with pytest.raises(PlanError, match="outside the stage's limits"):
+def test_what_leaves_the_stage_is_refused(bench: Bench) -> None:
+    with pytest.raises(SettingsError, match="z = 900 mm is outside the stage's limits") as refused:
         SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=9e5, planes=3)).outlook(bench)
+    assert [name for name, _ in refused.value.problems] == ["z_max_um"]
+    with pytest.raises(PlanError, match="outside the stage's limits"):
+        SweepProcedure(
+            LateralRequest(z_um=1e5, half_field_x_um=1e6, half_field_y_um=0, spacing_um=5e5)
+        ).outlook(bench)
 
 
 def test_abort_between_two_frames_keeps_them_and_resume_makes_the_calibration(

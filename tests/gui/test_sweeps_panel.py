@@ -1,0 +1,267 @@
+"""Sweeps, plans and past runs by real clicks and keys on the simulated bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtWidgets import QMessageBox, QWidget
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.runs import RunsPanel
+from gui.panels.sweeps import SweepsPanel
+from instrument.store import Run, RunCondition
+
+LEFT = Qt.MouseButton.LeftButton
+WAIT_MS = 60_000
+
+
+@pytest.fixture
+def bench_text() -> str:
+    """A bench whose sweeps take a second or two: long enough to be paused and stopped."""
+    return """
+[bench]
+name = "test bench"
+data_folder = "runs"
+[camera]
+driver = "simulated"
+exposure_ms = 2.0
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+leds = 89
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0.1
+"""
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, window: MainWindow) -> SweepsPanel:
+    panel = window.show_panel("sweeps")
+    assert isinstance(panel, SweepsPanel)
+    qtbot.waitUntil(lambda: panel.outlook is not None, timeout=WAIT_MS)
+    return panel
+
+
+def enter(qtbot: QtBot, panel: SweepsPanel, **numbers: str) -> None:
+    """Type numbers into fields, as a person does, and wait until the form was checked."""
+    for name, text in numbers.items():
+        field: Any = panel.view.widgets[name]
+        if not field.isVisible():
+            qtbot.mouseClick(panel.view.more, LEFT)
+        qtbot.mouseClick(field, LEFT)
+        field.selectAll()
+        qtbot.keyClicks(field, text)
+    wait_for_check(qtbot, panel)
+
+
+def wait_for_check(qtbot: QtBot, panel: SweepsPanel) -> None:
+    qtbot.wait(1)
+    qtbot.waitUntil(lambda: not panel._rest.isActive() and panel._check_job is None, timeout=WAIT_MS)
+
+
+def press(qtbot: QtBot, button: Any) -> None:
+    assert button.isEnabled(), button.toolTip()
+    qtbot.mouseClick(button, LEFT)
+
+
+def run_of(folder: Path) -> Run:
+    (path,) = folder.glob("*_axial-sweep")
+    return Run.open(path)
+
+
+def test_a_form_begins_with_depths_that_the_stage_reaches_and_draws_them(
+    qtbot: QtBot, panel: SweepsPanel
+) -> None:
+    assert panel.run_bar.start_button.isEnabled()
+    assert panel.outlook is not None
+    assert panel.outlook.cost is not None
+    words = panel.verdict.toPlainText()
+    assert f"{panel.outlook.cost.frames} frames" in words
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4")
+    assert panel.outlook is not None
+    assert {place["z_um"] for place in panel.path.places} >= {60e3, 150e3}
+    (view,) = panel.path.views
+    assert view.axes == ("z_um", "x_um")
+
+
+WRONG = [
+    ("z_min_um", "abc", "no number", "60"),
+    ("z_min_um", "", "needed", "60"),
+    ("z_max_um", "900", "outside the stage's limits", "150"),
+    ("z_max_um", "20", "nearest first", "150"),
+    ("average", "1.5", "whole number", "1"),
+    ("average", "0", "at least 1", "1"),
+    ("target", "3", "between 0.05 and 0.9", "0.7"),
+    ("binning", "999", "choose 15 at most", "1"),
+]
+
+
+def test_wrong_entries_are_refused_at_the_field_with_the_reason(qtbot: QtBot, panel: SweepsPanel) -> None:
+    for name, text, reason, right in WRONG:
+        field: Any = panel.view.widgets[name]
+        if not text:
+            field.setFocus()
+            field.selectAll()
+            qtbot.keyClick(field, Qt.Key.Key_Delete)
+            wait_for_check(qtbot, panel)
+        else:
+            enter(qtbot, panel, **{name: text})
+        assert reason in panel.view.reason(name)
+        assert panel.view._reasons[name].isVisible()
+        assert field.property("refused")
+        assert not panel.run_bar.start_button.isEnabled()
+        enter(qtbot, panel, **{name: right})
+        assert not panel.view.reason(name)
+
+
+def test_a_sweep_with_pause_quality_as_it_arrives_and_its_run_in_the_list(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4", average="2")
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: len(panel.psfs.qualities) >= 1, timeout=WAIT_MS)
+    press(qtbot, panel.run_bar.pause_button)
+    qtbot.waitUntil(lambda: "PAUSED" in panel.run_bar.words.text(), timeout=WAIT_MS)
+    led_array = window.session.bench.led_array
+    assert led_array is not None
+    assert led_array.pattern.is_dark
+    assert panel.frame.image is not None
+    press(qtbot, panel.run_bar.pause_button)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        pass
+    assert panel.run_bar.words.text() == "Done"
+    assert [q is not None and not q.findings for q in panel.psfs.qualities] == [True] * 4
+    assert "all 4 PSFs good" in panel.verdict.toPlainText()
+    runs = window.show_panel("runs")
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
+    click_row(qtbot, runs, 0)
+    assert runs.opened is not None
+    assert "4 PSFs, good" in runs.about.toPlainText()
+    assert not runs.bar.start_button.isEnabled()
+    runs.slider.setFocus()
+    qtbot.keyClick(runs.slider, Qt.Key.Key_End)
+    assert f"Frame {runs.opened.n_frames - 1} of" in runs.frame_words.text()
+
+
+def click_row(qtbot: QtBot, runs: RunsPanel, row: int) -> None:
+    place = runs.table.visualItemRect(runs.table.item(row, 0)).center()
+    qtbot.mouseClick(runs.table.viewport(), LEFT, pos=QPoint(place.x(), place.y()))
+
+
+def test_escape_stops_a_sweep_at_once_and_resume_completes_it(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    bench = window.session.bench
+    assert bench.led_array is not None
+    assert bench.stage is not None
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4", average="2")
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: len(panel.psfs.qualities) >= 1, timeout=WAIT_MS)
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.keyClick(window, Qt.Key.Key_Escape)
+    assert bench.led_array.pattern.is_dark
+    assert not bench.stage.is_moving
+    qtbot.waitUntil(lambda: not panel.run.is_running, timeout=WAIT_MS)
+    run = run_of(window.session.runs_folder)
+    assert run.condition is RunCondition.STOPPED
+    assert 0 < len(run.records) < run.n_frames
+    runs = window.show_panel("runs")
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
+    click_row(qtbot, runs, 0)
+    compile(runs.as_python(), "resume", "exec")
+    assert "ResumeProcedure" in runs.as_python()
+    press(qtbot, runs.bar.start_button)
+    with qtbot.waitSignal(runs.run.over, timeout=WAIT_MS):
+        pass
+    run = run_of(window.session.runs_folder)
+    assert run.condition is RunCondition.COMPLETED
+    assert (run.path / "calibration" / "calibration.json").is_file()
+
+
+def test_abort_keeps_what_was_taken(qtbot: QtBot, window: MainWindow, panel: SweepsPanel) -> None:
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4", average="2")
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: len(panel.psfs.qualities) >= 1, timeout=WAIT_MS)
+    press(qtbot, panel.run_bar.abort_button)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        pass
+    run = run_of(window.session.runs_folder)
+    assert run.condition is RunCondition.ABORTED
+    assert "diffuserbench resume" in panel.verdict.toPlainText()
+
+
+def answer(question: QMessageBox | None, words: str) -> Any:
+    assert question is not None
+    (button,) = [button for button in question.buttons() if button.text() == words]
+    return button
+
+
+def test_closing_during_a_run_asks_and_ends_it_safely(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    session = window.session
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4", average="2")
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: len(panel.psfs.qualities) >= 1, timeout=WAIT_MS)
+    window.close()
+    assert window.isVisible()
+    assert window.question is not None
+    (stay,) = [
+        b
+        for b in window.question.buttons()
+        if window.question.buttonRole(b) is QMessageBox.ButtonRole.RejectRole
+    ]
+    qtbot.mouseClick(stay, LEFT)
+    assert panel.run.is_running
+    window.close()
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        qtbot.mouseClick(answer(window.question, "Stop and close"), LEFT)
+    run = run_of(session.runs_folder)
+    assert run.condition in (RunCondition.STOPPED, RunCondition.ABORTED)
+    assert not any(device.is_open for device in session.bench.devices.values())
+
+
+def test_a_plan_is_typed_checked_and_carried_out(qtbot: QtBot, panel: SweepsPanel) -> None:
+    panel.choose("plan")
+    text: Any = panel.view.widgets["text"]
+    text.selectAll()
+    for line in ('label = "two"', "[[parts]]", 'label = "psf"', 'light = "sauce"'):
+        qtbot.keyClicks(text, line)
+        qtbot.keyClick(text, Qt.Key.Key_Return)
+    wait_for_check(qtbot, panel)
+    assert "sauce" in panel.verdict.toPlainText()
+    assert not panel.run_bar.start_button.isEnabled()
+    text.setPlainText(
+        'label = "two"\n[[parts]]\nlabel = "psf"\nlight = "source"\n'
+        'positions = { kind = "points", points_um = [[0, 0, 8e4], [1e3, 0, 9e4]] }\n'
+    )
+    wait_for_check(qtbot, panel)
+    assert len(panel.path.places) == 2
+    press(qtbot, panel.run_bar.start_button)
+    with qtbot.waitSignal(panel.run.over, timeout=WAIT_MS):
+        pass
+    assert "completed: 2 of 2 frames" in panel.verdict.toPlainText()
+
+
+def test_every_routine_can_be_reached_by_the_keyboard(qtbot: QtBot, panel: SweepsPanel) -> None:
+    for number, form in enumerate(panel.forms):
+        panel.choice.setFocus()
+        assert panel.choice.currentIndex() == number
+        for widget in panel.view.widgets.values():
+            assert widget.focusPolicy() & Qt.FocusPolicy.TabFocus, form.name
+            assert widget.accessibleName()
+            assert widget.toolTip() or isinstance(widget, QWidget)
+        wait_for_check(qtbot, panel)
+        qtbot.keyClick(panel.choice, Qt.Key.Key_Down)
