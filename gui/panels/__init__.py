@@ -47,7 +47,7 @@ PANELS: Mapping[str, PanelEntry] = {
         "Alignment",
         "gui.panels.alignment:AlignmentPanel",
         "centre",
-        "Ctrl+9",
+        "Ctrl+Shift+A",
         "Find the scattering mask and bring it to its place",
     ),
     "reconstructions": PanelEntry(
