@@ -7,7 +7,6 @@ import time
 import typer
 
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
-from instrument.cli.words import duration
 from instrument.video.block import BlockReport
 from instrument.video.reconstruction import (
     PreparedVideo,
@@ -16,6 +15,7 @@ from instrument.video.reconstruction import (
     prepare_video,
     solve_video,
 )
+from instrument.words import duration
 
 
 def reconstruct_to_video(
