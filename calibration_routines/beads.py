@@ -26,6 +26,13 @@ Floats = npt.NDArray[np.float32]
 Ask = Callable[[str], None]
 Progress = Callable[[str, float], object]
 
+MANY_PX = 1_000_000
+"""Pixels beyond which solving takes long."""
+BIN_FIRST = (
+    "Note: images of more than a megapixel take long to solve; bin them until a spot of the pattern covers "
+    "about two pixels."
+)
+
 
 @runtime_checkable
 class SlideChanger(Protocol):
@@ -174,15 +181,8 @@ def calibrate_beads(
     InputError
         When the images cannot be solved.
     """
-    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
-    if pitch_um is None or distance_mm is None:
-        raise BenchError(
-            "Where the PSFs belong follows from pixel_pitch_um and diffuser_distance_mm: give them in "
-            "[geometry] of bench.toml (or --pixel-um and --distance-mm with files)."
-        )
-    window = slides.window_px or window_of(geometry, slides.z_um)
-    limit = images.shape[1:]
-    window = (min(window[0], limit[0]), min(window[1], limit[1]))
+    pitch_um, distance_mm = needed_geometry(geometry)
+    window = window_for(slides, geometry, (images.shape[1], images.shape[2]))
     result = calibrate_from_beads(images, window, slides.solver, progress=progress)
     object_um = pitch_um * slides.z_um / (1e3 * distance_mm)
     places = [(-column * object_um, -row * object_um, slides.z_um) for row, column in result.points]
@@ -200,12 +200,42 @@ def calibrate_beads(
         quality={
             "rank": result.rank,
             "misfits": list(result.misfits),
+            "point_misfits": list(result.point_misfits),
             "stopped": result.stopped,
-            "beads_found": [_count(beads) for beads in result.beads],
+            "beads_found": [len(beads) for beads in result.beads],
         },
         provenance=record,
     )
     return BeadCalibration(calibration, result)
+
+
+def needed_geometry(geometry: Geometry) -> tuple[float, float]:
+    """Return ``pixel_pitch_um`` and ``diffuser_distance_mm``.
+
+    Raises
+    ------
+    BenchError
+        When one is not known.
+    """
+    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
+    if pitch_um is None or distance_mm is None:
+        raise BenchError(
+            "Where the PSFs belong follows from pixel_pitch_um and diffuser_distance_mm: give them in "
+            "[geometry] of bench.toml (or --pixel-um and --distance-mm with files)."
+        )
+    return pitch_um, distance_mm
+
+
+def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -> tuple[int, int]:
+    """Return height and width in which a PSF is looked for, at most the images' ``shape``.
+
+    Raises
+    ------
+    BenchError
+        When it neither is given nor follows from the geometry.
+    """
+    height, width = slides.window_px or window_of(geometry, slides.z_um)
+    return min(height, shape[0]), min(width, shape[1])
 
 
 def bench_geometry(bench: Bench, slides: BeadSlides) -> Geometry:
@@ -254,21 +284,17 @@ def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
     return np.stack(grey).astype(np.float32)
 
 
-def _count(beads: Floats) -> int:
-    """Count bright local maxima: what stands out of its 3 x 3 neighbours and a twentieth of the brightest."""
-    from scipy import ndimage
-
-    peaks = (beads == ndimage.maximum_filter(beads, 3)) & (beads > 0.05 * beads.max())
-    return int(np.count_nonzero(peaks))
-
-
 __all__ = [
+    "BIN_FIRST",
+    "MANY_PX",
     "BeadCalibration",
     "BeadSlides",
     "SlideChanger",
     "bench_geometry",
     "calibrate_beads",
     "mean_images",
+    "needed_geometry",
     "photograph_slides",
+    "window_for",
     "window_of",
 ]

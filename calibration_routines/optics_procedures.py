@@ -8,12 +8,15 @@ from pathlib import Path
 from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
 from calibration_routines.angular_response import CUT_OFF, AngularResponse
 from calibration_routines.beads import (
+    BIN_FIRST,
+    MANY_PX,
     BeadCalibration,
     BeadSlides,
     bench_geometry,
     calibrate_beads,
+    needed_geometry,
     photograph_slides,
-    window_of,
+    window_for,
 )
 from calibration_routines.calibration_figures import response_figure, surface_figure
 from calibration_routines.dpc import DiffuserSurface, DpcSetup, dpc_optics, dpc_plan, measure_diffuser
@@ -211,14 +214,19 @@ class BeadProcedure:
         self._refuse_existing()
         slides = self.slides
         geometry = bench_geometry(bench, slides)
-        height, width = slides.window_px or window_of(geometry, slides.z_um)
+        needed_geometry(geometry)
         rows, columns = slides.solver.grid
+        frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
+        height, width = window_for(slides, geometry, frame)
+        note = (BIN_FIRST,) if frame[0] * frame[1] > MANY_PX else ()
         frames = slides.images * (slides.average + 4)
         return Outlook(
             (
                 f"{slides.images} photographs of {slides.average} frames, each with 4 dark frames: {frames} "
                 "frames; the slide is moved in between",
-                f"{rows} x {columns} PSFs of {height} x {width} pixels",
+                f"{rows} x {columns} PSFs of {height} x {width} pixels at z = {slides.z_um / 1e3:g} mm, over "
+                f"{slides.solver.reach:.0%} of the field of {frame[0]} x {frame[1]} pixels",
+                *note,
             )
         )
 
@@ -259,8 +267,9 @@ class BeadProcedure:
 def bead_lines(done: BeadCalibration) -> list[str]:
     """Return what the bead images gave, in lines."""
     result = done.result
-    misfits = ", ".join(f"{m:.3f}" for m in result.misfits)
+    misfits, between = (", ".join(f"{m:.3f}" for m in ms) for ms in (result.misfits, result.point_misfits))
     return [
         f"Beads found: {', '.join(map(str, done.calibration.quality['beads_found']))}",
-        f"Misfit by rank: {misfits}; kept rank {result.rank} ({result.stopped})",
+        f"Misfit by rank: {misfits} with beads on the pixel grid ({result.stopped});",
+        f"  {between} with beads between pixels, PSFs of rank {result.rank}",
     ]

@@ -60,7 +60,8 @@ class Told(Listener):
         """Advance the bar."""
         if self._bar is not None:
             bar, task = self._bar
-            bar.update(task, completed=done, total=total)
+            scale = 100 if total == 1 else 1  # a fraction is shown in parts of a hundred
+            bar.update(task, completed=round(scale * done), total=scale * total)
 
     def frame(self, status: RunStatus) -> None:
         """Advance the bar."""

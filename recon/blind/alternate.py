@@ -1,4 +1,8 @@
-"""Blind deconvolution of bead images: beads and PSFs in turn, the rank raised (Kuo 2020, Eqs. 5.11-5.13)."""
+"""Blind deconvolution of bead images: beads and PSFs in turn, the rank raised (Kuo 2020, Eqs. 5.11-5.13).
+
+First on a grid of pixels, as the dissertation does. That finds the beads, but not between pixels, and its
+PSFs bend to make up for it. Then the same again with beads as points (:mod:`recon.blind.polish`).
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.blind.plausible import refuse_what_is_no_beads
+from recon.blind.point_step import Points
+from recon.blind.polish import points_on_grid, polish
 from recon.blind.psf_step import BeadMixer, solve_psfs
 from recon.blind.start import first_psf, offset_of
 from recon.errors import InputError
@@ -22,8 +29,7 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
 
-BLOB_PX = 2
-"""How far around its brightest pixel a bead's light may lie."""
+_GRID_SHARE = 0.6  # of the work, on the grid; the rest with points
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +41,12 @@ class BlindSettings:
     grid : (int, int)
         Rows and columns of PSFs over the field.
     ranks : sequence of int
-        The rank of each round, rising (Kuo 2020: raised after each alternating solve).
+        The rank of each round on the grid, rising (Kuo 2020: raised after each alternating solve).
     iterations : int
         Of each half-step (Kuo 2020: 100).
+    degree : int
+        Highest degree of the polynomials over the field with which PSFs vary in the end: 0, 1 or 2, and so
+        rank 1, 3 or 6. It is lowered where the beads are too few.
     tau : float
         Weight of the beads' sparsity relative to ``max |A^H b|`` (Eq. 5.12).
     reach : float
@@ -47,9 +56,10 @@ class BlindSettings:
     """
 
     grid: tuple[int, int] = (5, 5)
-    ranks: Sequence[int] = (1, 2, 3, 4, 5, 6)
-    iterations: int = 100
-    tau: float = 0.03
+    ranks: Sequence[int] = (1, 2, 3)
+    iterations: int = 60
+    degree: int = 2
+    tau: float = 0.01
     reach: float = 0.8
     improvement: float = 0.02
 
@@ -69,21 +79,25 @@ class BlindResult:
         Registered to one another. Their noise is on both sides of zero: clipped, it would sum to a haze.
     points : ndarray, (n_psfs, 2)
         ``(row, column)`` from the axis in object pixels that each PSF stands for.
-    beads : ndarray, float32, (n_images, field height, field width)
+    beads : tuple of Points
+        One an image; light as in the images.
     rank : int
-        Of the last round that was kept.
+        Of the PSFs, at most: the number of functions over the field.
     misfits : tuple of float
-        ``||f(H, y) - b|| / ||b||`` after each round.
+        ``||f(H, y) - b|| / ||b||`` after each round on the grid.
+    point_misfits : tuple of float
+        The same with beads as points, after each degree of the field's variation.
     stopped : str
-        Why it ended.
+        Why the rounds on the grid ended.
     sensor_shape : (int, int)
     """
 
     psfs: Floats
     points: npt.NDArray[np.float64]
-    beads: Floats
+    beads: tuple[Points, ...]
     rank: int
     misfits: tuple[float, ...]
+    point_misfits: tuple[float, ...]
     stopped: str
     sensor_shape: tuple[int, int]
 
@@ -146,39 +160,50 @@ def calibrate_from_beads(
     beads = np.zeros((len(data), *field_shape), np.float32)
     norm = float(np.linalg.norm(data))
     misfits: list[float] = []
-    best: tuple[Floats, Floats, int] | None = None
+    best: Floats | None = None
     stopped = "the last rank was reached"
     ranks = [r for r in settings.ranks if r <= len(points)]
     for number, rank in enumerate(ranks):
-        share = number / len(ranks)
-        tell(f"rank {rank}: beads", share)
-        beads = _solve_beads(data, np.maximum(psfs, 0), points, beads, settings)
+        share, part = _GRID_SHARE * number / len(ranks), _GRID_SHARE / len(ranks)
+
+        def finding(done: float, rank: int = rank, share: float = share, part: float = part) -> None:
+            tell(f"rank {rank}: beads", share + 0.8 * part * done)
+
+        beads = _solve_beads(data, np.maximum(psfs, 0), points, beads, settings, finding)
         if not beads.any():
             raise InputError(
                 "No bead was found: the first PSF explains nothing. Are the images of the same optics, with "
                 "several beads each and their background removed?"
             )
-        tell(f"rank {rank}: PSFs", share + 0.5 / len(ranks))
+        tell(f"rank {rank}: PSFs", share + 0.8 * part)
         mixer = BeadMixer(weights, beads, psf_shape, sensor)
         psfs, half = solve_psfs(mixer, data, psfs, rank, settings.iterations)
         psfs, beads = _by_convention(psfs, beads)
         misfits.append(float(np.sqrt(2 * half)) / norm)
         if best is not None and misfits[-1] > (1 - settings.improvement) * misfits[-2]:
             stopped = f"rank {rank} fits only {1 - misfits[-1] / misfits[-2]:.1%} better"
-            if misfits[-1] < misfits[-2]:
-                best = (psfs, beads, rank)
+            best = beads if misfits[-1] < misfits[-2] else best
             break
-        best = (psfs, beads, rank)
+        best = beads
     assert best is not None
-    psfs, beads, rank = best
-    psfs = _seen_by_points(psfs, beads)
+    polished = polish(
+        data,
+        [points_on_grid(image, centre) for image in best],
+        psf_shape,
+        settings.iterations,
+        settings.degree,
+        lambda share: tell("beads between pixels", _GRID_SHARE + (1 - _GRID_SHARE) * share),
+    )
+    refuse_what_is_no_beads(data, polished.images(sensor), polished.beads)
+    psfs = polished.at(points)
     light = psfs.sum(axis=(1, 2), keepdims=True)
     return BlindResult(
         psfs=np.asarray(psfs / np.where(light > 0, light, 1), np.float32),
         points=points,
-        beads=beads * scale,
-        rank=rank,
+        beads=tuple(Points(found.places, found.light * float(scale)) for found in polished.beads),
+        rank=polished.functions.count,
         misfits=tuple(misfits),
+        point_misfits=polished.misfits,
         stopped=stopped,
         sensor_shape=sensor,
     )
@@ -191,6 +216,13 @@ def _check(data: Floats, psf_shape: tuple[int, int], settings: BlindSettings) ->
         raise InputError("An image of beads holds values that are not finite numbers.")
     if not (data.max(axis=(1, 2)) > 0).all():
         raise InputError("An image of beads holds no light.")
+    for first in range(len(data)):
+        for second in range(first + 1, len(data)):
+            if np.array_equal(data[first], data[second]):
+                raise InputError(
+                    f"Images {first + 1} and {second + 1} are the same, pixel by pixel: each must be a "
+                    "photograph of its own, the slide moved in between."
+                )
     if any(p < 3 or p > n for p, n in zip(psf_shape, data.shape[1:], strict=True)):
         raise InputError(
             f"The PSF's window {psf_shape} must lie within the sensor {data.shape[1:]}: bin less, or use a "
@@ -201,6 +233,8 @@ def _check(data: Floats, psf_shape: tuple[int, int], settings: BlindSettings) ->
         raise InputError(f"Ranks rise from 1 or more, not {ranks}.")
     if min(settings.grid) < 1 or settings.iterations < 1 or not 0 < settings.tau < 1:
         raise InputError("The grid and the iterations are at least 1, tau lies between 0 and 1.")
+    if settings.degree not in (0, 1, 2):
+        raise InputError(f"PSFs vary over the field with degree 0, 1 or 2, not {settings.degree}.")
 
 
 def _points(sensor: tuple[int, int], settings: BlindSettings) -> npt.NDArray[np.float64]:
@@ -211,55 +245,26 @@ def _points(sensor: tuple[int, int], settings: BlindSettings) -> npt.NDArray[np.
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2).round()
 
 
-def _solve_beads(data: Floats, psfs: Floats, points: Array, start: Floats, settings: BlindSettings) -> Floats:
+def _solve_beads(
+    data: Floats,
+    psfs: Floats,
+    points: Array,
+    start: Floats,
+    settings: BlindSettings,
+    progress: Callable[[float], None],
+) -> Floats:
     """Find the beads of each image with the PSFs fixed (Eq. 5.12): FISTA with a rigorous step."""
     sensor = (data.shape[1], data.shape[2])
     operator = local_convolution([FieldOfPsfs(psfs[:, None], points)], sensor)
     found = np.empty_like(start)
-    for image, beads, out in zip(data, start, found, strict=True):
+    for number, (image, beads, out) in enumerate(zip(data, start, found, strict=True)):
+        progress(number / len(data))
         target = image[None]
         weight = settings.tau * float(np.abs(operator.adjoint(target)).max())
         solver = Fista(operator, target, L1(weight) + NonNegativity(), initial=beads[None, None])
         outcome = solver.run(StoppingRules(iterations=settings.iterations, tolerance=1e-3))
         out[...] = outcome.solution[0, 0]
     return found
-
-
-def _seen_by_points(psfs: Floats, beads: Floats) -> Floats:
-    """Convolve PSFs with the mean shape of the beads found, so that a point casts what a bead did.
-
-    A bead between pixels is found as a small blob, and the PSF that fits it comes out sharper by as much.
-    Each blob is centred by its own centroid, between pixels, before the mean is taken.
-    """
-    height, width = psfs.shape[1:]
-    f_y, f_x = np.fft.fftfreq(height), np.fft.rfftfreq(width)
-    offsets = np.arange(-BLOB_PX, BLOB_PX + 1)
-    shape = np.zeros((height, len(f_x)), np.complex128)
-    total = 0.0
-    for image in beads:
-        for row, column in _peaks(image):
-            blob = image[row - BLOB_PX : row + BLOB_PX + 1, column - BLOB_PX : column + BLOB_PX + 1]
-            light = float(blob.sum())
-            middle = [float(blob.sum(axis=1 - axis) @ offsets) / light for axis in (0, 1)]
-            e_y = np.exp(-2j * np.pi * np.outer(f_y, offsets - middle[0]))
-            e_x = np.exp(-2j * np.pi * np.outer(offsets - middle[1], f_x))
-            # Bright beads tell the PSF, by the square of their light.
-            shape += light * (e_y @ blob @ e_x)
-            total += light**2
-    if total == 0:
-        return psfs
-    spectra = np.fft.rfft2(psfs) * (shape / total)
-    return np.asarray(np.fft.irfft2(spectra, s=(height, width)), np.float32)
-
-
-def _peaks(image: Floats) -> list[tuple[int, int]]:
-    """Return pixels brighter than their neighbours and a tenth of the brightest, away from the border."""
-    from scipy import ndimage
-
-    found = (image == ndimage.maximum_filter(image, 2 * BLOB_PX + 1)) & (image > 0.1 * image.max())
-    inside = np.zeros_like(found)
-    inside[BLOB_PX:-BLOB_PX, BLOB_PX:-BLOB_PX] = found[BLOB_PX:-BLOB_PX, BLOB_PX:-BLOB_PX]
-    return [(int(row), int(column)) for row, column in np.argwhere(inside)]
 
 
 def _by_convention(psfs: Floats, beads: Floats) -> tuple[Floats, Floats]:

@@ -112,6 +112,38 @@ def test_without_geometry_it_says_what_is_missing(
     assert "--pixel-um and --distance-mm" in capsys.readouterr().err
 
 
+def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
+    files: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "x")
+    words = ["calibrate", "beads", *files, "--pixel-um", "11.6", "--distance-mm", "3.8", "--window", "21x21"]
+    assert main([*words, "--dry-run", "--out", out]) == 0
+    said = capsys.readouterr().out
+    assert "4 files, read and found alike; 48 x 48 pixels" in said
+    assert "5 x 5 PSFs of 21 x 21 pixels" in said
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bench.toml").write_text(BENCH)
+    assert main(["calibrate", "beads", "--dry-run", "--out", out]) == 0
+    said = capsys.readouterr().out
+    assert "9 photographs of 4 frames" in said
+    assert "take long to solve" in said
+    assert not (tmp_path / "runs").exists()
+    assert not Path(out).exists()
+
+
+def test_options_of_files_are_refused_on_the_bench(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "beads", "--dark", "100", "--pixel-um", "3"]) == 2
+    assert "--dark and --pixel-um go with image files" in capsys.readouterr().err
+
+
+def test_the_same_file_twice_is_refused(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["calibrate", "beads", files[0], files[1], files[0], "--pixel-um", "11.6", "--distance-mm", "3.8"]
+    assert main([*words, "--window", "21x21", "--out", str(tmp_path / "x")]) == 2
+    assert "Images 1 and 3 are the same" in capsys.readouterr().err
+
+
 def test_the_simulated_bench_changes_its_slides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

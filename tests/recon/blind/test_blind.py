@@ -139,7 +139,7 @@ def test_the_first_psf_is_that_of_the_centre_with_noise(camera: Microscope, imag
 
 def test_bead_images_give_psfs_over_the_field(camera: Microscope, images: np.ndarray) -> None:
     """Kuo 2020, Fig. 5.4c: good but imperfect correspondence; the first PSF alone is less alike."""
-    settings = BlindSettings(grid=(3, 3), ranks=(1, 2, 3), iterations=40, reach=0.4, improvement=0.0)
+    settings = BlindSettings(grid=(3, 3), ranks=(1, 2), iterations=30, degree=1, reach=0.4, improvement=0.0)
     found = calibrate_from_beads(images, WINDOW, settings)
     assert list(found.misfits) == sorted(found.misfits, reverse=True)
     assert found.psfs.sum(axis=(1, 2)) == pytest.approx(np.ones(9), rel=1e-4)

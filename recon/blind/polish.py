@@ -1,0 +1,152 @@
+"""From beads on a grid to points between pixels, and from their PSFs to those that the points ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.blind.field_functions import FieldFunctions
+from recon.blind.point_psfs import PointMixer, solve_smooth, support_of
+from recon.blind.point_step import PointImages, Points, cleaned, overlooked, refine
+from recon.blind.start import offset_of
+
+Floats = npt.NDArray[np.float32]
+
+BLOB_PX = 2
+"""How far around its brightest pixel a bead's light may lie on the grid."""
+_BEADS_A_FUNCTION = 4  # at least so many beads for each field function
+_ROUNDS = 3  # with each degree
+_MOST_BEADS = 150  # an image; more are no separate beads, and would take for ever
+_LEAST_GAIN = 0.003  # relative decrease of the misfit that another round must bring
+
+
+@dataclass(frozen=True, slots=True)
+class Polished:
+    """PSFs and beads after the polish.
+
+    Attributes
+    ----------
+    psfs : ndarray, float32, (n_functions, height, width)
+        One a field function.
+    functions : FieldFunctions
+    beads : tuple of Points
+        One an image.
+    misfits : tuple of float
+        ``||f - b|| / ||b||`` after the rounds with each degree.
+    """
+
+    psfs: Floats
+    functions: FieldFunctions
+    beads: tuple[Points, ...]
+    misfits: tuple[float, ...]
+
+    def images(self, sensor_shape: tuple[int, int]) -> Floats:
+        """Return what the model says of the images: (n_images, height, width)."""
+        camera = PointImages(self.psfs, self.functions, sensor_shape)
+        return np.stack([camera.image(points) for points in self.beads])
+
+    def at(self, places: npt.NDArray[np.float64]) -> Floats:
+        """Return the PSFs at places (n, 2): (n, height, width)."""
+        return np.tensordot(self.functions.at(places).astype(np.float32), self.psfs, 1)
+
+
+def polish(
+    data: Floats,
+    beads: Sequence[Points],
+    psf_shape: tuple[int, int],
+    iterations: int,
+    highest_degree: int,
+    progress: Callable[[float], object],
+) -> Polished:
+    """Alternate between PSFs and points, the degree of the field's variation raised step by step.
+
+    Parameters
+    ----------
+    data : ndarray, float32, (n_images, height, width)
+    beads : sequence of Points
+        At least one each; a first guess good to a pixel.
+    psf_shape : (int, int)
+    iterations : int
+        Of each fit of the PSFs.
+    highest_degree : int
+        Fewer where there are too few beads.
+    progress : callable
+        Called with the share done.
+    """
+    sensor = data.shape[1], data.shape[2]
+    norm = float(np.linalg.norm(data))
+    degrees = range(highest_degree + 1)
+    misfits: list[float] = []
+    psfs: Floats | None = None
+    functions: FieldFunctions | None = None
+    for degree in degrees:
+        places = np.concatenate([points.places for points in beads])
+        if degree and (degree + 1) * (degree + 2) / 2 * _BEADS_A_FUNCTION > len(places):
+            break
+        best = np.inf
+        for number in range(_ROUNDS):
+            progress((degree + number / _ROUNDS) / len(degrees))
+            functions = FieldFunctions(degree, np.concatenate([points.places for points in beads]))
+            mixer = PointMixer(beads, functions, psf_shape, sensor)
+            start = np.zeros((functions.count, *psf_shape), np.float32)
+            free, _ = solve_smooth(mixer, data, start, None, iterations)
+            support = support_of(free[0])
+            psfs, misfit = solve_smooth(mixer, data, free, support, iterations)
+            psfs, beads = _centred(psfs, beads)
+            noise = misfit / np.sqrt(data.size)
+            beads = _better_points(PointImages(psfs, functions, sensor), data, beads, noise)
+            if misfit > (1 - _LEAST_GAIN) * best:
+                break
+            best = misfit
+        misfits.append(min(best, misfit) / norm)
+    assert psfs is not None
+    assert functions is not None
+    return Polished(psfs, functions, tuple(beads), tuple(misfits))
+
+
+def points_on_grid(beads: Floats, centre: tuple[int, int]) -> Points:
+    """Return the blobs of a bead image (height, width) on the field's grid as points: centroid and light."""
+    from scipy import ndimage
+
+    peaks = (beads == ndimage.maximum_filter(beads, 2 * BLOB_PX + 1)) & (beads > 0.1 * beads.max())
+    peaks[:BLOB_PX] = peaks[-BLOB_PX:] = False
+    peaks[:, :BLOB_PX] = peaks[:, -BLOB_PX:] = False
+    offsets = np.arange(-BLOB_PX, BLOB_PX + 1)
+    places, light = [], []
+    for row, column in np.argwhere(peaks):
+        blob = beads[row - BLOB_PX : row + BLOB_PX + 1, column - BLOB_PX : column + BLOB_PX + 1]
+        total = float(blob.sum(dtype=np.float64))
+        middle = [float(blob.sum(axis=1 - axis) @ offsets) / total for axis in (0, 1)]
+        places.append((row - centre[0] + middle[0], column - centre[1] + middle[1]))
+        light.append(total)
+    brightest = np.argsort(light)[::-1][:_MOST_BEADS]
+    return Points(
+        np.array(places, np.float64).reshape(-1, 2)[brightest], np.array(light, np.float64)[brightest]
+    )
+
+
+def _better_points(
+    camera: PointImages, data: Floats, beads: Sequence[Points], noise: float
+) -> tuple[Points, ...]:
+    found = []
+    for image, points in zip(data, beads, strict=True):
+        fitted, left = refine(camera, image, points)
+        fitted = overlooked(camera, left, cleaned(camera, fitted, noise), noise)
+        fitted, _ = refine(camera, image, fitted, sweeps=1)
+        kept = cleaned(camera, fitted, noise)
+        found.append(kept if len(kept) else points)
+    return tuple(found)
+
+
+def _centred(psfs: Floats, beads: Sequence[Points]) -> tuple[Floats, tuple[Points, ...]]:
+    """Give the mean PSF unit light, centred on the centre pixel; the beads go the other way."""
+    from recon.registration import shifted
+
+    rows, columns = offset_of(np.maximum(psfs[0], 0)[None])
+    light = float(psfs[0].sum(dtype=np.float64))
+    moved = np.asarray(shifted(psfs, -rows, -columns) / np.float32(light), np.float32)
+    by = np.array([rows, columns], np.float64)
+    return moved, tuple(Points(points.places + by, points.light * light) for points in beads)
