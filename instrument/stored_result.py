@@ -16,6 +16,7 @@ from instrument.images import read_image
 from instrument.volume_source import VolumeSource, open_volume
 from instrument.volume_zarr import is_zarr_name
 from recon.solvers.stopping import IterationRecord
+from recon.verdict.verdict import Region
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,18 @@ class StoredResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What may be wrong with it, in sentences."""
-        return tuple(str(text) for text in self.record.get("warnings", ()))
+        """What may be wrong with it, in sentences: the verdict first, where it is not favourable."""
+        verdict = self.verdict if self._region in (Region.NEAR, Region.OUTSIDE) else ()
+        return (*verdict, *(str(text) for text in self.record.get("warnings", ())))
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """Whether to trust it, in sentences; empty where it was not judged."""
+        return tuple(str(text) for text in (self.record.get("verdict") or {}).get("sentences", ()))
+
+    @property
+    def _region(self) -> str:
+        return str((self.record.get("verdict") or {}).get("region", Region.UNKNOWN))
 
     @property
     def histories(self) -> tuple[tuple[IterationRecord, ...], ...]:
@@ -78,10 +89,12 @@ class StoredResult:
         return np.array(z_um, float), np.array(pitch_um, float)
 
     def facts(self) -> list[tuple[str, str]]:
-        """Return what is known of it as names and values, to be shown; the model and its reason first."""
+        """Return what is known of it as names and values, to be shown; verdict and model first."""
         record = self.record
         origin = record.get("provenance", {})
         facts: list[tuple[str, str]] = []
+        if self.verdict:
+            facts.append(("Verdict", " ".join(self.verdict)))
         model = record.get("model") or origin.get("model")
         if model:
             reason = record.get("model_reason") or origin.get("model_reason") or ""

@@ -64,6 +64,9 @@ PANELS: Mapping[str, PanelEntry] = {
         "Ctrl+Shift+H",
         "Compute a hologram, show it, photograph it",
     ),
+    "charts": PanelEntry(
+        "Charts", "gui.panels.charts:ChartsPanel", "centre", "Ctrl+Shift+C", "Where methods fail"
+    ),
     "live_reconstruction": PanelEntry(
         "Live reconstruction",
         "gui.panels.live_reconstruction:LiveReconstructionPanel",

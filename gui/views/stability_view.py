@@ -1,0 +1,185 @@
+"""Stability maps: where a method fails, cell by cell, with every method's boundary over it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
+
+from gui.theme import colours
+from gui.widgets.plot import curve_pen, plot_widget
+from recon.stability.failure import Failure
+
+_SPAN = 1.0
+"""The colours reach from a tenth of the severity at the boundary to ten times of it."""
+
+
+class StabilityView(QWidget):
+    """One map of a ``stability.json``: a method's cells in colour, the boundaries of all as lines."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._maps: Mapping[str, Any] = {}
+        self.map = QComboBox()
+        self.map.setToolTip("Which two stresses are varied")
+        self.map.currentIndexChanged.connect(lambda _: self._choose_map())
+        self.method = QComboBox()
+        self.method.setToolTip("Whose cells are coloured; the lines are the boundaries of all methods")
+        self.method.currentIndexChanged.connect(lambda _: self._draw())
+        self.question = QLabel()
+        self.question.setWordWrap(True)
+        self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.place = QLabel(
+            "Blue-green works, brown fails; numbers are errors. Point at a cell for its figures."
+        )
+        self.place.setProperty("role", "dim")
+        self.place.setWordWrap(True)
+        self.plot: Any = plot_widget(grid=False)
+        self.plot.setMouseEnabled(x=False, y=False)
+        self.plot.addLegend(offset=(10, 10), labelTextColor=colours().text, brush=(20, 23, 28, 200))
+        self.image: Any = pg.ImageItem()
+        self.plot.scene().sigMouseMoved.connect(self._moved)
+        self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
+        row = QHBoxLayout()
+        row.addWidget(self.map, 2)
+        row.addWidget(self.method, 1)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(row)
+        layout.addWidget(self.question)
+        layout.addWidget(self.plot, 1)
+        layout.addWidget(self.place)
+
+    def show_maps(self, maps: Mapping[str, Any]) -> None:
+        """Show the maps of a ``stability.json``, by name."""
+        self._maps = maps
+        self.map.blockSignals(True)
+        self.map.clear()
+        for name, record in maps.items():
+            self.map.addItem(record["title"], name)
+        self.map.blockSignals(False)
+        self._choose_map()
+
+    @property
+    def record(self) -> Mapping[str, Any] | None:
+        """The map that is shown."""
+        name = self.map.currentData()
+        return None if name is None else self._maps[name]
+
+    def _choose_map(self) -> None:
+        record = self.record
+        self.method.blockSignals(True)
+        self.method.clear()
+        if record is not None:
+            self.method.addItems(list(record["methods"]))
+        self.method.blockSignals(False)
+        self._draw()
+
+    def _draw(self) -> None:
+        self.plot.clear()
+        self.boundaries = {}
+        record, name = self.record, self.method.currentText()
+        if record is None or not name:
+            return
+        self.question.setText(f"{record['question']} ({record['size']} map)")
+        method = record["methods"][name]
+        severity = _grid(method["severity"])
+        level = np.log10(np.maximum(severity, 1e-2))
+        self.image.setImage(_coloured(level))
+        self.image.setRect(-0.5, -0.5, severity.shape[1], severity.shape[0])
+        self.plot.addItem(self.image)
+        self._write_errors(_grid(method["error"]), level)
+        for number, (other, found) in enumerate(record["methods"].items()):
+            self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
+        for side, which in (("bottom", "x"), ("left", "y")):
+            about = record[which]
+            unit = f" ({about['unit']})" if about["unit"] else ""
+            self.plot.setLabel(side, f"{about['label']}{unit}")
+            self.plot.getAxis(side).setTicks([[(i, _short(v)) for i, v in enumerate(about["values"])]])
+        rows, columns = severity.shape
+        self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
+        self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
+
+    def _write_errors(self, errors: npt.NDArray[np.float64], level: npt.NDArray[np.float64]) -> None:
+        for (iy, ix), error in np.ndenumerate(errors):
+            if np.isfinite(error):
+                dark = not abs(level[iy, ix]) < 0.6
+                text = pg.TextItem(f"{error:.2g}", color="#e8edf2" if dark else "#20262e", anchor=(0.5, 0.5))
+                text.setPos(ix, iy)
+                self.plot.addItem(text)
+
+    def _draw_boundary(
+        self, number: int, name: str, points: Sequence[Sequence[float]], record: Any, *, chosen: bool
+    ) -> None:
+        places = np.array([(_place(record["x"], x), _place(record["y"], y)) for x, y in points], float)
+        self.boundaries[name] = places.reshape(-1, 2)
+        label = name if len(places) else f"{name}: no boundary here"
+        width = 4.0 if chosen else 2.0
+        self.plot.plot(
+            *self.boundaries[name].T,
+            pen=curve_pen(number, width),
+            symbol="o",
+            symbolSize=9 if chosen else 6,
+            symbolPen=None,
+            symbolBrush=colours().curves[number % len(colours().curves)],
+            name=label,
+        )
+
+    def _moved(self, place: Any) -> None:
+        point = self.plot.getPlotItem().vb.mapSceneToView(place)
+        self.place.setText(self.describe(round(point.x()), round(point.y())))
+
+    def describe(self, ix: int, iy: int) -> str:
+        """Return a cell in words; empty outside of the map."""
+        record = self.record
+        if record is None:
+            return ""
+        x, y = record["x"], record["y"]
+        if not (0 <= ix < len(x["values"]) and 0 <= iy < len(y["values"])):
+            return ""
+        said = [f"{_stress(x, ix)}, {_stress(y, iy)}"]
+        for name, method in record["methods"].items():
+            severity, error = method["severity"][iy][ix], method["error"][iy][ix]
+            if severity is None:
+                said.append(f"{name}: not made")
+                continue
+            failure = method["failure"][iy][ix]
+            words = f"fails ({Failure[failure.upper()]})" if failure else "works"
+            value = "" if error is None else f", {record['error']} {error:.3g}"
+            said.append(f"{name}: {words}{value}, severity {severity:.2f}")
+        return ";  ".join(said)
+
+
+def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
+    return np.array([[np.nan if v is None else v for v in row] for row in rows], float)
+
+
+def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Return (rows, columns, 3): blue-green where it works, brown where it fails, dark where not made."""
+    from matplotlib import colormaps
+
+    shown = colormaps["BrBG_r"](np.clip((level + _SPAN) / (2 * _SPAN), 0, 1))[..., :3]
+    shown[~np.isfinite(level)] = 0.1
+    pixels: npt.NDArray[np.uint8] = np.round(255 * shown).astype(np.uint8)
+    return pixels
+
+
+def _place(axis: Mapping[str, Any], value: float) -> float:
+    """Return where a value lies between the cells of an axis, counted in cells."""
+    values = np.array(axis["values"], float)
+    if axis["logarithmic"]:
+        values, value = np.log(values), float(np.log(value))
+    return float(np.interp(value, values, np.arange(len(values))))
+
+
+def _stress(axis: Mapping[str, Any], index: int) -> str:
+    return f"{axis['label']} {_short(axis['values'][index])} {axis['unit']}".rstrip()
+
+
+def _short(value: float) -> str:
+    return f"{value / 1000:g}k" if abs(value) >= 10000 else f"{value:g}"

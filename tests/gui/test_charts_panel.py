@@ -1,0 +1,107 @@
+"""Stability maps in the window: what is drawn is what the file says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from gui.panels.charts import ChartsPanel
+from instrument.images import read_image
+from instrument.stability_file import read_stability
+from recon.stability.shipped import shipped_file
+
+WAIT_MS = 20_000
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session) -> ChartsPanel:
+    panel = ChartsPanel(make_session())
+    panel.resize(900, 600)
+    qtbot.addWidget(panel)
+    panel.show()
+    qtbot.waitUntil(lambda: panel.stability.record is not None, timeout=WAIT_MS)
+    return panel
+
+
+def made(tmp_path: Path) -> Path:
+    """A file with one planted map: the first method fails from x = 100 on, the second never."""
+    grid = [[0.1, 1.0, 10.0], [0.1, 1.0, None]]
+    methods = {
+        "admm tv": {
+            "error": [[0.1, 0.5, 0.9], [0.2, 0.6, None]],
+            "severity": grid,
+            "failure": [[None, "spots", "trivial"], [None, "spots", None]],
+            "boundary": [[100.0, 1.0], [100.0, 2.0]],
+        },
+        "fista": {
+            "error": [[0.1] * 3] * 2, "severity": [[0.5] * 3] * 2,
+            "failure": [[None] * 3] * 2, "boundary": [],
+        },
+    }  # fmt: skip
+    record = {
+        "format": "diffuserbench-stability", "version": 1, "program": "diffuserbench 1", "utc": "today",
+        "machine": "m", "command": "planted",
+        "maps": {"planted": {
+            "title": "Planted", "question": "Where?", "size": "quick", "error": "NRMSE", "methods": methods,
+            "x": {"key": "n", "label": "points", "unit": "", "values": [10, 100, 1000], "logarithmic": True},
+            "y": {"key": "a", "label": "spread", "unit": "px", "values": [1, 2], "logarithmic": False},
+        }},
+    }  # fmt: skip
+    path = tmp_path / "stability.json"
+    path.write_text(json.dumps(record))
+    return path
+
+
+def test_every_shipped_map_and_method_is_drawn(panel: ChartsPanel) -> None:
+    view = panel.stability
+    maps = read_stability(shipped_file())["maps"]
+    assert [view.map.itemData(i) for i in range(view.map.count())] == list(maps)
+    for index, record in enumerate(maps.values()):
+        view.map.setCurrentIndex(index)
+        for number in range(len(record["methods"])):
+            view.method.setCurrentIndex(number)
+            assert view.image.image.shape[:2] == np.shape(
+                list(record["methods"].values())[number]["severity"]
+            )
+        assert view.describe(0, 0).startswith(record["x"]["label"])
+
+
+def test_boundaries_colours_and_words_are_those_of_the_file(
+    qtbot: QtBot, panel: ChartsPanel, tmp_path: Path
+) -> None:
+    panel.open(made(tmp_path))
+    view = panel.stability
+    qtbot.waitUntil(lambda: view.map.currentText() == "Planted", timeout=WAIT_MS)
+    np.testing.assert_allclose(view.boundaries["admm tv"], [[1, 0], [1, 1]])
+    assert view.boundaries["fista"].shape == (0, 2)
+    works, fails = view.image.image[0, 0].astype(int), view.image.image[0, 2].astype(int)
+    assert works[2] > works[0]
+    assert fails[0] > fails[2]
+    said = view.describe(1, 0)
+    assert "points 100, spread 1 px" in said
+    assert "admm tv: fails (points lost or made up), NRMSE 0.5, severity 1.00" in said
+    assert "fista: works" in said
+    assert "not made" in view.describe(2, 1)
+    assert view.describe(3, 0) == ""
+    view.method.setCurrentText("fista")
+    assert len(np.unique(view.image.image.reshape(-1, 3), axis=0)) == 1
+
+
+def test_copied_lines_draw_the_map_and_a_wrong_file_is_told(
+    qtbot: QtBot, panel: ChartsPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel.open(made(tmp_path))
+    qtbot.waitUntil(lambda: panel.stability.map.currentText() == "Planted", timeout=WAIT_MS)
+    qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
+    monkeypatch.chdir(tmp_path)
+    exec(QApplication.clipboard().text(), {})
+    assert read_image(tmp_path / "planted.png").is_colour
+    (tmp_path / "other.json").write_text("{}")
+    panel.open(tmp_path / "other.json")
+    qtbot.waitUntil(lambda: "holds no stability maps" in panel._note.toolTip(), timeout=WAIT_MS)
