@@ -32,6 +32,7 @@ class ChartsPanel(Panel):
         self.shipped_button.setToolTip("The maps that come with the program, by which verdicts are made")
         self.shipped_button.clicked.connect(lambda: self.open(shipped_file()))
         self.heading = QLabel()
+        self.heading.setMinimumWidth(10)
         row = QHBoxLayout()
         row.addWidget(self.heading, 1)
         row.addWidget(self.open_button)

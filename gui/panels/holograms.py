@@ -33,7 +33,7 @@ from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
-from gui.views.entry import Entry, PathEntry, existing_path, number
+from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
 from gui.views.facts import FactsView
 from gui.views.view_grid import ViewGrid
 from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
@@ -124,7 +124,9 @@ class HologramsPanel(Panel):
         self.seen, self.phase, self.captured = ImageView(), ImageView(), ImageView()
         self.metrics = FactsView()
         self.plot = plot_widget("iteration", "PSNR", y_unit="dB")
-        self.plot.setMinimumHeight(100)
+        self.plot.setMinimumSize(120, 80)
+        for view in (self.target, self.seen, self.phase, self.captured):
+            view.setMinimumSize(70, 50)
         self.plot.setToolTip("PSNR of the seen image, computed, as the optimiser goes")
         self._arrange()
         self._connect()
@@ -134,6 +136,8 @@ class HologramsPanel(Panel):
     def _arrange(self) -> None:
         rows = QFormLayout()
         rows.setVerticalSpacing(4)
+        rows.setContentsMargins(2, 6, 8, 2)
+        rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         painting = QHBoxLayout()
         painting.addWidget(self.brush)
         painting.addWidget(self.clear)
@@ -166,6 +170,7 @@ class HologramsPanel(Panel):
         scroll.setWidget(inside)
         scroll.setWidgetResizable(True)
         scroll.setFrameShape(QScrollArea.Shape.NoFrame)
+        scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         left = QWidget()
         column = QVBoxLayout(left)
         column.setContentsMargins(0, 0, 0, 0)
@@ -200,7 +205,7 @@ class HologramsPanel(Panel):
         whole.addWidget(left)
         whole.addWidget(right)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([310, 900])
+        whole.setSizes([280, 900])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)
@@ -462,6 +467,7 @@ def _choice(names: list[str], tip: str) -> QComboBox:
     box = QComboBox()
     box.addItems(names)
     box.setToolTip(tip)
+    narrow(box)
     return box
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ class ReconstructionsPanel(Panel):
         self._suggested: Path | None = None
         self.list = QListWidget()
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
+        self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)
         self.list.itemClicked.connect(self._open_item)
         self.open_button = QPushButton("Open…")
@@ -77,6 +79,12 @@ class ReconstructionsPanel(Panel):
         self.convergence = ConvergenceView()
         self.heading = QLabel()
         self.heading.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.place = QLabel()
+        self.place.setProperty("role", "dim")
+        self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.place.setMinimumWidth(10)
+        for hovered in (self.picture.hovered, self.volume.hovered):
+            hovered.connect(self.place.setText)
         self._empty = QLabel("Open a result on the left, or reconstruct one.")
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self._empty.setProperty("role", "dim")
@@ -110,18 +118,22 @@ class ReconstructionsPanel(Panel):
         top = QWidget()
         column = QVBoxLayout(top)
         column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(self.heading)
+        line = QHBoxLayout()
+        line.addWidget(self.heading)
+        line.addWidget(self.place, 1)
+        column.addLayout(line)
         column.addWidget(self.viewers, 1)
         right.addWidget(top)
         right.addWidget(below)
         right.setStretchFactor(0, 3)
         right.setStretchFactor(1, 1)
-        right.setSizes([520, 190])
+        right.setSizes([520, 170])
+        below.setSizes([330, 330])
         whole = QSplitter(Qt.Orientation.Horizontal)
         whole.addWidget(self.tabs)
         whole.addWidget(right)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([300, 900])
+        whole.setSizes([270, 900])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)
@@ -136,7 +148,8 @@ class ReconstructionsPanel(Panel):
     def _list(self, records: list[Path]) -> None:
         self.list.clear()
         for record in records:
-            item = QListWidgetItem(f"{record.stem}\n{record.parent.name}")
+            changed = datetime.fromtimestamp(record.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+            item = QListWidgetItem(f"{record.stem}\n    {changed}  {record.parent.name}")
             item.setToolTip(str(record))
             item.setData(Qt.ItemDataRole.UserRole, record)
             self.list.addItem(item)

@@ -23,13 +23,14 @@ class ConvergenceView(QWidget):
         super().__init__(parent)
         self.plot: Any = plot_widget("iteration")
         self.plot.setLogMode(y=True)
-        self.plot.addLegend(offset=(-5, 5), labelTextColor=colours().dim, brush=None)
-        self.plot.setMinimumHeight(110)
+        self.plot.addLegend(offset=(-5, 5), labelTextColor=colours().dim, brush=colours().panel)
+        self.plot.setMinimumSize(120, 80)
         self.plot.setToolTip(
             "Residual in units of what the noise explains (1: nothing is left to explain), "
             "and relative change of the result an iteration"
         )
-        self.against_time = QCheckBox("against seconds")
+        self.against_time = QCheckBox("against seconds", self.plot)
+        self.against_time.move(60, 2)
         self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")
         self.against_time.toggled.connect(self._draw)
         self.curves: dict[str, Any] = {}
@@ -39,7 +40,6 @@ class ConvergenceView(QWidget):
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(0)
         layout.addWidget(self.plot, 1)
-        layout.addWidget(self.against_time)
 
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
         """Draw histories; ``noise_norm`` is the expected norm of the noise in the residuals' units."""

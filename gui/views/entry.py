@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from PySide6.QtCore import Signal
 from PySide6.QtGui import QFocusEvent
-from PySide6.QtWidgets import QFileDialog, QHBoxLayout, QLineEdit, QToolButton, QWidget
+from PySide6.QtWidgets import QComboBox, QFileDialog, QHBoxLayout, QLineEdit, QToolButton, QWidget
 
 from instrument.errors import BenchError
 
@@ -51,6 +51,7 @@ class Entry(QLineEdit):
         self._tip = tip
         self.setToolTip(tip)
         self.setPlaceholderText(placeholder)
+        self.setMinimumWidth(40)
         self.returnPressed.connect(self.check)
         self.textEdited.connect(lambda _: self._mark(""))
 
@@ -118,6 +119,12 @@ class PathEntry(QWidget):
         if chosen:
             self.entry.setText(chosen)
             self.entry.check()
+
+
+def narrow(box: QComboBox) -> None:
+    """Let a box be narrower than its longest entry."""
+    box.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
+    box.setMinimumContentsLength(5)
 
 
 def existing_path(text: str) -> Path:

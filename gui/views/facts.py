@@ -16,7 +16,7 @@ class FactsView(QTextBrowser):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.setOpenLinks(False)
-        self.setMinimumSize(160, 80)
+        self.setMinimumSize(120, 60)
 
     def show_facts(
         self, facts: Sequence[tuple[str, str]], warnings: Sequence[str] = (), *, simulated: bool = False

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QHBoxLayout, QPushButton, QVBoxLayout, QWidget
 
 from gui.views.levels_bar import LevelsBar
 from gui.widgets.image_view import ImageView
@@ -31,11 +31,10 @@ class PictureView(QWidget):
         self.whole = QPushButton("Whole")
         self.whole.setToolTip("Show the whole picture (the wheel zooms, dragging moves)")
         self.whole.clicked.connect(self.image.whole)
-        self.place = QLabel()
-        self.place.setProperty("role", "dim")
-        self.image.hovered.connect(self.place.setText)
+        self.image.setMinimumSize(70, 50)
+        self.hovered = self.image.hovered
         below = QHBoxLayout()
-        below.addWidget(self.place, 1)
+        below.addStretch()
         below.addWidget(self.whole)
         below.addWidget(self.turn)
         layout = QVBoxLayout(self)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import Signal
+from PySide6.QtCore import Qt, Signal
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -20,7 +20,7 @@ from PySide6.QtWidgets import (
 )
 
 from gui.python_lines import expression
-from gui.views.entry import Entry, PathEntry, existing_path, number
+from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
 from instrument.errors import BenchError
 from instrument.preparation import Crop
 from instrument.reconstruction_file import Outputs
@@ -139,7 +139,10 @@ class ReconstructForm(QWidget):
 
     def _arrange(self) -> None:
         self._rows = QFormLayout()
-        self._rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.ExpandingFieldsGrow)
+        self._rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        self._rows.setContentsMargins(2, 6, 8, 2)
+        for box in (self.kind, self.method, self.model, self.prior):
+            narrow(box)
         self._rows.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
         self._rows.setVerticalSpacing(4)
         self._psfs_row = PathEntry(self.psfs, "folder")
@@ -169,6 +172,7 @@ class ReconstructForm(QWidget):
         scroll.setWidget(inside)
         scroll.setWidgetResizable(True)
         scroll.setFrameShape(QScrollArea.Shape.NoFrame)
+        scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         buttons = QHBoxLayout()
         buttons.addWidget(self.start, 1)
         buttons.addWidget(self.stop)

@@ -17,6 +17,8 @@ from recon.stability.failure import Failure
 
 _SPAN = 1.0
 """The colours reach from a tenth of the severity at the boundary to ten times of it."""
+_STRENGTH = 0.75
+"""Of the colours: figures are read on them."""
 
 
 class StabilityView(QWidget):
@@ -35,13 +37,14 @@ class StabilityView(QWidget):
         self.question.setWordWrap(True)
         self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.place = QLabel(
-            "Blue-green works, brown fails; numbers are errors. Point at a cell for its figures."
+            "Green works, red fails, dark is the boundary; numbers are errors. Point at a cell for more."
         )
         self.place.setProperty("role", "dim")
         self.place.setWordWrap(True)
+        self.legend = QLabel()
+        self.legend.setWordWrap(True)
         self.plot: Any = plot_widget(grid=False)
         self.plot.setMouseEnabled(x=False, y=False)
-        self.plot.addLegend(offset=(10, 10), labelTextColor=colours().text, brush=(20, 23, 28, 200))
         self.image: Any = pg.ImageItem()
         self.plot.scene().sigMouseMoved.connect(self._moved)
         self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
@@ -53,6 +56,7 @@ class StabilityView(QWidget):
         layout.addLayout(row)
         layout.addWidget(self.question)
         layout.addWidget(self.plot, 1)
+        layout.addWidget(self.legend)
         layout.addWidget(self.place)
 
     def show_maps(self, maps: Mapping[str, Any]) -> None:
@@ -90,12 +94,20 @@ class StabilityView(QWidget):
         method = record["methods"][name]
         severity = _grid(method["severity"])
         level = np.log10(np.maximum(severity, 1e-2))
-        self.image.setImage(_coloured(level))
+        self.image.setImage(_coloured(level), levels=(0, 255))
         self.image.setRect(-0.5, -0.5, severity.shape[1], severity.shape[0])
         self.plot.addItem(self.image)
-        self._write_errors(_grid(method["error"]), level)
+        self._write_errors(_grid(method["error"]))
         for number, (other, found) in enumerate(record["methods"].items()):
             self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
+        self.legend.setText(
+            "Boundaries: "
+            + " &nbsp; ".join(
+                f'<span style="color:{_colour(number)}">●</span> {other}'
+                + ("" if found["boundary"] else " (none here)")
+                for number, (other, found) in enumerate(record["methods"].items())
+            )
+        )
         for side, which in (("bottom", "x"), ("left", "y")):
             about = record[which]
             unit = f" ({about['unit']})" if about["unit"] else ""
@@ -105,11 +117,10 @@ class StabilityView(QWidget):
         self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
         self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
 
-    def _write_errors(self, errors: npt.NDArray[np.float64], level: npt.NDArray[np.float64]) -> None:
+    def _write_errors(self, errors: npt.NDArray[np.float64]) -> None:
         for (iy, ix), error in np.ndenumerate(errors):
             if np.isfinite(error):
-                dark = not abs(level[iy, ix]) < 0.6
-                text = pg.TextItem(f"{error:.2g}", color="#e8edf2" if dark else "#20262e", anchor=(0.5, 0.5))
+                text = pg.TextItem(f"{error:.2g}", color=colours().text, anchor=(0.5, 0.5))
                 text.setPos(ix, iy)
                 self.plot.addItem(text)
 
@@ -118,7 +129,6 @@ class StabilityView(QWidget):
     ) -> None:
         places = np.array([(_place(record["x"], x), _place(record["y"], y)) for x, y in points], float)
         self.boundaries[name] = places.reshape(-1, 2)
-        label = name if len(places) else f"{name}: no boundary here"
         width = 4.0 if chosen else 2.0
         self.plot.plot(
             *self.boundaries[name].T,
@@ -126,8 +136,7 @@ class StabilityView(QWidget):
             symbol="o",
             symbolSize=9 if chosen else 6,
             symbolPen=None,
-            symbolBrush=colours().curves[number % len(colours().curves)],
-            name=label,
+            symbolBrush=_colour(number),
         )
 
     def _moved(self, place: Any) -> None:
@@ -159,13 +168,19 @@ def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
     return np.array([[np.nan if v is None else v for v in row] for row in rows], float)
 
 
-def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
-    """Return (rows, columns, 3): blue-green where it works, brown where it fails, dark where not made."""
-    from matplotlib import colormaps
+def _colour(number: int) -> str:
+    return colours().curves[number % len(colours().curves)]
 
-    shown = colormaps["BrBG_r"](np.clip((level + _SPAN) / (2 * _SPAN), 0, 1))[..., :3]
-    shown[~np.isfinite(level)] = 0.1
-    pixels: npt.NDArray[np.uint8] = np.round(255 * shown).astype(np.uint8)
+
+def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Return (rows, columns, 3): green works, red fails, dark at the boundary."""
+    now = colours()
+    works, middle, fails = (pg.mkColor(c).getRgb()[:3] for c in (now.ok, now.window, now.error))
+    share = np.clip(np.nan_to_num(level) / _SPAN, -1, 1)[..., None]
+    end = np.where(share < 0, np.array(works, float), np.array(fails, float))
+    shown = np.array(middle, float) + np.abs(share) * _STRENGTH * (end - np.array(middle, float))
+    shown[~np.isfinite(level)] = pg.mkColor(now.line).getRgb()[:3]
+    pixels: npt.NDArray[np.uint8] = np.round(shown).astype(np.uint8)
     return pixels
 
 

@@ -49,9 +49,12 @@ class VolumeView(QWidget):
     -------
     failed : str
         The volume could not be read.
+    hovered : str
+        Place and value under the mouse.
     """
 
     failed = Signal(str)
+    hovered = Signal(str)
 
     def __init__(self, jobs: JobRunner, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -78,10 +81,10 @@ class VolumeView(QWidget):
         self.front.clicked.connect(lambda column, row: self.go_to(self.point[0], row, column))
         self.side.clicked.connect(lambda column, row: self.go_to(column, row, self.point[2]))
         self.top.clicked.connect(lambda column, row: self.go_to(row, self.point[1], column))
-        self.place = QLabel()
-        self.place.setProperty("role", "dim")
-        for view in (self.front, self.side, self.top):
-            view.hovered.connect(self.place.setText)
+        for view in (self.front, self.side, self.top, self.coloured):
+            view.setMinimumSize(70, 50)
+            view.hovered.connect(self.hovered)
+        self.profile.setMinimumSize(70, 50)
 
         self.brightest_button = QPushButton("Brightest")
         self.brightest_button.setToolTip("The brightest voxels along each axis (Ctrl+B)")
@@ -136,7 +139,6 @@ class VolumeView(QWidget):
         layout.addLayout(bar)
         layout.addWidget(self.progress)
         layout.addLayout(grid, 1)
-        layout.addWidget(self.place)
         layout.addWidget(self.levels)
 
     # What is shown -------------------------------------------------------------------------------

@@ -1,0 +1,264 @@
+"""Screenshots of every panel of the desktop program, on SIMULATED benches, for docs/desktop.md.
+
+    python benchmarks/gui_screenshots.py --out docs/images/gui
+    python benchmarks/gui_screenshots.py --out /tmp/shots --size 1920x1080 --panel reconstructions
+
+What the panels show is made first, with the commands that an operator uses: a calibration and a photograph of
+beads, reconstructed as picture and volume in the window itself, and a hologram on a display whose mask is
+aligned. ``--work`` keeps that between calls. Needs no screen (QT_QPA_PLATFORM=offscreen). A few minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+
+import numpy as np
+from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler
+from PySide6.QtTest import QTest
+
+import instrument
+from gui.app import application
+from gui.main_window import MainWindow
+from gui.panels import PANELS
+from gui.session import BenchSession
+from gui.theme import apply_theme
+from instrument.cli import main as command
+from instrument.config_file import parse_config
+from instrument.images import write_image
+from instrument.sample_images import load_sample
+
+SIZE = "1280x800"
+WAIT_S = 300.0
+SETTLE_MS = 1500
+"""For the live view's first frames, histograms and what else comes by timers."""
+CAMERA = """\
+[bench]
+name = "simulated bench"
+data_folder = "runs"
+[camera]
+driver = "simulated"
+exposure_ms = 1.0
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+[slm]
+driver = "simulated"
+shape = [540, 960]
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+scene = "beads"
+beads = 12
+bead_diameter_um = 300.0
+scene_distance_mm = 40.84
+scene_depth_mm = 50.0
+"""
+SWEEP = ["--z-min", "22", "--z-max", "80", "--planes", "12", "--average", "2"]
+PICTURE_Z_MM = "40.84"
+ALIGNED = {
+    "shift_um": "[0.0, 0.0]",
+    "z_um": "0.0",
+    "roll_mrad": "0.0",
+    "pitch_mrad": "0.0",
+    "yaw_mrad": "0.0",
+    "magnification": "0.0",
+    "relay_distortion_um": "0.0",
+}
+
+
+def main() -> int:
+    """Make the screenshots."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
+    parser.add_argument("--work", type=Path, default=Path("runs/screenshots"), help="folder of what is shown")
+    parser.add_argument("--size", default=SIZE, help=f"of the window in pixels, default {SIZE}")
+    parser.add_argument("--theme", choices=("dark", "red"), default="dark")
+    parser.add_argument("--panel", action="append", choices=list(PANELS), help="only this one; repeatable")
+    given = parser.parse_args()
+    width, height = (int(part) for part in given.size.split("x"))
+    given.out.mkdir(parents=True, exist_ok=True)
+    work = given.work.resolve()
+    names = given.panel or list(PANELS)
+    qInstallMessageHandler(_quietly)
+    apply_theme(application(), given.theme)
+    if set(names) - {"holograms"}:
+        _prepare_camera(work / "camera")
+        window = _open(work / "camera", width, height)
+        for name in names:
+            if name != "holograms":
+                _show(window, name, given.out)
+        _close(window)
+    if "holograms" in names:
+        _prepare_display(work / "display")
+        window = _open(work / "display", width, height)
+        _hologram(window)
+        _grab(window, given.out / "holograms.png")
+        _close(window)
+    return 0
+
+
+# What is shown -----------------------------------------------------------------------------------------
+def _prepare_camera(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    bench = folder / "bench.toml"
+    fast = CAMERA.replace('preset = "tiny"', 'preset = "tiny"\ntime_scale = 0.0')
+    bench.write_text(fast)
+    if not list((folder / "runs").glob("*/calibration")):
+        _do("calibrate", "axial", "--bench", bench, *SWEEP)
+    for scene in ("beads", "bars"):
+        bench.write_text(fast.replace('scene = "beads"', f'scene = "{scene}"'))
+        if not (folder / f"{scene}.tif").exists():
+            _do("snap", "--bench", bench, "--out", folder / f"{scene}.tif")
+    bench.write_text(CAMERA)
+
+
+def _prepare_display(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    text = (Path(instrument.__file__).parent / "display_bench.toml").read_text()
+    for key, value in ALIGNED.items():
+        text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
+        if count != 1:
+            raise SystemExit(f"display_bench.toml has {count} lines {key}; one is expected.")
+    (folder / "bench.toml").write_text(text)
+    write_image(folder / "portrait.png", np.round(255 * load_sample("portrait", (512, 512))).astype(np.uint8))
+
+
+def _do(*words: object) -> None:
+    if command([str(word) for word in words]) != 0:
+        raise SystemExit(f"diffuserbench {' '.join(map(str, words))} failed.")
+
+
+# The window --------------------------------------------------------------------------------------------
+def _open(folder: Path, width: int, height: int) -> MainWindow:
+    bench = folder / "bench.toml"
+    session = BenchSession(parse_config(bench.read_text(), bench))
+    settings = QSettings(str(folder / "window.ini"), QSettings.Format.IniFormat)
+    settings.clear()
+    window = MainWindow(session, settings)
+    window.resize(width, height)
+    window.show()
+    opened: list[bool] = []
+    session.opened.connect(lambda: opened.append(True))
+    session.open()
+    _wait(lambda: bool(opened), "the bench to open")
+    QTest.qWait(SETTLE_MS)
+    return window
+
+
+def _close(window: MainWindow) -> None:
+    for panel in window._panels.values():
+        panel.shutdown()
+    window.session.close()
+    _wait(lambda: window.session.is_closed, "the bench to close")
+
+
+def _show(window: MainWindow, name: str, out: Path) -> None:
+    window.show_panel(name)
+    QTest.qWait(SETTLE_MS)
+    if name == "reconstructions":
+        _reconstructions(window, out)
+        return
+    _grab(window, out / f"{name}.png")
+
+
+def _reconstructions(window: MainWindow, out: Path) -> None:
+    """Reconstruct a picture and a volume with the form, and look at them."""
+    from gui.panels.reconstructions import ReconstructionsPanel
+    from gui.views.reconstruct_form import CALIBRATION, VOLUME
+
+    panel = window.panel("reconstructions")
+    assert isinstance(panel, ReconstructionsPanel)
+    folder = panel.session.runs_folder.parent
+    calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[-1]
+    form = panel.form
+    for kind, scene, prior, tau, shot in (
+        (CALIBRATION, "bars", "tv", "", "reconstruct"),
+        (VOLUME, "beads", "l1", "0.05", "volume"),
+    ):
+        panel.tabs.setCurrentWidget(form)
+        form.kind.setCurrentText(kind)
+        form.image.setText(str(folder / f"{scene}.tif"))
+        form.psfs.setText(str(calibration))
+        form.z_mm.setText(PICTURE_Z_MM)
+        form.prior.setCurrentText(prior)
+        form.tau.setText(tau)
+        form.iterations.setText("150")
+        panel._suggest_out()
+        job = panel.reconstruct()
+        if job is None:
+            raise SystemExit(panel._note.toolTip())
+        _wait(lambda: panel.result is not None, "the reconstruction")
+        if kind == CALIBRATION:
+            panel.picture.turned_deg = 90
+            panel.picture.turn_by_90()
+            _grab(window, out / f"{shot}.png")
+            continue
+        _wait(lambda: panel.volume.projections is not None, "the projections")
+        panel.tabs.setCurrentIndex(0)
+        _grab(window, out / f"{shot}.png")
+        brightest = np.unravel_index(
+            panel.volume.projections.front.argmax(), panel.volume.projections.front.shape
+        )
+        plane = int(panel.volume.projections.deepest[brightest])
+        panel.volume.set_mode("slices")
+        panel.volume.go_to(plane, int(brightest[0]), int(brightest[1]))
+        _grab(window, out / "slices.png")
+
+
+def _hologram(window: MainWindow) -> None:
+    """Compute a foveated hologram, show it, photograph it."""
+    from gui.panels.holograms import HologramsPanel
+
+    panel = window.show_panel("holograms")
+    assert isinstance(panel, HologramsPanel)
+    panel.picture.setText(str(panel.session.runs_folder.parent / "portrait.png"))
+    panel.picture.check()
+    panel.weights_mode.setCurrentText("a fovea, dragged")
+    panel.target.set_fovea((0.42, 0.5), 0.24)
+    panel.iterations.setText("60")
+    for start in (panel.compute, panel.photograph):
+        job = start()
+        if job is None:
+            raise SystemExit(panel._note.toolTip())
+        _wait(lambda job=job: job.is_over, job.title)
+        if job.error is not None:
+            raise SystemExit(f"{job.title}: {job.error}")
+
+
+def _grab(window: MainWindow, path: Path) -> None:
+    QTest.qWait(SETTLE_MS)
+    if not window.grab().save(str(path)):
+        raise SystemExit(f"{path}: could not be written.")
+    print(path)
+
+
+def _wait(until: Callable[[], bool], what: str) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not until():
+        if time.monotonic() > end_s:
+            raise SystemExit(f"Waited {WAIT_S:g} s for {what} in vain.")
+        QTest.qWait(50)
+
+
+def _quietly(kind: QtMsgType, _context: object, text: str) -> None:
+    """Pass on Qt's messages but the one that the offscreen platform has for every window."""
+    if "propagateSizeHints" not in text:
+        print(f"{kind.name}: {text}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
