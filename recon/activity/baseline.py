@@ -20,7 +20,7 @@ FLOOR_SHARE = 0.1
 """Least baseline that a change is divided by, relative to the bright part of the picture: where there is
 next to nothing, a relative change means nothing."""
 
-BRIGHT_PERCENTILE = 99.0
+BRIGHT_PERCENTILE = 99.9
 
 _ANCHORS_A_WINDOW = 4
 

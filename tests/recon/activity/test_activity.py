@@ -88,6 +88,13 @@ def test_noise_alone_has_no_regions() -> None:
     assert find_regions(frames) == []
 
 
+def test_noise_that_is_flat_in_patches_has_no_regions() -> None:
+    patches = np.random.default_rng(0).standard_normal((150, 10, 12)).astype(np.float32)
+    frames = 1 + 0.1 * np.kron(patches, np.ones((1, 4, 4), np.float32))
+    assert local_correlation(frames).max() > 0.9
+    assert find_regions(frames) == []
+
+
 def test_neighbours_with_other_courses_stay_apart() -> None:
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     spots = np.array([np.exp(-((y - 20) ** 2 + (x - c) ** 2) / 8) for c in (20, 27)])
