@@ -12,11 +12,11 @@ from recon.stability.maps_light import ELECTRONS, PICTURE, scene_map
 from recon.stability.scene_trial import Options, judge, run_scene, scene_of, solve, spec_at
 
 SIZE_ERROR = Axis(
-    "size_error", "depth error: PSF too large by", "%", (0.1, 0.3, 1, 2, 3, 5), (0.3, 1, 3), logarithmic=True
+    "size_error", "depth error: PSF too large by", "%", (0.5, 1, 2, 3, 5, 8), (1, 3, 5, 8), logarithmic=True
 )
-ROTATION = Axis("drift_deg", "rotation", "degrees", (0.1, 0.3, 1, 2, 4, 8), (0.3, 1, 4), logarithmic=True)
+ROTATION = Axis("drift_deg", "rotation", "degrees", (0.3, 1, 3, 5, 8, 12), (1, 3, 5, 8), logarithmic=True)
 SCALE = Axis(
-    "drift_scale", "swelling", "relative", (0.001, 0.003, 0.01, 0.03, 0.1), (0.003, 0.01, 0.03), True
+    "drift_scale", "swelling", "relative", (0.003, 0.01, 0.03, 0.1, 0.2), (0.01, 0.03, 0.1, 0.2), True
 )
 SHIFT = Axis("drift_px", "shift", "pixels", (0.1, 0.3, 0.6, 1, 2, 4), (0.3, 1, 4), logarithmic=True)
 COLOUR = Axis(
@@ -65,7 +65,7 @@ MAPS = (
         PICTURE,
         ROTATION,
         SCALE,
-        ("admm tv", "wiener"),
+        ("admm tv", "admm l1", "wiener"),
     ),
     scene_map(
         "shift",

@@ -38,11 +38,7 @@ def _misplaced(kind: str, method: str, x: float, y: float, seed: int, size: Size
     factor = METHODS[method]
     hologram = _hologram(factor, seed, ITERATIONS[size])
     half = 0.5 * SLM[1] * factor
-    if kind == "moved":
-        pose = Pose(shift_x=x, roll_mrad=1e3 * y / half)
-    else:
-        corner = float(np.hypot(SLM[0], SLM[1])) * factor / 2
-        pose = Pose(z_um=x, cubic=y / corner**3)
+    pose = Pose(shift_x=x, roll_mrad=1e3 * y / half) if kind == "moved" else Pose(z_um=x, cubic=y)
     psnr_db = hologram.psnr_db(pose)
     return Trial(psnr_db, {Failure.PICTURE: bounded(10 ** ((PSNR_DB - psnr_db) / 20))})
 

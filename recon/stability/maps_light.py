@@ -33,8 +33,8 @@ BACKGROUND = Axis(
     "background",
     "smooth background",
     "of the scene's mean",
-    (0.01, 0.03, 0.1, 0.3, 1, 3),
-    (0.01, 0.1, 1),
+    (0.03, 0.1, 0.3, 1, 3, 10, 30),
+    (0.1, 1, 10, 30),
     logarithmic=True,
 )
 LEFT_OUT = ", left out"
@@ -124,7 +124,17 @@ MAPS = (
         PICTURE,
         BACKGROUND,
         ELECTRONS,
-        ("admm tv", "wiener", "admm tv" + SUBTRACTED),
+        ("admm tv", "admm l1", "wiener", "admm tv" + SUBTRACTED),
+        Options(subtract_background=False),
+    ),
+    scene_map(
+        "background-points",
+        "Background and light: points",
+        "How much smooth stray light do thirty points stand that nobody subtracts?",
+        POINTS,
+        BACKGROUND,
+        ELECTRONS,
+        ("admm l1", "admm tv", "wiener"),
         Options(subtract_background=False),
     ),
 )

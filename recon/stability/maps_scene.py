@@ -17,11 +17,18 @@ from recon.stability.map import Axis, Size, StressMap, Trial
 from recon.stability.scene_trial import PIXELS, Options, run_scene, spec_at
 
 VOXELS = Axis(
-    "lit", "voxels that are not dark", "share", (0.0003, 0.001, 0.003, 0.01, 0.03), (0.001, 0.01), True
+    "lit",
+    "voxels that are not dark",
+    "share",
+    (0.0003, 0.001, 0.003, 0.01, 0.03),
+    (0.0003, 0.001, 0.003, 0.01),
+    True,
 )
-DEPTHS = Axis("depths", "voxels per pixel (depth planes)", "planes", (1, 2, 4, 8), (1, 4), True)
-LEAVES = Axis("leaves", "edges: shapes in the picture", "shapes", (4, 10, 25, 60, 150), (4, 60), True)
-PER_PIXEL = Axis("per_pixel", "unknowns per measured pixel", "by erasing", (1, 1.5, 2.5, 5, 10), (1, 5), True)
+DEPTHS = Axis("depths", "voxels per pixel (depth planes)", "planes", (1, 2, 4, 8), (1, 2, 8), True)
+LEAVES = Axis("leaves", "edges: shapes in the picture", "shapes", (4, 10, 25, 60, 150), (4, 20, 100), True)
+PER_PIXEL = Axis(
+    "per_pixel", "unknowns per measured pixel", "by erasing", (1, 1.5, 2.5, 5, 10), (1, 2, 4), True
+)
 SEPARATION = Axis(
     "separation", "separation of neighbours", "pixels", (1, 1.5, 2, 2.5, 3, 4, 5, 6), (1.5, 2.5, 4, 6)
 )
@@ -35,7 +42,8 @@ LEAVES_AT_1 = 45
 def _lit_voxels(method: str, x: float, y: float, seed: int, size: Size) -> Trial:
     depths = int(y)
     beads = max(x * depths * PIXELS[size] ** 2, 1)
-    base = SceneSpec("beads", depths=depths, layers=(0.5, 0.5) if depths == 1 else (0.0, 1.0))
+    flat = depths == 1
+    base = SceneSpec("beads", depths=depths, z_near=3.0, z_far=5.0, layers=(0.5, 0.5) if flat else (0.0, 1.0))
     spec = spec_at(base, size, seed, density=beads / BEADS_AT_1)
     return run_scene(spec, method, Options(), size)
 

@@ -14,8 +14,19 @@ from recon.stability.shipped import shipped_maps
 
 Floats = npt.NDArray[np.float64]
 
-FEATURES = ("detail", "unexplained", "load", "signal", "similarity", "erased", "saturated", "unsettled")
-"""Evidence by which cases are alike."""
+FEATURES = (
+    "detail",
+    "unexplained",
+    "load",
+    "signal",
+    "similarity",
+    "dimming",
+    "erased",
+    "saturated",
+    "unsettled",
+    "grain",
+)
+"""Evidence by which cases are alike; ``grain`` is that of edges over lit voxels."""
 FLOOR = {
     "detail": 0.05,
     "unexplained": 0.02,
@@ -23,9 +34,12 @@ FLOOR = {
     "signal": 0.1,
     "saturated": 0.01,
     "unsettled": 0.05,
+    "dimming": 0.01,
+    "grain": 0.05,
 }
 """Below these nothing can be told from zero; above, ratios count."""
-WEIGHT = {"similarity": 2.0, "erased": 1.0, "unsettled": 0.3, "signal": 0.5}
+NOTHING = 1e-3
+WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5}
 """How much a feature's difference counts, relative to a ratio of ``e`` in the others."""
 
 GROUPS = {
@@ -64,8 +78,10 @@ class Cases:
 def place_of(evidence: Mapping[str, Any]) -> Floats:
     """Return where evidence lies in the space of :class:`Cases`."""
     coordinates = []
+    # Surfaces have fewer edges than lit voxels, points more: priors fail on them in different ways.
+    numbers = {**evidence, "grain": (evidence["edges"] + NOTHING) / (evidence["lit"] + NOTHING)}
     for name in FEATURES:
-        value = float(evidence[name])
+        value = float(numbers[name])
         if name in FLOOR:
             value = float(np.log(max(value, 0.0) + FLOOR[name]))
         coordinates.append(WEIGHT.get(name, 1.0) * value)

@@ -48,6 +48,8 @@ class Evidence:
         Depths.
     similarity : float
         Greatest inner product of PSFs of neighbouring depths; 0 for one depth.
+    dimming : float
+        Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are.
     unsettled : float
         Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
     """
@@ -62,6 +64,7 @@ class Evidence:
     load: float
     planes: int
     similarity: float
+    dimming: float
     unsettled: float
 
     def as_json(self) -> dict[str, float]:
@@ -114,6 +117,7 @@ def measure(
         load=min(lit, edges) * volume.size / len(used),
         planes=len(volume),
         similarity=_similarity(psfs),
+        dimming=_dimming(psfs),
         unsettled=unsettled,
     )
 
@@ -155,6 +159,11 @@ def _similarity(psfs: Array) -> float:
     flat = psfs.reshape(len(psfs), -1).astype(np.float64)
     flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
     return float(np.max(np.sum(flat[1:] * flat[:-1], axis=1)))
+
+
+def _dimming(psfs: Array) -> float:
+    norms = np.linalg.norm(psfs.reshape(len(psfs), -1).astype(np.float64), axis=1)
+    return float(norms.min() / norms.max()) if norms.max() > 0 else 1.0
 
 
 def averaged(channels: list[Evidence]) -> Evidence:

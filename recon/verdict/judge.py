@@ -55,6 +55,11 @@ STRESSES: Mapping[str, tuple[int, str, str]] = {
         "PSFs of neighbouring depths are {value:.0%} alike",
         "Fewer depths would help, or a longer range of depths",
     ),
+    "dimming": (
+        1,
+        "The farthest points are {value:.0%} as bright on the sensor as the nearest",
+        "A shorter range of depths would help, or one reconstruction for the far part by itself",
+    ),
     "erased": (
         -1,
         "{value:.0%} of the pixels are not used",
@@ -90,19 +95,27 @@ def verdict_on(evidence: Evidence, method: str) -> Verdict:
     cases = None if group is None else cases_of(group)
     if cases is None or len(cases.severities) < FEWEST:
         return Verdict(Region.UNKNOWN, method, None, (), numbers)
-    place = place_of(numbers)
+    place = _no_better_than_any(cases, place_of(numbers))
     share, nearest = failing_share(cases, place)
     if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all() or share >= LOST:
         region = Region.OUTSIDE
-    elif share <= RELIABLE and nearest <= FAR:
-        region = Region.INSIDE
+    elif nearest > FAR:
+        region = Region.UNKNOWN
     else:
-        region = Region.NEAR
-    basis = (
-        f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)})"
-        + ("" if nearest <= FAR else "; none of them is much like this one")
-    )
+        region = Region.INSIDE if share <= RELIABLE else Region.NEAR
+    basis = f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)})"
     return Verdict(region, method, share, _findings(cases, place, numbers, share), numbers, basis)
+
+
+def _no_better_than_any(cases: Cases, place: Floats) -> Floats:
+    """Return a place moved to the best case's where it is better: more light than the most is as good."""
+    moved = place.copy()
+    for index, name in enumerate(FEATURES):
+        if name in STRESSES:
+            column = cases.places[:, index]
+            better = STRESSES[name][0]
+            moved[index] = min(moved[index], column.max()) if better > 0 else max(moved[index], column.min())
+    return moved
 
 
 def failing_share(cases: Cases, place: Floats) -> tuple[float, float]:
@@ -124,6 +137,8 @@ def _findings(cases: Cases, place: Floats, numbers: Mapping[str, float], share: 
         return ()
     findings = []
     for index, name in enumerate(FEATURES):
+        if name not in STRESSES:
+            continue
         better, words, help_ = STRESSES[name]
         typical = float(np.median(good[:, index]))
         if (place[index] - typical) * better >= 0:

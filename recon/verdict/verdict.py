@@ -21,7 +21,7 @@ WORDS: Mapping[Region, str] = {
     Region.INSIDE: "reliable: inside the region where {method} works",
     Region.NEAR: "doubtful: near the boundary where {method} fails",
     Region.OUTSIDE: "not reliable: outside the region where {method} works",
-    Region.UNKNOWN: "not judged: no stability map was made for {method}",
+    Region.UNKNOWN: "not judged: the stability maps hold no case of {method} that is much like this one",
 }
 
 
