@@ -87,8 +87,12 @@ class Dark:
     reason: str
 
 
-def check_pair(psf: ImageFile, image: ImageFile, *, allow_mixed_depth: bool = False) -> None:
+def check_pair(
+    psf: ImageFile, image: ImageFile, *, allow_mixed_depth: bool = False, mosaic: bool = False
+) -> None:
     """Refuse a PSF and an image that cannot belong together.
+
+    ``mosaic``: the image is a colour sensor's raw frame, so that a PSF in colour may belong to it.
 
     Raises
     ------
@@ -104,7 +108,7 @@ def check_pair(psf: ImageFile, image: ImageFile, *, allow_mixed_depth: bool = Fa
             f"both must have one shape.{turned}",
             "Take both with the same camera, region of interest and binning.",
         )
-    if psf.is_colour and not image.is_colour:
+    if psf.is_colour and not (image.is_colour or mosaic):
         raise FileError(
             psf.path,
             f"the PSF is colour, but the image {image.path} is grey.",

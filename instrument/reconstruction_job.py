@@ -15,6 +15,7 @@ from instrument.calibration_file import is_calibration, load_calibration
 from instrument.erasures import Choice, Erased, erasures_of, reduce_valid
 from instrument.errors import BenchError, FileError
 from instrument.images import ImageFile, read_image
+from instrument.mosaic import mosaic_of, reduce_mosaic, require_mosaic
 from instrument.preparation import (
     AUTO_PIXELS,
     Crop,
@@ -31,6 +32,7 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
+from recon.bayer import Pattern, interpolate_bayer
 from recon.noise import NoiseModel
 from recon.refocus import at_depth
 from recon.types import Calibration
@@ -62,6 +64,8 @@ class Reduction:
 
 
 DarkChoice = Literal["auto"] | float | Path
+MosaicChoice = Pattern | Literal["auto"] | None
+"""A colour mosaic; None for none; "auto" for what the image's metadata say."""
 Binning = int | None
 """Pixels to average along each axis; None chooses automatically."""
 
@@ -111,10 +115,14 @@ def job_from_files(
     crop: Crop | None = None,
     binning: Binning = None,
     erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
     allow_saturated: bool = False,
     allow_mixed_depth: bool = False,
 ) -> Job:
     """Prepare a PSF and an image from anywhere.
+
+    ``mosaic`` names the colour mosaic of which a grey image is the raw frame; its PSF, when grey as well,
+    is taken to be one too.
 
     Raises
     ------
@@ -124,14 +132,23 @@ def job_from_files(
     psf, image = read_image(psf_path), read_image(image_path)
     _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=allow_saturated)
-    check_pair(psf, image, allow_mixed_depth=allow_mixed_depth)
+    pattern = _pattern(mosaic, image)
+    check_pair(psf, image, allow_mixed_depth=allow_mixed_depth, mosaic=pattern is not None)
     level = _dark(dark, psf, image)
     window = _window(crop, image)
     factor = auto_binning(window) if binning is None else binning
+    if pattern is not None and binning is None and factor > 1:
+        factor += factor % 2
     erased = erasures_of(erasures, image)
     valid = _reduced_valid(erased, crop, factor)
-    measurement = reduce(image.pixels, level.image, crop, factor)
-    psf_pixels = np.maximum(reduce(psf.pixels, level.psf, crop, factor), 0)
+    if pattern is None:
+        measurement = reduce(image.pixels, level.image, crop, factor)
+        psf_pixels = reduce(psf.pixels, level.psf, crop, factor)
+    else:
+        measurement, known = reduce_mosaic(reduce(image.pixels, level.image, None, 1), pattern, crop, factor)
+        valid = known if valid is None else known & valid[..., None]
+        psf_pixels = _mosaic_psf(reduce(psf.pixels, level.psf, None, 1), pattern, crop, factor)
+    psf_pixels = np.maximum(psf_pixels, 0)
     if not psf_pixels.any():
         raise FileError(
             psf.path,
@@ -147,6 +164,7 @@ def job_from_files(
             "Dark": level.reason,
             "Pixels": _describe_window(crop, binning, factor, measurement),
             "Erased": erased.reason,
+            **_mosaic_note(pattern),
         },
         valid,
         (*warnings, *_saturation(image, erased)),
@@ -157,6 +175,7 @@ def job_from_files(
             "crop": _crop_record(crop, image),
             "binning": factor,
             "erased": erased.reason,
+            "mosaic": pattern,
         },
         psf.is_simulated or image.is_simulated,
         Reduction(1, level.image, crop, factor),
@@ -171,6 +190,7 @@ def job_from_calibration(
     crop: Crop | None = None,
     binning: Binning = None,
     erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
 ) -> Job:
     """Prepare an image for a calibration folder, or a run folder with one calibration inside.
 
@@ -186,6 +206,7 @@ def job_from_calibration(
         crop=crop,
         binning=binning,
         erasures=erasures,
+        mosaic=mosaic,
     )
 
 
@@ -198,20 +219,30 @@ def job_with(
     crop: Crop | None = None,
     binning: Binning = None,
     erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
 ) -> Job:
     """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
     image = read_image(image_path)
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
-    if calibration.psfs.shape[1] > 1 and not image.is_colour:
+    pattern = _pattern(mosaic, image)
+    if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
     pixels, level = _calibrated_dark(dark, image, calibration, match)
     factor = 1 if binning is None else binning
     erased = erasures_of(erasures, image)
     matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
     valid = _reduced_valid(matched, crop, factor)
-    measurement = reduce(pixels, level.image, crop, factor)
+    if pattern is None:
+        measurement = reduce(pixels, level.image, crop, factor)
+    else:
+        offset = _on_every_pixel(level.image, match, image.pixels.shape)
+        measurement, known = _matched_mosaic(
+            reduce(image.pixels, offset, None, 1), pattern, match, crop, factor
+        )
+        valid = known if valid is None else known & valid[..., None]
+        calibration = _in_colour(calibration, pattern, match)
     return Job(
         measurement,
         _reduced_calibration(calibration, crop, factor),
@@ -222,6 +253,7 @@ def job_with(
             "Dark": level.reason,
             "Pixels": _describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
+            **_mosaic_note(pattern),
         },
         valid,
         _saturation(image, erased),
@@ -233,6 +265,7 @@ def job_with(
             "crop": None if crop is None else _slices_record(crop.slices((shape[0], shape[1]))),
             "binning": factor,
             "erased": erased.reason,
+            "mosaic": pattern,
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
         Reduction(match, level.image, crop, factor),
@@ -293,6 +326,57 @@ def find_calibration(folder: Path) -> Path:
         )
         raise FileError(folder, f"holds {found}; exactly one is expected.")
     return inside[0]
+
+
+# Colour mosaics ----------------------------------------------------------------------------------------
+def _pattern(choice: MosaicChoice, image: ImageFile) -> Pattern | None:
+    pattern = mosaic_of(image) if choice == "auto" else choice
+    if pattern is not None:
+        require_mosaic(image, pattern)
+    return pattern
+
+
+def _mosaic_psf(psf: FloatImage, pattern: Pattern, crop: Crop | None, factor: int) -> FloatImage:
+    """Bring a PSF to a mosaic's measurement: binned, each colour by the pixels that saw it, as that is."""
+    if psf.ndim == 3:
+        return reduce(psf, 0.0, crop, factor)
+    if factor > 1:
+        return reduce_mosaic(psf, pattern, crop, factor)[0]
+    return reduce(interpolate_bayer(psf, pattern), 0.0, crop, 1)
+
+
+def _mosaic_note(pattern: Pattern | None) -> dict[str, str]:
+    if pattern is None:
+        return {}
+    return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
+
+
+def _matched_mosaic(
+    raw: FloatImage, pattern: Pattern, match: int, crop: Crop | None, factor: int
+) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
+    """Bring a raw frame to a calibration's pixels, then cut and bin on those."""
+    if match == 1:
+        return reduce_mosaic(raw, pattern, crop, factor)
+    image = reduce(reduce_mosaic(raw, pattern, None, match)[0], 0.0, crop, factor)
+    return image, np.ones(image.shape, bool)
+
+
+def _on_every_pixel(level: float | FloatImage, match: int, shape: tuple[int, ...]) -> float | FloatImage:
+    """Bring a dark level on a calibration's pixels to those of the raw frame."""
+    if not isinstance(level, np.ndarray):
+        return level
+    spread = np.repeat(np.repeat(level, match, axis=0), match, axis=1)
+    grown: FloatImage = np.zeros(shape[:2], np.float32)
+    grown[: spread.shape[0], : spread.shape[1]] = spread
+    return grown
+
+
+def _in_colour(calibration: Calibration, pattern: Pattern, match: int) -> Calibration:
+    """Fill the colours of PSFs that are raw frames themselves; binned ones are grey and serve all colours."""
+    if calibration.psfs.shape[1] > 1 or match > 1:
+        return calibration
+    psfs = np.stack([np.moveaxis(interpolate_bayer(psf[0], pattern), -1, 0) for psf in calibration.psfs])
+    return replace(calibration, psfs=psfs, background=None)
 
 
 # Pieces ------------------------------------------------------------------------------------------------

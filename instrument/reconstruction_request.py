@@ -17,6 +17,7 @@ from instrument.reconstruction_job import (
     Binning,
     DarkChoice,
     Job,
+    MosaicChoice,
     job_from_calibration,
     job_from_files,
     refocused,
@@ -26,6 +27,7 @@ from recon.gpu.namespace import DEVICES, Device
 from recon.noise import NoiseModel
 from recon.picture import reconstruct
 from recon.result import Reconstruction
+from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.volume.channel import PRIORS as VOLUME_PRIORS
 from recon.volume.channel import VolumePrior
@@ -76,7 +78,9 @@ class Settings:
         One of :data:`recon.volume.model.MODELS`.
     prior : str or None
         None: the method's default.
-    tau, noise, iterations, time_s, tolerance
+    mosaic : str or None
+        Colour mosaic of which the photograph is a raw frame, "auto" for what its metadata say.
+    tau, noise, iterations, time_s, tolerance, stop_at_noise
         As :func:`recon.reconstruct`. Without ``iterations`` and ``time_s`` a default count applies.
     """
 
@@ -91,6 +95,8 @@ class Settings:
     iterations: int | None = None
     time_s: float | None = None
     tolerance: float | None = None
+    stop_at_noise: bool = False
+    mosaic: MosaicChoice = "auto"
 
     def limit(self, default: int) -> int | None:
         """Return the largest count of iterations: as given, or the default, or none where time is the end."""
@@ -141,12 +147,12 @@ class PictureRequest:
             When a file cannot be used, or the files do not belong together.
         """
         given = self.settings
-        if self.method == "wiener" and (given.iterations, given.time_s, given.tolerance) != (
-            None,
-            None,
-            None,
-        ):
-            raise BenchError("wiener is one shot: --iterations, --time and --tolerance do not apply to it.")
+        rules = (given.iterations, given.time_s, given.tolerance, given.stop_at_noise or None)
+        if self.method == "wiener" and rules != (None, None, None, None):
+            raise BenchError(
+                "wiener is one shot: --iterations, --time, --tolerance and --stop-at-noise do not apply "
+                "to it."
+            )
         if self.calibration is not None and self.psf is None:
             job = job_from_calibration(
                 self.calibration,
@@ -155,6 +161,7 @@ class PictureRequest:
                 crop=given.crop,
                 binning=given.binning,
                 erasures=given.erasures,
+                mosaic=given.mosaic,
             )
         elif self.psf is not None and self.calibration is None:
             job = job_from_files(
@@ -164,6 +171,7 @@ class PictureRequest:
                 crop=given.crop,
                 binning=given.binning,
                 erasures=given.erasures,
+                mosaic=given.mosaic,
                 allow_saturated=self.allow_saturated,
                 allow_mixed_depth=self.allow_mixed_depth,
             )
@@ -172,7 +180,12 @@ class PictureRequest:
         return job if self.z_um is None else refocused(job, self.z_um)
 
     def solve(
-        self, job: Job, *, watch: Watch | None = None, cancel: threading.Event | None = None
+        self,
+        job: Job,
+        *,
+        watch: Watch | None = None,
+        cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
     ) -> Reconstruction:
         """Reconstruct what :meth:`prepare` returned.
 
@@ -195,8 +208,10 @@ class PictureRequest:
             time_s=given.time_s,
             erasures=None if job.valid is None else ~job.valid,
             tolerance=given.tolerance,
+            stop_at_noise=given.stop_at_noise,
             callback=watch,
             cancel=cancel,
+            keeper=keeper,
         )
 
     def share(self, record: IterationRecord) -> float:
@@ -216,6 +231,8 @@ class VolumeRequest:
         As :func:`instrument.volume_job.volume_job`.
     estimate_background : bool
         Estimate a smooth background as well.
+    positive_background : bool
+        One that is nowhere negative.
     scratch : Path or None
         Folder on a fast disk for what does not fit into memory.
     memory_gib : float or None
@@ -228,6 +245,7 @@ class VolumeRequest:
     image: Path
     psfs: Path
     estimate_background: bool = True
+    positive_background: bool = False
     scratch: Path | None = None
     memory_gib: float | None = None
     device: Device = "cpu"
@@ -237,6 +255,8 @@ class VolumeRequest:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
         given = self.settings
         known_volume_prior(given.prior or "tv")
+        if self.positive_background and not self.estimate_background:
+            raise BenchError("--positive-background and --no-background exclude each other.")
         return volume_job(
             self.psfs,
             self.image,
@@ -244,10 +264,16 @@ class VolumeRequest:
             crop=given.crop,
             binning=given.binning,
             erasures=given.erasures,
+            mosaic=given.mosaic,
         )
 
     def solve(
-        self, job: Job, *, watch: Watch | None = None, cancel: threading.Event | None = None
+        self,
+        job: Job,
+        *,
+        watch: Watch | None = None,
+        cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
     ) -> VolumeReconstruction:
         """Reconstruct what :meth:`prepare` returned; errors as :meth:`PictureRequest.solve`."""
         given = self.settings
@@ -258,6 +284,7 @@ class VolumeRequest:
             tau=given.tau,
             model=given.model,
             estimate_background=self.estimate_background,
+            positive_background=self.positive_background,
             erasures=None if job.valid is None else ~job.valid,
             noise=job.binned_noise(given.noise),
             scratch=self.scratch,
@@ -266,8 +293,10 @@ class VolumeRequest:
             iterations=given.limit(VOLUME_ITERATIONS),
             time_s=given.time_s,
             tolerance=1e-3 if given.tolerance is None else given.tolerance,
+            stop_at_noise=given.stop_at_noise,
             callback=watch,
             cancel=cancel,
+            keeper=keeper,
         )
 
     def share(self, record: IterationRecord) -> float:

@@ -10,7 +10,7 @@ from instrument.calibration_file import is_calibration
 from instrument.erasures import Choice
 from instrument.images import read_stack
 from instrument.preparation import Crop, darkest_block
-from instrument.reconstruction_job import DarkChoice, Job, job_from_calibration, job_with
+from instrument.reconstruction_job import DarkChoice, Job, MosaicChoice, job_from_calibration, job_with
 from instrument.store.layout import STATE
 from recon.types import Calibration
 
@@ -23,6 +23,7 @@ def volume_job(
     crop: Crop | None = None,
     binning: int | None = None,
     erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
 ) -> Job:
     """Prepare a photograph and PSFs at several depths.
 
@@ -32,7 +33,7 @@ def volume_job(
         A calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one image
         file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs lose
         their darkest level; float ones are taken to be free of any offset.
-    image, dark, crop, binning, erasures
+    image, dark, crop, binning, erasures, mosaic
         As :func:`instrument.reconstruction_job.job_from_calibration`.
 
     Raises
@@ -40,7 +41,9 @@ def volume_job(
     FileError, BenchError
     """
     if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
-        return job_from_calibration(psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
+        return job_from_calibration(
+            psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures, mosaic=mosaic
+        )
     stack = read_stack(psfs, leave_out=image).pixels
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
@@ -49,4 +52,6 @@ def volume_job(
     calibration = Calibration(
         np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs)}
     )
-    return job_with(calibration, psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures)
+    return job_with(
+        calibration, psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures, mosaic=mosaic
+    )

@@ -15,7 +15,7 @@ from recon.operators.base import Array, LinearOperator
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
 from recon.solvers.admm import Admm
-from recon.solvers.base import Callback, Outcome
+from recon.solvers.base import Callback, Keeper, Outcome
 from recon.solvers.fista import Fista
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.stopping import StoppingRules
@@ -38,6 +38,7 @@ class Problem:
     rules: StoppingRules
     callback: Callback | None
     cancel: threading.Event | None
+    keeper: Keeper | None = None
 
 
 Solve = Callable[[Problem], Outcome]
@@ -71,12 +72,12 @@ def method_named(name: str) -> Method:
 
 def _admm(p: Problem) -> Outcome:
     solver = Admm(p.operator, p.data, p.prior, initial=p.initial)
-    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel, keeper=p.keeper)
 
 
 def _sensor_admm(p: Problem) -> Outcome:
     solver = SensorAdmm(p.operator, p.data, p.prior, initial=p.initial)
-    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel, keeper=p.keeper)
 
 
 def _gpu(p: Problem) -> Outcome:
@@ -84,12 +85,12 @@ def _gpu(p: Problem) -> Outcome:
     from recon.gpu.picture import picture_solver
 
     solver = picture_solver(array_namespace("gpu"), p.operator, p.data, p.prior, p.initial)
-    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel, keeper=p.keeper)
 
 
 def _fista(p: Problem) -> Outcome:
     solver = Fista(p.operator, p.data, p.prior, initial=p.initial)
-    return solver.run(p.rules, callback=p.callback, cancel=p.cancel)
+    return solver.run(p.rules, callback=p.callback, cancel=p.cancel, keeper=p.keeper)
 
 
 def _wiener(p: Problem) -> Outcome:

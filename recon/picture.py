@@ -16,7 +16,7 @@ from recon.noise import NoiseModel
 from recon.preparation import Field, Prepared, prepare
 from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
 from recon.result import Reconstruction
-from recon.solvers.base import Outcome, Solver
+from recon.solvers.base import Keeper, Outcome, Solver
 from recon.solvers.stopping import IterationRecord, StoppingRules
 from recon.types import Calibration
 from recon.varying_picture import model_of, reconstruct_varying
@@ -67,6 +67,7 @@ def reconstruct(
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
     judged: bool = True,
+    keeper: Keeper | None = None,
 ) -> Reconstruction:
     """Reconstruct the picture of one depth from a lensless camera's measurement.
 
@@ -114,6 +115,8 @@ def reconstruct(
         Set it to stop after the iteration in progress.
     judged : bool
         Say whether the result can be trusted (``verdict``), at the cost of about two iterations.
+    keeper : Keeper, optional
+        Keeps the solver's state, and has it go on from what was kept of the same reconstruction.
 
     Returns
     -------
@@ -146,9 +149,11 @@ def reconstruct(
             background=background,
             erasures=erasures,
             field=field,
+            stop_at_noise=stop_at_noise,
             callback=callback,
             cancel=cancel,
             judged=judged,
+            keeper=keeper,
         )
     problem = prepare(
         measurement, calibration, z_um=z_um, noise=noise, background=background, erasures=erasures
@@ -184,6 +189,7 @@ def reconstruct(
             rules=rules,
             callback=None if callback is None else tell,
             cancel=cancel,
+            keeper=keeper,
         )
     )
     picture = problem.picture(outcome.solution, field)

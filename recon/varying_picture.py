@@ -13,6 +13,7 @@ from recon.errors import InputError
 from recon.noise import NoiseModel
 from recon.preparation import Field
 from recon.result import ImageGrid, Reconstruction
+from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.volume.channel import PRIORS
@@ -63,6 +64,8 @@ def reconstruct_varying(
     field: Field,
     callback: Progress | None,
     cancel: threading.Event | None,
+    keeper: Keeper | None,
+    stop_at_noise: bool,
     judged: bool = True,
 ) -> Reconstruction:
     """Reconstruct a picture with the local or low-rank model. Parameters as :func:`recon.reconstruct`."""
@@ -94,6 +97,8 @@ def reconstruct_varying(
         callback=None if callback is None else show,
         cancel=cancel,
         judged=judged,
+        keeper=keeper,
+        stop_at_noise=stop_at_noise,
     )
     z, pitch = float(result.grid.z_um[0]), float(result.grid.pitch_um[0])
     provenance: dict[str, Any] = {**result.provenance, "model": model, "model_reason": reason}

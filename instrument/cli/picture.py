@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
+from instrument.checkpoint import CheckpointFolder
 from instrument.cli.app import saying_what_is_left
+from instrument.cli.checkpoint_option import checkpoint_for, say_what_is_kept
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs, write_reconstruction
@@ -15,7 +19,7 @@ from recon.solvers.stopping import IterationRecord, StopReason
 
 
 def reconstruct_to_picture(
-    request: PictureRequest, outputs: Outputs, *, rotate_deg: int, force: bool
+    request: PictureRequest, outputs: Outputs, *, rotate_deg: int, checkpoint: Path | None, force: bool
 ) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted."""
     outputs.check(0, overwrite=force)
@@ -28,7 +32,9 @@ def reconstruct_to_picture(
             typer.echo("SIMULATED   PSF or image come from the simulated bench")
         for warning in job.warnings:
             typer.echo(f"Warning: {warning}", err=True)
-        result = _solve(job, request)
+        keeper = checkpoint_for(checkpoint, job, request)
+        result = _solve(job, request, keeper)
+        say_what_is_kept(keeper, [result.stop_reason])
         _tell(result)
         _write(outputs, result, job, rotate_deg)
     if result.stop_reason is StopReason.CANCELLED:
@@ -37,7 +43,7 @@ def reconstruct_to_picture(
         raise typer.Exit(130)
 
 
-def _solve(job: Job, request: PictureRequest) -> Reconstruction:
+def _solve(job: Job, request: PictureRequest, keeper: CheckpointFolder | None) -> Reconstruction:
     with progress_bar() as bar, first_interrupt_cancels() as cancel:
         total = request.settings.limit(PICTURE_ITERATIONS) or 1000
         task = bar.add_task(request.method, total=total, note="")
@@ -46,7 +52,7 @@ def _solve(job: Job, request: PictureRequest) -> Reconstruction:
             done = round(total * request.share(record))
             bar.update(task, completed=done, note=f"change {record.change:.1e}")
 
-        return request.solve(job, watch=show, cancel=cancel)
+        return request.solve(job, watch=show, cancel=cancel, keeper=keeper)
 
 
 def _write(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) -> None:

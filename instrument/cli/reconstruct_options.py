@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from instrument.mosaic import mosaic_named
 from instrument.preparation import Crop
 from instrument.reconstruction_request import PICTURE_ITERATIONS, Settings, known_model
 from instrument.reconstruction_words import parse_binning, parse_dark, parse_erasures, parse_noise
@@ -174,6 +175,14 @@ ErasuresOption = Annotated[
         help="Pixels to leave out: saturated ones, a mask's zeros, or a random share.",
     ),
 ]
+BayerOption = Annotated[
+    str,
+    typer.Option(
+        "--bayer",
+        metavar="RGGB|GRBG|GBRG|BGGR|auto|none",
+        help="The photograph is a raw frame of this colour mosaic; auto: as its metadata say.",
+    ),
+]
 NoiseOption = Annotated[
     str | None,
     typer.Option(
@@ -238,6 +247,26 @@ TimeOption = Annotated[
     float | None,
     typer.Option("--time", min=0.0, metavar="S", help="At most S seconds.", show_default=False),
 ]
+StopAtNoiseOption = Annotated[
+    bool,
+    typer.Option("--stop-at-noise", help="Stop as soon as the residual is down to the expected noise."),
+]
+CheckpointOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--checkpoint",
+        metavar="FOLDER",
+        help="Keep the work here, once a minute and at the end; the same command goes on from it.",
+        show_default=False,
+    ),
+]
+PositiveBackgroundOption = Annotated[
+    bool,
+    typer.Option(
+        "--positive-background",
+        help="Of a volume: a background that is nowhere negative; up to three more runs.",
+    ),
+]
 ToleranceOption = Annotated[
     float | None,
     typer.Option(
@@ -298,6 +327,8 @@ def parse_settings(
     iterations: int | None,
     time_s: float | None,
     tolerance: float | None,
+    stop_at_noise: bool,
+    bayer: str,
 ) -> Settings:
     """Understand the options that pictures and volumes share.
 
@@ -318,4 +349,6 @@ def parse_settings(
         iterations=iterations,
         time_s=time_s,
         tolerance=tolerance,
+        stop_at_noise=stop_at_noise,
+        mosaic=mosaic_named(bayer),
     )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from instrument.cli.app import saying_what_is_left
+from instrument.cli.checkpoint_option import checkpoint_for, say_what_is_kept
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs
@@ -13,7 +16,9 @@ from instrument.volume_file import write_volume
 from recon.solvers.stopping import IterationRecord, StopReason
 
 
-def reconstruct_to_volume(request: VolumeRequest, outputs: Outputs, *, force: bool) -> None:
+def reconstruct_to_volume(
+    request: VolumeRequest, outputs: Outputs, *, checkpoint: Path | None, force: bool
+) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted."""
     outputs.check(0, overwrite=force)
     limit = request.settings.limit(VOLUME_ITERATIONS)
@@ -24,13 +29,15 @@ def reconstruct_to_volume(request: VolumeRequest, outputs: Outputs, *, force: bo
         if job.simulated:
             typer.echo("SIMULATED   PSFs or image come from the simulated bench")
         outputs.check(len(job.calibration.psfs) * job.measurement.size, overwrite=force)
+        keeper = checkpoint_for(checkpoint, job, request)
         with progress_bar() as bar, first_interrupt_cancels() as cancel:
             task = bar.add_task("volume", total=limit, note="")
 
             def show(record: IterationRecord, _volume: object) -> None:
                 bar.update(task, completed=record.iteration, note=f"residual {record.data_residual:.3g}")
 
-            result = request.solve(job, watch=show, cancel=cancel)
+            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
+        say_what_is_kept(keeper, result.stop_reasons)
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
         typer.echo(f"{'Memory':<12}{result.provenance['memory']}")
         count = max(len(history) for history in result.histories)

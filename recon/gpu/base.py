@@ -21,8 +21,8 @@ class PlainSolver(Solver):
     camera: DepthCamera
     system: PlainSensorSystem
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Return a copy of the state in the host's memory."""
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state in the host's memory; there always as a copy."""
         state = {name: getattr(self, name) for name in ("iteration", *self.state_names)}
         state["tolerance"] = self.system.tolerance
         return {k: to_host(v).copy() if hasattr(v, "shape") else v for k, v in state.items()}
@@ -69,9 +69,9 @@ class ChannelByChannel(Solver):
     def _start(self) -> npt.NDArray[Any] | None:
         return None
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Return a copy of every channel's state."""
-        return {"iteration": self.iteration, "channels": [s.checkpoint() for s in self.solvers]}
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return every channel's state."""
+        return {"iteration": self.iteration, "channels": [s.checkpoint(copy=copy) for s in self.solvers]}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""

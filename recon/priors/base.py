@@ -15,7 +15,14 @@ class Prior(ABC):
 
     Solvers pick what they need: proximal gradient methods take ``prox``; splitting methods look at the
     structure of the sum (:meth:`terms`).
+
+    Attributes
+    ----------
+    memory : ndarray or None
+        What an iterative prox starts from next time; part of the state of the solver that calls it.
     """
+
+    memory: Array | None = None
 
     @abstractmethod
     def value(self, x: Array) -> float:

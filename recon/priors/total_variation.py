@@ -51,7 +51,6 @@ class TotalVariation(Prior):
         self.separable = separable or Zero()
         self.tolerance = tolerance
         self.max_inner = max_inner
-        self._dual: Array | None = None
 
     def terms(self) -> tuple[Prior, ...]:
         """Return the total variation on its own and the separable part."""
@@ -87,9 +86,9 @@ class TotalVariation(Prior):
         psi = self.differences(x)
         if strength == 0:
             return self.separable.prox(x, step, out)
-        if self._dual is None or self._dual.shape != psi.range_shape or self._dual.dtype != x.dtype:
-            self._dual = np.zeros(psi.range_shape, x.dtype)
-        dual = ahead = self._dual
+        if self.memory is None or self.memory.shape != psi.range_shape or self.memory.dtype != x.dtype:
+            self.memory = np.zeros(psi.range_shape, x.dtype)
+        dual = ahead = self.memory
         rate = 1 / (strength * psi.norm_bound**2)
         target = self.tolerance * 0.5 * float(np.vdot(x, x))
         t = 1.0
@@ -102,7 +101,8 @@ class TotalVariation(Prior):
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
             ahead = new + x.dtype.type((t - 1) / t_next) * (new - dual)
             dual, t = new, t_next
-        self._dual = dual
+        # A start that is no number would spoil every later call.
+        self.memory = dual if np.isfinite(np.sum(dual, dtype=np.float64)) else None
         if out is None:
             return p
         out[...] = p

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,21 @@ class Outcome:
     history: tuple[IterationRecord, ...]
     stop_reason: StopReason
     seconds: float
+
+
+class Keeper(Protocol):
+    """Keeps the state of a run outside the program, so that it can be gone on with another day.
+
+    A run of several solvers, one after the other, tells them apart by ``part``.
+    """
+
+    def resume(self, part: str, solver: Solver) -> tuple[IterationRecord, ...]:
+        """Restore what was kept of a part, if anything, and return its history so far."""
+        ...
+
+    def keep(self, part: str, solver: Solver, history: Sequence[IterationRecord], *, ended: bool) -> None:
+        """Look at a solver after an iteration, and once more when its run has ended."""
+        ...
 
 
 class Solver(ABC):
@@ -64,6 +79,8 @@ class Solver(ABC):
         *,
         callback: Callback | None = None,
         cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
+        part: str = "",
     ) -> Outcome:
         """Iterate until a rule fires.
 
@@ -74,13 +91,21 @@ class Solver(ABC):
             ``callback(solver, record)`` after each iteration; its time is not counted.
         cancel : threading.Event, optional
             Set from any thread (or from the callback) to end the run after the iteration in progress.
+        keeper : Keeper, optional
+            Who keeps the state. What it has of an earlier run is gone on with, and counts for all rules.
+        part : str
+            This run's name with the keeper.
         """
         self.compile()
         check = StopCheck(rules or StoppingRules())
-        history: list[IterationRecord] = []
-        reason: StopReason | None = None
         start = self._start()
-        seconds = 0.0
+        history = [] if keeper is None else list(keeper.resume(part, self))
+        reason: StopReason | None = None
+        for record in history:
+            reason = check(record)
+        if reason is StopReason.CONVERGED and not self.confirm():
+            reason = None
+        seconds = history[-1].seconds if history else 0.0
         while reason is None:
             began = time.perf_counter()
             known = self.step()
@@ -93,8 +118,12 @@ class Solver(ABC):
                 reason = None
             if callback is not None:
                 callback(self, record)
+            if keeper is not None:
+                keeper.keep(part, self, history, ended=False)
             if reason is None and cancel is not None and cancel.is_set():
                 reason = StopReason.CANCELLED
+        if keeper is not None:
+            keeper.keep(part, self, history, ended=True)
         solution = self._end()
         # One number is enough to find a NaN or an infinity, and takes no second array.
         if not np.isfinite(np.sum(solution, dtype=np.float64)):
@@ -116,10 +145,13 @@ class Solver(ABC):
         """Return the result, which is the caller's from then on."""
         return self.solution.copy()
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Return a copy of the state: arrays and numbers by name, to be kept and given to :meth:`restore`."""
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state: arrays and numbers by name, to be kept and given to :meth:`restore`.
+
+        Without ``copy`` the arrays are the solver's own, to be read before its next step.
+        """
         state = {name: getattr(self, name) for name in ("iteration", *self.state_names)}
-        return {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in state.items()}
+        return {k: v.copy() if copy and isinstance(v, np.ndarray) else v for k, v in state.items()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint taken from a solver of the same problem."""

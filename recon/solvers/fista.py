@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from copy import copy as shallow_copy
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -59,7 +60,9 @@ class Fista(Solver):
         super().__init__()
         self.operator = operator
         self.data = np.asarray(data, operator.dtype)
-        self.prior = prior
+        # Its own: what a prox keeps from call to call belongs to this run.
+        self.prior = shallow_copy(prior)
+        self.prior.memory = None
         self.restart = restart
         self.accelerate = accelerate
         bound = operator.norm_bound
@@ -73,6 +76,17 @@ class Fista(Solver):
         self.t = 1.0
         self.objective = np.inf
         self._gradient = np.empty_like(self.x)
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with what the prior's prox keeps."""
+        memory = self.prior.memory
+        kept = np.zeros(0) if memory is None else memory.copy() if copy else memory
+        return {**super().checkpoint(copy=copy), "prior": kept}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        super().restore(state)
+        self.prior.memory = np.array(state["prior"]) if state["prior"].size else None
 
     @property
     def solution(self) -> Array:
@@ -99,6 +113,8 @@ class Fista(Solver):
         self.operator.forward(self.x, self.forward_x)
 
         residual = float(np.linalg.norm(self.forward_x - self.data))
+        if not np.isfinite(residual):
+            residual = np.inf  # NaN would mean "not known", and a prox may make zeros of it
         objective = 0.5 * residual**2 + self.prior.value(self.x)
         grew = objective > self.objective
         self.objective = objective

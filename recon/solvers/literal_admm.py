@@ -31,6 +31,8 @@ class LiteralAdmm(Solver):
         One wrapped ``TotalVariation`` and separable priors.
     mu : tuple of float
         ``mu_1, mu_2, mu_3`` of A.3.
+    initial : ndarray, ``operator.domain_shape``, optional
+        Starting point; default zeros.
     """
 
     state_names: ClassVar[tuple[str, ...]] = ("y", "xi", "eta", "rho")
@@ -41,6 +43,8 @@ class LiteralAdmm(Solver):
         data: Array,
         prior: Prior,
         mu: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        *,
+        initial: Array | None = None,
     ) -> None:
         super().__init__()
         structure = as_cropped_convolution(operator)
@@ -65,6 +69,8 @@ class LiteralAdmm(Solver):
         psi_psi = np.fft.fft2(self.psi.adjoint(self.psi.forward(point))).real
         self.denominator = self.mu_1 * np.abs(self.M) ** 2 + self.mu_2 * psi_psi + self.mu_3
         self.y = np.zeros(shape, dtype)
+        if initial is not None:
+            self.y[...] = initial
         self.xi = np.zeros(shape, dtype)
         self.eta = np.zeros(self.psi.range_shape, dtype)
         self.rho = np.zeros(shape, dtype)
@@ -86,7 +92,7 @@ class LiteralAdmm(Solver):
 
     def step(self) -> IterationRecord:
         """Do the updates of A.3 in their order."""
-        previous = self.y
+        previous, norm = self.y, np.linalg.norm
         u = self.shrink(self.psi.forward(self.y) + self.eta / self.mu_2, self.tau / self.mu_2)
         v = (self.D * self.b + self.mu_1 * self.convolve(self.y) + self.xi) / (self.D + self.mu_1)
         w = self.separable.prox(self.y + self.rho / self.mu_3, 1 / self.mu_3)
@@ -97,10 +103,26 @@ class LiteralAdmm(Solver):
         self.xi = self.xi + self.mu_1 * (My - v)
         self.eta = self.eta + self.mu_2 * (self.psi.forward(self.y) - u)
         self.rho = self.rho + self.mu_3 * (self.y - w)
-        residual = float(np.linalg.norm(self.D * My - self.b))
-        size = float(np.linalg.norm(self.y)) or 1.0
-        change = float(np.linalg.norm(self.y - previous)) / size
-        return IterationRecord(0, 0.0, data_residual=residual, change=change)
+        Py = self.psi.forward(self.y)
+        residual = float(norm(self.D * My - self.b))
+        size = float(norm(self.y)) or 1.0
+        prior = self.tau * float(np.sum(self.lengths(Py)))
+        prior += self.separable.weight * float(np.sum(np.abs(w)))
+        return IterationRecord(
+            0,
+            0.0,
+            0.5 * residual**2 + prior,
+            residual,
+            primal_residual=float(norm([norm(My - v), norm(Py - u), norm(self.y - w)])) / size,
+            # The splits follow y, whose change is what is left of the optimality condition.
+            dual_residual=float(norm(self.y - previous)) / size,
+            change=float(norm(self.y - previous)) / size,
+        )
+
+    def lengths(self, d: Array) -> Array:
+        """Lengths of the differences: of each on its own, or of the pairs."""
+        lengths: Array = np.sqrt(np.sum(d * d, axis=0)) if self.isotropic else np.abs(d)
+        return lengths
 
     def shrink(self, d: Array, threshold: float) -> Array:
         """Soft threshold: of each difference, or of each pixel's pair when isotropic."""

@@ -66,7 +66,7 @@ class DouglasRachford(VolumeSplitting):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "z", "e", "gamma", "_used_gamma", "_active", "_empty_for", "_patience",
+        "z", "e", "gamma", "_used_gamma", "_tolerance", "_active", "_empty_for", "_patience",
     )  # fmt: skip
 
     def __init__(

@@ -64,7 +64,15 @@ class LeanTotalVariation(VolumeSplitting):
         Adapt mu to the residuals.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("X", "S", "e", "penalty", "_used_penalty", "_misfit")
+    state_names: ClassVar[tuple[str, ...]] = (
+        "X",
+        "S",
+        "e",
+        "penalty",
+        "_used_penalty",
+        "_misfit",
+        "_tolerance",
+    )
 
     def __init__(
         self,

@@ -38,9 +38,13 @@ class LiteralAdmm(Solver):
     balance : bool
         Residual balancing of each penalty: doubled or halved where primal and dual residual differ more than
         tenfold (Boyd et al. 2011, sec. 3.4.1), which is what the dissertation calls automatic tuning.
+    balance_every : int
+        Iterations between two looks at the balance.
+    initial : ndarray, ``operator.domain_shape``, optional
+        Starting point; default zeros.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("x", "u", "v", "w", "xi", "eta", "rho", "mu")
+    state_names: ClassVar[tuple[str, ...]] = ("x", "Mx", "Px", "u", "v", "w", "xi", "eta", "rho", "mu")
 
     def __init__(
         self,
@@ -52,6 +56,7 @@ class LiteralAdmm(Solver):
         penalties: tuple[float, float, float],
         balance: bool = False,
         balance_every: int = 1,
+        initial: Array | None = None,
     ) -> None:
         super().__init__()
         self.operator = operator
@@ -71,11 +76,13 @@ class LiteralAdmm(Solver):
         self.M = fft.rfft(kernel, axes=3)
         self._psi_power = self._power_of_psi()
         self.x = np.zeros(self.shape, dtype)
-        self.Mx = np.zeros(self.shape, dtype)
+        if initial is not None:
+            self.x[...] = np.reshape(initial, self.shape)
+        self.Mx = self._convolve(self.x)
         self.Px = self._psi(self.x)
         self.u, self.eta = np.zeros_like(self.Px), np.zeros_like(self.Px)
         self.v, self.xi = np.zeros_like(self.x), np.zeros_like(self.x)
-        self.w, self.rho = np.zeros_like(self.x), np.zeros_like(self.x)
+        self.w, self.rho = np.maximum(self.x, 0), np.zeros_like(self.x)
 
     def _power_of_psi(self) -> Array:
         if self.axis_weights is None:

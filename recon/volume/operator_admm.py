@@ -94,7 +94,7 @@ class OperatorAdmm(Solver):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "x", "_pixels", "_differences", "e", "penalty", "_used_penalty", "_misfit",
+        "x", "_pixels", "_differences", "e", "penalty", "_used_penalty", "_misfit", "_tolerance",
     )  # fmt: skip
 
     def __init__(
@@ -250,6 +250,15 @@ class OperatorAdmm(Solver):
     def _variation(self, d: Array) -> float:
         sizes = np.sqrt(np.sum(d * d, axis=0)) if self.isotropic else np.abs(d)
         return float(np.sum(sizes, dtype=np.float64))
+
+    @property
+    def _tolerance(self) -> float:
+        """Part of the state: how exactly the sensor's system is solved next."""
+        return self.system.tolerance
+
+    @_tolerance.setter
+    def _tolerance(self, value: float) -> None:
+        self.system.tolerance = value
 
     def _start(self) -> Array | None:
         return None

@@ -18,6 +18,7 @@ from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
 from recon.preparation import Field, channel_noise, data_of, require_same_pixels
 from recon.solvers import Outcome, Solver, StoppingRules
+from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.verdict.collect import evidence_of, unsettled_by
@@ -50,6 +51,7 @@ def reconstruct_volume(
     iterations: int | None = None,
     time_s: float | None = None,
     tolerance: float = 1e-3,
+    stop_at_noise: bool = False,
     drop_empty: bool = True,
     field: Field = "sensor",
     initial: VolumeReconstruction | None = None,
@@ -59,6 +61,7 @@ def reconstruct_volume(
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
     judged: bool = True,
+    keeper: Keeper | None = None,
 ) -> VolumeReconstruction:
     """Reconstruct a volume from one measurement (Kuo 2020, Eq. 4.2; with a background Eq. 6.2).
 
@@ -89,6 +92,8 @@ def reconstruct_volume(
     iterations, time_s, tolerance : optional
         When to stop, whichever comes first. Without ``iterations`` and ``time_s``: 200 iterations. ``time_s``
         is shared evenly by the channels.
+    stop_at_noise : bool
+        Also stop as soon as a channel's residual is down to the expected noise.
     drop_empty : bool
         With l1: leave out depth planes that stay empty, and certify it (see ``empty_planes`` of the result).
     field : "sensor" or "full"
@@ -109,6 +114,9 @@ def reconstruct_volume(
         Set it to stop after the iteration in progress.
     judged : bool
         Say whether the result can be trusted (``verdict``).
+    keeper : Keeper, optional
+        Keeps the solvers' state, a part a channel, and has them go on from what was kept of the same
+        reconstruction. Turns for a positive background are not kept: they begin anew.
 
     Raises
     ------
@@ -155,7 +163,15 @@ def reconstruct_volume(
             if callback is not None:
                 callback(record, lambda: solver.solution[0][:, window[0], window[1]] * np.float32(scale))
 
-        outcome = solver.run(rules, callback=tell if callback is not None else None, cancel=cancel)
+        if stop_at_noise:
+            rules = replace(rules, noise_norm=_noise_norm(scaled, channel))
+        outcome = solver.run(
+            rules,
+            callback=tell if callback is not None else None,
+            cancel=cancel,
+            keeper=keeper,
+            part=f"channel-{channel}",
+        )
         smooth_part = run.background(outcome.solution) if smooth else None
         if positive_background and smooth_part is not None and is_negative(smooth_part):
             smooth_part = run.positive_background(outcome.solution)
@@ -189,7 +205,7 @@ def reconstruct_volume(
         prior=prior,
         tau=max(taus),
         background=_stacked(backgrounds, scaled.flat),
-        noise_norm=float(np.sqrt(np.count_nonzero(scaled.valid[0]))),
+        noise_norm=_noise_norm(scaled),
         histories=tuple(o.history for o in outcomes),
         stop_reasons=tuple(o.stop_reason for o in outcomes),
         seconds=sum(o.seconds for o in outcomes),
@@ -219,6 +235,10 @@ def _verdict(
         max(unsettled_by(o.history, o.stop_reason, tolerance) for o in outcomes),
     )
     return verdict_on(evidence, method_name("volume", prior))
+
+
+def _noise_norm(scaled: Scaled, channel: int = 0) -> float:
+    return float(np.sqrt(np.count_nonzero(scaled.valid[channel])))
 
 
 def _uncertified(empty: list[EmptyPlanes]) -> list[str]:

@@ -65,5 +65,14 @@ class VolumeSplitting(Solver):
         self.data = self.system.masked(np.array(data, operator.dtype).reshape(operator.sensor_shape))
         self._storage = storage or Storage()
 
+    @property
+    def _tolerance(self) -> float:
+        """Part of the state: how exactly the sensor's system is solved next."""
+        return self.system.tolerance
+
+    @_tolerance.setter
+    def _tolerance(self, value: float) -> None:
+        self.system.tolerance = value
+
     def _start(self) -> Array | None:
         return None

@@ -1,0 +1,66 @@
+"""The option ``--checkpoint``: a reconstruction kept while it runs, and gone on with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import typer
+
+from instrument.checkpoint import CheckpointFolder, digest
+from instrument.errors import BenchError
+from instrument.reconstruction_job import Job
+from instrument.reconstruction_request import PictureRequest, VolumeRequest
+from recon.solvers.stopping import StopReason
+
+_FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
+_SEEN_IN_JOB = ("image", "psf", "psfs", "calibration", "dark", "crop", "binning", "erasures", "mosaic")
+_WHEN_TO_STOP = ("iterations", "time_s", "tolerance", "stop_at_noise")
+_WITHOUT_BEARING = ("allow_saturated", "allow_mixed_depth", "memory_gib", "scratch", "settings")
+
+
+def checkpoint_for(
+    folder: Path | None, job: Job, request: PictureRequest | VolumeRequest
+) -> CheckpointFolder | None:
+    """Return the folder that was asked for, checked against what is to be reconstructed.
+
+    What only says when to stop may differ from the earlier run.
+
+    Raises
+    ------
+    BenchError
+        For a method without iterations.
+    FileError
+        When the folder keeps something else.
+    """
+    if folder is None:
+        return None
+    if isinstance(request, PictureRequest) and request.method == "wiener":
+        raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
+    given = asdict(request)
+    given |= given["settings"]
+    apart = {*_SEEN_IN_JOB, *_WHEN_TO_STOP, *_WITHOUT_BEARING}
+    problem = {
+        "program": f"diffuserbench {version('diffuserbench')}",
+        "measurement": digest(job.measurement),
+        "psfs": digest(job.calibration.psfs),
+        "psf positions": digest(job.calibration.source_positions_um),
+        "valid pixels": digest(job.valid),
+        **{name: value for name, value in given.items() if name not in apart},
+    }
+    return CheckpointFolder(folder, problem)
+
+
+def say_what_is_kept(keeper: CheckpointFolder | None, reasons: Sequence[StopReason | None]) -> None:
+    """Tell where the work went on from; remove it where it has come to its end."""
+    if keeper is None:
+        return
+    if keeper.resumed_from:
+        typer.echo(f"{'Went on':<12}from iteration {keeper.resumed_from} in {keeper.folder}")
+    if all(reason in _FINISHED for reason in reasons):
+        keeper.remove()
+        typer.echo(f"{'Checkpoint':<12}removed: the work has come to its end")
+    else:
+        typer.echo(f"{'Checkpoint':<12}{keeper.folder}: the same command, with more time, goes on from it")

@@ -1,0 +1,215 @@
+"""What the engine promises of every iterative solver, tried on every one of them."""
+
+import itertools
+import threading
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation
+from recon.gpu.picture import picture_solver
+from recon.operators import (
+    Convolution3D,
+    Erasures,
+    FieldOfPsfs,
+    PadCropConvolution,
+    local_convolution,
+    low_rank,
+)
+from recon.priors import L1, NonNegativity, TotalVariation
+from recon.solvers import Admm, Fista, LiteralAdmm, SensorAdmm, StoppingRules, StopReason
+from recon.solvers.stopping import IterationRecord
+from recon.volume import DouglasRachford, LeanTotalVariation
+from recon.volume import LiteralAdmm as LiteralVolume
+from recon.volume.operator_admm import OperatorAdmm
+
+RNG = np.random.default_rng(0)
+SENSOR = (12, 13)
+PICTURE_PSF = RNG.random((2, 7, 8)) ** 4
+VOLUME_PSFS = RNG.random((4, 1, 7, 8)) ** 4
+POINTS = np.array([(y, x) for y in (-4.0, 4.0) for x in (-4.0, 4.0)])
+FIELD = [FieldOfPsfs(RNG.random((4, 1, 7, 8)) ** 4, POINTS)]
+VALID = RNG.random((2, *SENSOR)) > 0.2
+TV = TotalVariation(0.02, tolerance=1e-6) + NonNegativity()
+
+
+def picture_camera():
+    camera = PadCropConvolution(PICTURE_PSF, SENSOR, dtype=np.float64)
+    return Erasures(VALID, camera.range_shape, np.float64) @ camera
+
+
+def volume_camera():
+    return Convolution3D(VOLUME_PSFS, SENSOR, dtype=np.float64)
+
+
+def central():
+    return Convolution3D(FIELD[0].psfs[:1], SENSOR, dtype=np.float64)
+
+
+def plain():
+    camera = volume_camera()
+    return DepthCamera(
+        np, camera.channel_spectrum(0), camera.grid_shape, camera.sensor_window, VALID[0], None
+    )
+
+
+def varying(kind):
+    model = local_convolution if kind == "local" else low_rank
+    options = {} if kind == "local" else {"error": 0.1}
+    return model(FIELD, SENSOR, grid_shape=central().grid_shape, dtype=np.float64, **options)
+
+
+SPARSE = L1(0.02) + NonNegativity()
+
+SOLVERS = {
+    "FISTA": (picture_camera, lambda A, b, x: Fista(A, b, TV, initial=x)),
+    "ISTA": (picture_camera, lambda A, b, x: Fista(A, b, SPARSE, accelerate=False, initial=x)),
+    "ADMM": (picture_camera, lambda A, b, x: Admm(A, b, TV, initial=x)),
+    "exact-data ADMM": (picture_camera, lambda A, b, x: SensorAdmm(A, b, TV, initial=x)),
+    "literal ADMM": (picture_camera, lambda A, b, x: LiteralAdmm(A, b, TV, (0.3, 3.0, 3.0), initial=x)),
+    "picture by namespace": (picture_camera, lambda A, b, x: picture_solver(np, A, b, TV, x)),
+    "lean TV": (
+        volume_camera,
+        lambda A, b, x: LeanTotalVariation(A, b, 0.02, valid=VALID[0], initial=x),
+    ),
+    "Douglas-Rachford": (
+        volume_camera,
+        lambda A, b, x: DouglasRachford(A, b, 0.02, valid=VALID[0], initial=x),
+    ),
+    "literal volume": (
+        volume_camera,
+        lambda A, b, x: LiteralVolume(A, b, 0.02, penalties=(0.3, 3.0, 3.0), initial=x),
+    ),
+    "lean TV by namespace": (
+        volume_camera,
+        lambda A, b, x: PlainTotalVariation(plain(), b[0], 0.02, initial=x),
+    ),
+    "Douglas-Rachford by namespace": (
+        volume_camera,
+        lambda A, b, x: PlainDouglasRachford(plain(), b[0], 0.02, initial=None if x is None else x[0]),
+    ),
+    "local model": (
+        lambda: varying("local"),
+        lambda A, b, x: OperatorAdmm(A, central(), b, 0.02, axis_weights=(0.0, 1.0, 1.0), initial=x),
+    ),
+    "low-rank model": (
+        lambda: varying("low rank"),
+        lambda A, b, x: OperatorAdmm(A, central(), b, 0.02, initial=x),
+    ),
+}  # fmt: skip
+PROXIMAL_GRADIENT = ("FISTA", "ISTA")
+"""These have no split variables, and so no primal and dual residuals."""
+
+
+@pytest.fixture(params=SOLVERS, scope="module")
+def case(request):
+    """Name, and what makes a solver from a starting point (and data other than the scene's)."""
+    make_camera, make = SOLVERS[request.param]
+    camera = make_camera()
+    scene = np.zeros(camera.domain_shape)
+    scene[..., 5:9, 6:11] = 1
+    clean = camera.forward(scene)
+    data = clean + 0.01 * np.random.default_rng(1).standard_normal(clean.shape)
+
+    def solver(initial=None, bad=False):
+        given = data.copy()
+        if bad:
+            given[0, np.argwhere(VALID[0])[20][0], np.argwhere(VALID[0])[20][1]] = np.nan
+        return make(camera, given, initial)
+
+    return request.param, solver
+
+
+def test_starts_warm(case):
+    _, solver = case
+    end = solver().run(StoppingRules(iterations=400, tolerance=0)).solution
+    warm, cold = (solver(x).run(StoppingRules(iterations=2, tolerance=0)).solution for x in (end, None))
+    assert np.linalg.norm(warm - end) < 0.6 * np.linalg.norm(cold - end)
+
+
+def test_is_watched_and_cancelled_within_one_iteration(case):
+    _, solver = case
+    stop, seen = threading.Event(), []
+
+    def watch(running, record):
+        seen.append((record.iteration, running.solution.shape))
+        if record.iteration == 3:
+            stop.set()
+
+    out = solver().run(StoppingRules(iterations=50, tolerance=0), callback=watch, cancel=stop)
+    assert out.stop_reason is StopReason.CANCELLED
+    assert seen == [(i, out.solution.shape) for i in (1, 2, 3)]
+
+
+class Kept:
+    """A keeper in memory."""
+
+    def __init__(self, state=None, history=()):
+        self.state, self.history, self.ends = state, history, 0
+
+    def resume(self, part, solver):
+        if self.state is not None:
+            solver.restore(self.state)
+        return self.history
+
+    def keep(self, part, solver, history, *, ended):
+        self.state, self.history = solver.checkpoint(), tuple(history)
+        self.ends += ended
+
+
+def test_goes_on_exactly_from_what_was_kept(case):
+    _, solver = case
+    rules = StoppingRules(iterations=47, tolerance=0)
+    whole = solver().run(rules)
+    kept = Kept()
+    solver().run(StoppingRules(iterations=31, tolerance=0), keeper=kept)
+    assert kept.ends == 1
+    rest = solver().run(rules, keeper=Kept(kept.state, kept.history))
+    assert np.array_equal(rest.solution, whole.solution)
+    assert [r.objective for r in rest.history] == [r.objective for r in whole.history]
+    assert rest.seconds > kept.history[-1].seconds
+    # What is finished already takes no further step.
+    again = solver().run(StoppingRules(iterations=31, tolerance=0), keeper=Kept(kept.state, kept.history))
+    assert len(again.history) == 31
+    assert again.stop_reason is StopReason.ITERATIONS
+
+
+def test_stops_on_nan_with_numbers(case):
+    _, solver = case
+    out = solver(bad=True).run(StoppingRules(iterations=50, tolerance=0))
+    assert out.stop_reason is StopReason.NOT_FINITE
+    assert len(out.history) < 5
+    assert np.isfinite(out.solution).all()
+
+
+def test_stops_by_each_rule_and_says_which(case):
+    _, solver = case
+    many = 4000
+    first = solver().run(StoppingRules(iterations=5, tolerance=0))
+    assert first.stop_reason is StopReason.ITERATIONS
+    assert len(first.history) == 5
+    level = 1.001 * first.history[-1].data_residual
+    noise = solver().run(StoppingRules(iterations=many, tolerance=0, noise_norm=level))
+    assert noise.stop_reason is StopReason.NOISE_LEVEL
+    assert noise.history[-1].data_residual <= level
+    late = solver().run(StoppingRules(iterations=None, time_s=1e-4, tolerance=0))
+    assert late.stop_reason is StopReason.TIME
+    assert late.seconds >= 1e-4
+    calm = solver().run(StoppingRules(iterations=many, tolerance=1e-3))
+    assert calm.stop_reason is StopReason.CONVERGED
+    assert calm.history[-1].change < 1e-3
+
+
+def test_history_tells_all_that_is_known(case):
+    name, solver = case
+    history = solver().run(StoppingRules(iterations=20, tolerance=0)).history
+    known = {f.name for f in fields(IterationRecord)}
+    if name in PROXIMAL_GRADIENT:
+        known -= {"primal_residual", "dual_residual"}
+    if "Douglas-Rachford" in name:
+        known -= {"dual_residual"}  # one fixed-point residual speaks for both
+    for field in known:
+        assert np.isfinite([getattr(record, field) for record in history]).all(), field
+    assert [r.iteration for r in history] == list(range(1, 21))
+    assert all(a.seconds < b.seconds for a, b in itertools.pairwise(history))
