@@ -352,7 +352,8 @@ def draw(soak: Soak, minutes: float, path: Path) -> None:
     t = [s["s"] / 60 for s in soak.samples]
     figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, constrained_layout=True)
     axes[0].plot(t, [s["memory_mb"] for s in soak.samples], color="#2b6cb0")
-    axes[0].set(ylabel="memory (MB)", ylim=(0, None))
+    most_mb = max(s["memory_mb"] for s in soak.samples)
+    axes[0].set(ylabel="memory (MB)", ylim=(0, 1.15 * most_mb))
     axes[1].plot(t, [s["screen_per_s"] for s in soak.samples], label="on the screen", color="#2f855a")
     axes[1].plot(t, [s["camera_per_s"] for s in soak.samples], label="of the camera", color="#b7791f", lw=0.9)
     axes[1].set(ylabel="frames a second", ylim=(0, None))

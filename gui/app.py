@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import traceback
@@ -14,6 +15,7 @@ from gui.main_window import MainWindow, theme_of
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from instrument.config import BenchConfig
+from instrument.errors import BenchError
 
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
@@ -21,6 +23,7 @@ _SIGNAL_CHECK_MS = 200
 
 def run(config: BenchConfig) -> int:
     """Show the window for a bench until it is closed; returns the exit status."""
+    require_screen()
     app = application()
     settings = QSettings("diffuserbench", "diffuserbench")
     apply_theme(app, theme_of(settings))
@@ -36,16 +39,37 @@ def run(config: BenchConfig) -> int:
         session.stop()
         session.close()
 
+    before = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
+        # A signal that the parent chose to ignore (nohup) stays ignored.
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, end)
-    window.show()
-    session.open()
-    status = app.exec()
-    session.join()
-    sys.excepthook = sys.__excepthook__
+            before[number] = signal.signal(number, end)
+    try:
+        window.show()
+        session.open()
+        status = app.exec()
+        session.join()
+    finally:
+        sys.excepthook = sys.__excepthook__
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return status
+
+
+def require_screen() -> None:
+    """Refuse to start where no screen can be reached: Qt would abort without a word to the user.
+
+    Raises
+    ------
+    BenchError
+    """
+    on_linux = sys.platform.startswith("linux")
+    if on_linux and not any(os.environ.get(v) for v in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")):
+        raise BenchError(
+            "There is no screen to show the window on (neither DISPLAY nor WAYLAND_DISPLAY is set). "
+            "Log in to a desktop, or with ssh -X; the command line does everything without one."
+        )
 
 
 def application() -> QApplication:

@@ -18,7 +18,6 @@ from PySide6.QtWidgets import (
     QSizePolicy,
     QTabWidget,
     QToolBar,
-    QVBoxLayout,
     QWidget,
 )
 
@@ -28,6 +27,7 @@ from gui.panels import PANELS, PanelEntry
 from gui.session import BenchSession, OperatorRequest
 from gui.theme import THEMES, apply_theme
 from gui.widgets.device_chips import DeviceChips
+from gui.widgets.panel_place import PanelPlace
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -52,7 +52,7 @@ class MainWindow(QMainWindow):
         self.session = session
         self._settings = settings
         self._panels: dict[str, Panel] = {}
-        self._places: dict[str, QWidget] = {}
+        self._places: dict[str, PanelPlace] = {}
         self._docks: dict[str, QDockWidget] = {}
         self._may_close = False
         self.question: QMessageBox | None = None
@@ -89,9 +89,7 @@ class MainWindow(QMainWindow):
         if name not in self._panels:
             panel = PANELS[name].load()(self.session)
             self._panels[name] = panel
-            layout = self._places[name].layout()
-            assert layout is not None
-            layout.addWidget(panel)
+            self._places[name].hold(panel)
         return self._panels[name]
 
     def show_panel(self, name: str) -> Panel:
@@ -108,9 +106,7 @@ class MainWindow(QMainWindow):
     def _make_panels(self) -> None:
         first: dict[str, QDockWidget] = {}
         for name, entry in PANELS.items():
-            place = QWidget()
-            box = QVBoxLayout(place)
-            box.setContentsMargins(0, 0, 0, 0)
+            place = PanelPlace()
             self._places[name] = place
             if entry.area == "centre":
                 index = self.tabs.addTab(place, entry.title)
@@ -132,7 +128,7 @@ class MainWindow(QMainWindow):
         self.setCorner(Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
         if "top right" in first and "right" in first:
             self.resizeDocks([first["top right"], first["right"]], [430, 430], Qt.Orientation.Vertical)
-            self.resizeDocks([first["top right"]], [560], Qt.Orientation.Horizontal)
+            self.resizeDocks([first["top right"]], [500], Qt.Orientation.Horizontal)
         if "bottom" in first:
             self.resizeDocks([first["bottom"]], [150], Qt.Orientation.Vertical)
 
@@ -153,12 +149,10 @@ class MainWindow(QMainWindow):
         except Exception as error:  # noqa: BLE001 - a panel's failure must not end the window
             text = words_for(error)
             self.session.log("error", f"{PANELS[name].title}: {text}")
-            layout = self._places[name].layout()
-            assert layout is not None
-            if layout.count() == 0:
+            if self._places[name].content is None:
                 view = QPlainTextEdit(text)
                 view.setReadOnly(True)
-                layout.addWidget(view)
+                self._places[name].hold(view)
 
     # Bars and menus ------------------------------------------------------------------------------
     def _make_top_bar(self) -> None:

@@ -44,7 +44,7 @@ class LedPanel(Panel):
         self.plot = plot_widget("x", "y", x_unit="mm", y_unit="mm", grid=False)
         self.plot.setAspectLocked(True)
         self.plot.hideButtons()
-        self.plot.setMinimumHeight(180)
+        self.plot.setMinimumHeight(110)
         self.plot.setToolTip("A click toggles an LED")
         self.spots: Any = pg.ScatterPlotItem(pxMode=False, pen=None)
         self.spots.sigClicked.connect(self._clicked)

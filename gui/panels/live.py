@@ -36,6 +36,8 @@ FRAME_MS = 32
 """Between two looks at the newest frame: thirty a second on the screen."""
 _STATISTICS_MS = 333
 _RATE_WINDOW_S = 2.0
+_PATIENCE_S = 1.5
+"""Without a frame for longer than this and three exposures, the panel says that it waits."""
 LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0, 99.0), "by hand": None}
 
 
@@ -65,13 +67,12 @@ class LivePanel(Panel):
         self._levels = (0.0, 1.0)
         self._shown: Frame | None = None
         self._counted: Frame | None = None
+        self._came_s = time.monotonic()
+        """When the last frame came, or could have begun to."""
         self._shown_at: deque[float] = deque(maxlen=400)
         self._lay_out()
         self.histogram.levels_dragged.connect(self._levels_by_hand)
         session.device_changed.connect(self._device_changed)
-        session.opened.connect(self._light_the_scene)
-        if session.is_open("camera"):
-            self._light_the_scene()
         self._frame_timer = QTimer(self)
         self._frame_timer.setTimerType(Qt.TimerType.PreciseTimer)
         self._frame_timer.timeout.connect(self.look)
@@ -240,8 +241,10 @@ class LivePanel(Panel):
             return
         first = self._shown is None
         self._shown = frame
+        self._came_s = time.monotonic()
         if first:
             self.count()
+            self._light_the_scene()
         full_scale = frame.full_scale
         low, high = self._levels
         self.view.show_image(frame.image, low, high, full_scale)
@@ -259,6 +262,8 @@ class LivePanel(Panel):
         if not self.isVisible():
             return
         self._show_light()
+        if self._waits():
+            return
         if frame is None:
             return
         if frame is not self._counted or self.sender() is self.stretch:
@@ -273,6 +278,19 @@ class LivePanel(Panel):
             if (ends := self.profile_line.ends) is not None:
                 self._profile_curve.setData(*line_profile(frame.image, *ends))
         self.status.setText(self._figures(frame))
+
+    def _waits(self) -> bool:
+        """Tell where no frame comes although the camera runs, and for how long; return whether it is so."""
+        frame = self._shown
+        exposure_s = 0.0 if frame is None else frame.metadata.exposure_ms / 1e3
+        seconds = time.monotonic() - self._came_s
+        if not self.session.live.is_running or seconds < _PATIENCE_S + 3 * exposure_s:
+            return False
+        words = f"Waiting for {'the first' if frame is None else 'a'} frame for {seconds:.0f} s."
+        if self.session.state("camera").simulated:
+            words += " The simulated scene is computed once for each new light: 15 to 30 s at 5 megapixels."
+        self.status.setText(words)
+        return True
 
     def _figures(self, frame: Frame) -> str:
         now = self.session.live.status()
@@ -371,7 +389,12 @@ class LivePanel(Panel):
             button.setChecked(button.property("light") == now.value)
 
     def _device_changed(self, kind: str) -> None:
-        if kind == "camera" and not self.session.is_open("camera"):
+        if kind != "camera":
+            return
+        self._came_s = time.monotonic()
+        if self.session.is_open("camera"):
+            self.status.setText("Waiting for the first frame …")
+        else:
             state = self.session.state("camera")
             self.status.setText(" ".join(state.text.split()) or f"The camera is {state.condition}.")
 

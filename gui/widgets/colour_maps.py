@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from instrument.frame_view import SATURATED
 
-_SATURATED_RGB = {"grey": (255, 40, 40), "red": (255, 255, 255)}
+_SATURATED_RGB = {"grey": (255, 40, 40), "red": (255, 120, 90)}
 _STOPS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "grey": ((0, 0, 0), (255, 255, 255)),
-    "red": ((0, 0, 0), (255, 0, 0)),
+    "red": ((0, 0, 0), (175, 0, 0)),
 }
 _MATPLOTLIB = ("viridis", "inferno", "magma", "turbo")
 NAMES = (*_STOPS, *_MATPLOTLIB)

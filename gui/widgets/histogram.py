@@ -38,7 +38,8 @@ class HistogramPlot(QWidget):
         self.plot.hideButtons()
         self.plot.setLogMode(y=True)
         self.plot.disableAutoRange()
-        self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0, brush=(74, 163, 223, 60))
+        self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0)
+        self._fill()
         self.region: Any = pg.LinearRegionItem(brush=(255, 255, 255, 18))
         self.region.sigRegionChanged.connect(self._dragged)
         self.plot.addItem(self.region)
@@ -73,6 +74,12 @@ class HistogramPlot(QWidget):
         """Take over the theme in use."""
         restyle(self.plot)
         self.curve.setPen(curve_pen(0))
+        self._fill()
+
+    def _fill(self) -> None:
+        colour = pg.mkColor(colours().accent)
+        colour.setAlpha(60)
+        self.curve.setBrush(pg.mkBrush(colour))
 
     def _dragged(self) -> None:
         if not self._quiet:

@@ -1,0 +1,85 @@
+"""``diffuserbench gui`` as a program: it starts, ends safely on a signal, and says what it lacks."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PySide6.QtCore import QSettings, QTimer
+from PySide6.QtWidgets import QApplication
+
+from gui.main_window import MainWindow
+from instrument.cli import main
+
+
+def test_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gui", "--help"]) == 0
+    assert "diffuserbench gui bench.toml" in capsys.readouterr().out
+
+
+def test_a_wrong_bench_is_told_before_a_window_opens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bench.toml"
+    file.write_text('[camera]\ndriver = "simulatd"\n')
+    assert main(["gui", str(file)]) == 2
+    assert "Did you mean" in capsys.readouterr().err
+
+
+def test_without_the_extra_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = builtins.__import__
+
+    def without_qt(name: str, *rest: Any, **named: Any) -> Any:
+        if name == "gui.app":
+            raise ModuleNotFoundError("No module named 'PySide6'", name="PySide6.QtCore")
+        return real(name, *rest, **named)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(builtins, "__import__", without_qt)
+    assert main(["gui"]) == 2
+    assert 'pip install "diffuserbench[gui]"' in capsys.readouterr().err
+
+
+def test_without_a_screen_it_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
+        monkeypatch.delenv(variable, raising=False)
+    assert main(["gui"]) == 2
+    assert "no screen" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("qapp")
+def test_sigterm_ends_it_with_everything_closed(tmp_path: Path, bench_text: str) -> None:
+    for scope in (QSettings.Scope.UserScope, QSettings.Scope.SystemScope):
+        QSettings.setPath(QSettings.Format.NativeFormat, scope, str(tmp_path / "settings"))
+    file = tmp_path / "bench.toml"
+    file.write_text(bench_text)
+    seen: list[MainWindow] = []
+    timer = QTimer()
+
+    def end_once_it_runs() -> None:
+        for window in QApplication.topLevelWidgets():
+            if isinstance(window, MainWindow) and window.session.live.newest() is not None and not seen:
+                seen.append(window)
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    timer.timeout.connect(end_once_it_runs)
+    timer.start(50)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert main(["gui", str(file)]) == 0
+    finally:
+        timer.stop()
+        signal.signal(signal.SIGTERM, before)
+    (window,) = seen
+    assert not any(device.is_open for device in window.session.bench.devices.values())
+    assert (tmp_path / "settings").exists()
+    window.deleteLater()
