@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
 from calibration_routines.angular_response import CUT_OFF, AngularResponse
 from calibration_routines.beads import (
@@ -20,6 +22,7 @@ from calibration_routines.beads import (
 )
 from calibration_routines.calibration_figures import response_figure, surface_figure
 from calibration_routines.dpc import DiffuserSurface, DpcSetup, dpc_optics, dpc_plan, measure_diffuser
+from calibration_routines.photograph import expose_scene, photograph, photograph_plan
 from calibration_routines.procedure import (
     Listener,
     Outcome,
@@ -32,11 +35,14 @@ from calibration_routines.sweep_plan import check_sweep
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
 from instrument.calibration_file import save_calibration
-from instrument.errors import BenchError, FileError
+from instrument.errors import BenchError, FileError, SettingsError
 from instrument.figures import save_figure
+from instrument.images import write_image
 from instrument.plan import check
 from instrument.run_control import RunControl
 from instrument.store.folder import dated_name, free_name
+
+PHOTOGRAPH_FILE = "photograph.tif"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,3 +279,86 @@ def bead_lines(done: BeadCalibration) -> list[str]:
         f"Misfit by rank: {misfits} with beads on the pixel grid ({result.stopped});",
         f"  {between} with beads between pixels, PSFs of rank {result.rank}",
     ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotographProcedure:
+    """Photograph the lit scene for a reconstruction: exposure, frames, dark frames taken off.
+
+    Attributes
+    ----------
+    exposure_ms : float, optional
+        None: found, so that nothing saturates.
+    average, dark_frames : int
+        Frames with and without light; all are stored.
+    binning : int
+        In software, on top of the camera's; the same as the calibration's.
+    """
+
+    exposure_ms: float | None = None
+    average: int = 4
+    dark_frames: int = 4
+    binning: int = 1
+
+    def __post_init__(self) -> None:
+        problems = [
+            (name, f"{name} must be at least 1, not {getattr(self, name)}")
+            for name in ("average", "dark_frames", "binning")
+            if getattr(self, name) < 1
+        ]
+        if self.exposure_ms is not None and not 0 < self.exposure_ms < np.inf:
+            problems.append(("exposure_ms", f"the exposure is above 0 ms, not {self.exposure_ms:g}"))
+        if problems:
+            raise SettingsError(problems)
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold exposure, frames and disk against the bench."""
+        folder = folder or bench.config.data_folder
+        present_ms = self.exposure_ms or bench.camera.exposure_ms
+        low, high = bench.camera.exposure_limits_ms
+        if not low <= present_ms <= high:
+            words = f"{present_ms:g} ms is outside the camera's {low:g} to {high:g} ms"
+            raise SettingsError([("exposure_ms", words)])
+        plan = photograph_plan(present_ms, self.average, self.dark_frames)
+        check(plan, abilities_of(bench, folder))
+        found = "as given" if self.exposure_ms is not None else "found at the start"
+        return outlook_of(bench, plan, folder, [f"The exposure is {found}."])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph, and write the picture that ``reconstruct`` takes into the run's folder."""
+        heard = listener or Listener()
+        with under_control(bench, control) as control:
+            exposure_ms = self.exposure_ms
+            if exposure_ms is None:
+                heard.step("finding the exposure")
+                exposure_ms = expose_scene(bench).exposure_ms
+                control.check()
+            heard.step("photographing")
+            taken = photograph(
+                bench,
+                exposure_ms,
+                folder,
+                average=self.average,
+                dark_frames=self.dark_frames,
+                binning=self.binning,
+                on_progress=heard.frame,
+                control=control,
+            )
+        file = taken.run.path / PHOTOGRAPH_FILE
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": self.binning}
+        write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})
+        words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
+        return Outcome(
+            verdict=(words,),
+            good=taken.saturated_pixels == 0,
+            runs=(taken.run.path,),
+            files=(file,),
+            result=taken,
+        )

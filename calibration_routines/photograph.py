@@ -66,6 +66,17 @@ def expose_scene(bench: Bench, *, target: float = 0.7) -> AutoExposure:
     return found
 
 
+def photograph_plan(exposure_ms: float, average: int, dark_frames: int) -> Plan:
+    """Return the plan of a photograph: the lit scene, then dark frames."""
+    return Plan(
+        label="photograph",
+        parts=(
+            Part(label="scene", scene_lit=True, exposures_ms=(exposure_ms,), repeats=average),
+            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=dark_frames),
+        ),
+    )
+
+
 def photograph(
     bench: Bench,
     exposure_ms: float | None = None,
@@ -104,13 +115,7 @@ def photograph(
     """
     if exposure_ms is None:
         exposure_ms = expose_scene(bench).exposure_ms
-    plan = Plan(
-        label="photograph",
-        parts=(
-            Part(label="scene", scene_lit=True, exposures_ms=(exposure_ms,), repeats=average),
-            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=dark_frames),
-        ),
-    )
+    plan = photograph_plan(exposure_ms, average, dark_frames)
     run = acquire(bench, plan, folder, on_progress=on_progress, control=control)
     if run.condition is not RunCondition.COMPLETED:
         raise RunEndedError("The run", run)

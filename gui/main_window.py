@@ -74,6 +74,7 @@ class MainWindow(QMainWindow):
         self._make_stop_keys()
         session.device_changed.connect(self._show_simulated)
         session.asked.connect(self._ask_operator)
+        session.handed_on.connect(lambda name, path: self.show_panel(name).take(path))
         session.closed.connect(self._close_now)
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar
 
 from PySide6.QtCore import Qt, QTimer
@@ -67,6 +68,10 @@ class Panel(QWidget):
         """Put the panel's Python lines on the clipboard."""
         QGuiApplication.clipboard().setText(self.as_python())
         self.session.log("info", f"{self.title}: copied as Python.")
+
+    def take(self, path: Path) -> None:
+        """Work with a file or folder that another panel hands on; for panels that can."""
+        raise NotImplementedError
 
     def shutdown(self) -> None:
         """End what the panel runs of its own (timers, workers); called before the window closes."""

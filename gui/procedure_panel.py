@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import (
@@ -12,6 +13,7 @@ from PySide6.QtWidgets import (
     QFrame,
     QLabel,
     QPlainTextEdit,
+    QPushButton,
     QScrollArea,
     QSplitter,
     QStackedWidget,
@@ -49,6 +51,10 @@ class ProcedurePanel(Panel):
     parent : QWidget, optional
     """
 
+    handed_to: ClassVar[str] = "reconstructions"
+    """The panel that works with what was calibrated."""
+    use_words: ClassVar[str] = "Reconstruct with it…"
+
     def __init__(
         self, session: BenchSession, forms: Sequence[Form], words: str, parent: QWidget | None = None
     ) -> None:
@@ -80,6 +86,11 @@ class ProcedurePanel(Panel):
         self.verdict.setToolTip("What will be done and why, or what stands against it; can be copied")
         self.verdict.setMaximumHeight(150)
         self.run_bar = RunBar(words)
+        self.use_button = QPushButton(self.use_words)
+        self.use_button.setToolTip("Take what was measured to where it is used")
+        self.use_button.hide()
+        self.use_button.clicked.connect(self._use)
+        self._result: Path | None = None
         left = QWidget()
         column = QVBoxLayout(left)
         column.setContentsMargins(0, 0, 6, 0)
@@ -89,6 +100,7 @@ class ProcedurePanel(Panel):
         column.addWidget(self.stack, 1)
         column.addWidget(self.verdict)
         column.addWidget(self.run_bar)
+        column.addWidget(self.use_button)
         self.right = QWidget()
         """For the subclass."""
         split = QSplitter()
@@ -225,6 +237,7 @@ class ProcedurePanel(Panel):
             self.refused(None, str(error))
             return
         self.accepted()
+        self.use_button.hide()
         self.run_bar.set_running(True)
         self.stack.setEnabled(False)
         self.choice.setEnabled(False)
@@ -285,11 +298,17 @@ class ProcedurePanel(Panel):
         self.run_bar.show_situation(now)
         self.looked(now)
 
+    def _use(self) -> None:
+        self.session.handed_on.emit(self.handed_to, self._result)
+
     def _succeeded(self, outcome: Outcome) -> None:
         where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
         self._say("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
         for line in outcome.verdict:
             self.session.log("info" if outcome.good else "warning", line)
+        pictures = [file for file in outcome.files if file.suffix == ".tif"]
+        self._result = outcome.calibration or next(iter(pictures), None)
+        self.use_button.setVisible(self._result is not None)
         self.run_bar.show_end("Done" if outcome.good else "Done, with findings", complete=True)
         self.finished(outcome)
 

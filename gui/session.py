@@ -69,6 +69,8 @@ class BenchSession(QObject):
         STOP was pressed, and everything is safe or known not to be.
     asked : object
         An :class:`OperatorRequest`: something is to be done by hand.
+    handed_on : str, Path
+        A panel's name and a file or folder that another panel gives it to work with.
     opened, closed
         Every device was tried; everything was closed.
     """
@@ -78,6 +80,7 @@ class BenchSession(QObject):
     run_finished = Signal(object)
     stopped = Signal()
     asked = Signal(object)
+    handed_on = Signal(str, object)
     opened = Signal()
     closed = Signal()
     _from_thread = Signal(str, object)

@@ -11,7 +11,12 @@ from typing import Any
 from calibration_routines.beads import BeadSlides
 from calibration_routines.display_procedures import SlmProcedure
 from calibration_routines.dpc import BANDS, DpcSetup
-from calibration_routines.optics_procedures import AngularProcedure, BeadProcedure, DpcProcedure
+from calibration_routines.optics_procedures import (
+    AngularProcedure,
+    BeadProcedure,
+    DpcProcedure,
+    PhotographProcedure,
+)
 from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.sweep_procedure import SweepProcedure
 from calibration_routines.sweep_request import (
@@ -347,6 +352,35 @@ SLM = Form(
 )  # fmt: skip
 
 
+PHOTOGRAPH = Form(
+    "photograph",
+    "Photograph of the scene",
+    "The lit scene, well exposed, dark frames taken off, as a reconstruction wants it",
+    (
+        field_of(
+            PhotographProcedure,
+            "exposure_ms",
+            "Exposure",
+            "Of each frame",
+            unit="ms",
+            optional="found, nothing saturates",
+        ),
+        field_of(PhotographProcedure, "average", "Frames", "All are stored; their mean is taken", "whole"),
+        field_of(PhotographProcedure, "dark_frames", "Dark frames", "Without light", "whole"),
+        field_of(
+            PhotographProcedure,
+            "binning",
+            "Binning",
+            "In software, on top of the camera's; the same as the calibration's",
+            "whole",
+            unit="px",
+            advanced=True,
+        ),
+    ),
+    lambda values: PhotographProcedure(**values),
+)
+
+
 def _plan(values: Mapping[str, Any]) -> PlanProcedure:
     try:
         data = tomllib.loads(values["text"])
@@ -369,4 +403,14 @@ PLAN = Form(
     _plan,
 )  # fmt: skip
 
-ROUTINES: tuple[Form, ...] = (AXIAL, LATERAL, VOLUME, ANGULAR, DPC, BEADS, SLM, PLAN)
+ROUTINES: tuple[Form, ...] = (
+    AXIAL,
+    LATERAL,
+    VOLUME,
+    PHOTOGRAPH,
+    ANGULAR,
+    DPC,
+    BEADS,
+    SLM,
+    PLAN,
+)

@@ -45,6 +45,8 @@ class AlignmentPanel(ProcedurePanel):
     """Alignment of the scattering mask."""
 
     title = "Alignment"
+    handed_to = "holograms"
+    use_words = "Compute holograms with it…"
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         self.spots = ImageView()

@@ -457,6 +457,11 @@ class HologramsPanel(Panel):
             self.out,
         ]
 
+    def take(self, path: Path) -> None:
+        """Put an alignment of the mask into the form."""
+        self.alignment.setText(str(path))
+        self.alignment.editingFinished.emit()
+
     def shutdown(self) -> None:
         """End the computation."""
         self.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from pathlib import Path
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import (
@@ -91,6 +92,14 @@ class LivePanel(Panel):
         self.snap_button = QPushButton("Snap")
         self.snap_button.setToolTip("Take a photograph and keep it in the runs' folder (Ctrl+K)")
         self.snap_button.clicked.connect(self.snap)
+        self.photograph: Path | None = None
+        """The last one that was taken here."""
+        self.reconstruct_button = QPushButton("Reconstruct…")
+        self.reconstruct_button.setToolTip("Reconstruct the last photograph")
+        self.reconstruct_button.setEnabled(False)
+        self.reconstruct_button.clicked.connect(
+            lambda: self.session.handed_on.emit("reconstructions", self.photograph)
+        )
         self.average = NumberEdit("frames", 1, minimum=1, integer=True, tip="Frames averaged in a photograph")
         self.average.setFixedWidth(90)
         self.colour_map = QComboBox()
@@ -136,7 +145,12 @@ class LivePanel(Panel):
         self.fit_button.clicked.connect(self.view.whole)
         bar = QHBoxLayout()
         bar.setSpacing(6)
-        before: tuple[QWidget, ...] = (self.live_button, self.snap_button, self.average)
+        before: tuple[QWidget, ...] = (
+            self.live_button,
+            self.snap_button,
+            self.average,
+            self.reconstruct_button,
+        )
         after: tuple[QWidget, ...] = (
             self.colour_map,
             self.stretch,
@@ -344,8 +358,13 @@ class LivePanel(Panel):
         except BusyError as error:
             self.refused(self.snap_button, str(error))
             return
-        job.succeeded.connect(lambda _: self.session.log("info", f"Photograph: {target}"))
+        job.succeeded.connect(lambda _: self._taken(target))
         job.succeeded.connect(lambda _: self.accepted(self.snap_button))
+
+    def _taken(self, photograph: Path) -> None:
+        self.session.log("info", f"Photograph: {photograph}")
+        self.photograph = photograph
+        self.reconstruct_button.setEnabled(True)
 
     def record(self) -> None:
         """Start a recording, or end the one that runs."""

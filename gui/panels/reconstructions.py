@@ -30,7 +30,7 @@ from gui.session import BenchSession
 from gui.views.convergence import ConvergenceView
 from gui.views.facts import FactsView
 from gui.views.picture_view import PictureView, as_shown
-from gui.views.reconstruct_form import ReconstructForm
+from gui.views.reconstruct_form import CALIBRATION, PSF, ReconstructForm
 from gui.views.volume_view import VolumeView
 from gui.widgets.colour_maps import table
 from instrument.errors import BenchError
@@ -333,6 +333,15 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     # The panel -----------------------------------------------------------------------------------
+    def take(self, path: Path) -> None:
+        """Put a calibration's folder, or a photograph, into the form."""
+        self.tabs.setCurrentWidget(self.form)
+        if path.is_dir() and self.form.kind.currentText() == PSF:
+            self.form.kind.setCurrentText(CALIBRATION)
+        field = self.form.psfs if path.is_dir() else self.form.image
+        field.setText(str(path))
+        field.editingFinished.emit()
+
     def as_python(self) -> str:
         """Return lines that make the reconstruction of the form, or open the result that is shown."""
         if self.tabs.currentWidget() is self.form:

@@ -58,6 +58,7 @@ class RunsPanel(Panel):
     about: QPlainTextEdit
     bar: RunBar
     folder_button: QPushButton
+    use_button: QPushButton
     _left: QWidget
     _right: QSplitter
 
@@ -132,6 +133,7 @@ class RunsPanel(Panel):
         self._can_resume = goes_on and (bool(run.missing()) or _lacks_calibration(run.path))
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
+        self.use_button.setEnabled((path / FOLDER).is_dir())
         self._show_frame(0)
 
     def as_python(self) -> str:
@@ -217,9 +219,17 @@ class RunsPanel(Panel):
         self.folder_button.setToolTip("Show the run's files in the file manager")
         self.folder_button.setEnabled(False)
         self.folder_button.clicked.connect(self._open_folder)
+        self.use_button = QPushButton("Reconstruct with it…")
+        self.use_button.setToolTip("Reconstruct photographs with this run's calibration")
+        self.use_button.setEnabled(False)
+        self.use_button.clicked.connect(self._use)
         foot = QHBoxLayout()
         foot.addWidget(self.bar, 1)
-        foot.addWidget(self.folder_button, 0, Qt.AlignmentFlag.AlignTop)
+        aside = QVBoxLayout()
+        aside.addWidget(self.use_button)
+        aside.addWidget(self.folder_button)
+        aside.addStretch(1)
+        foot.addLayout(aside)
         self._right = QSplitter(Qt.Orientation.Vertical)
         top = QWidget()
         column = QVBoxLayout(top)
@@ -292,6 +302,7 @@ class RunsPanel(Panel):
         self.about.setPlainText(why)
         self.bar.set_startable("No run is open.")
         self.folder_button.setEnabled(False)
+        self.use_button.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
         run = self.opened
@@ -316,6 +327,10 @@ class RunsPanel(Panel):
         ]
         place = ", ".join(f"{axis} {value:g}" for axis, value in (metadata.stage_position or {}).items())
         self.frame_words.setText(", ".join(word for word in (*words, place) if word))
+
+    def _use(self) -> None:
+        if self.opened is not None:
+            self.session.handed_on.emit("reconstructions", self.opened.path / FOLDER)
 
     def _open_folder(self) -> None:
         if self.opened is not None:

@@ -11,7 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QPixmap
 from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxLayout, QWidget
 
-from calibration_routines import SweepCalibration
+from calibration_routines import Photograph, SweepCalibration
 from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.sweep_watch import PointTaken
 from gui.forms.routines import ROUTINES
@@ -101,6 +101,9 @@ class SweepsPanel(ProcedurePanel):
         """Show the last judgement, or the routine's picture."""
         if isinstance(outcome.result, SweepCalibration):
             self.psfs.show_all(outcome.result.quality)
+        if isinstance(outcome.result, Photograph):
+            self._show_image(outcome.result.measurement)
+            self.frame_words.setText("The photograph, dark frames taken off")
         pictures = [file for file in outcome.files if file.suffix == ".png"]
         if pictures:
             self.picture.show_pixmap(QPixmap(str(pictures[0])))

@@ -1,0 +1,105 @@
+"""A full round by mouse alone: calibrate, photograph, reconstruct, on the simulated bench."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from drivers.simulated.world import SimulatedWorld
+from gui.main_window import MainWindow
+from gui.panels.reconstructions import ReconstructionsPanel
+from gui.panels.sweeps import SweepsPanel
+from instrument.images import read_image
+
+LEFT = Qt.MouseButton.LeftButton
+WAIT_MS = 120_000
+
+
+@pytest.fixture
+def bench_text() -> str:
+    return """
+[bench]
+name = "test bench"
+data_folder = "runs"
+[camera]
+driver = "simulated"
+exposure_ms = 20.0
+[stage]
+driver = "simulated"
+[led_array]
+driver = "simulated"
+leds = 89
+[source]
+rgb = [0, 255, 0]
+[scene]
+control = "simulated"
+[simulated]
+preset = "tiny"
+time_scale = 0
+scene = "picture"
+scene_distance_mm = 100
+"""
+
+
+def click_tab(qtbot: QtBot, window: MainWindow, name: str) -> None:
+    bar = window.tabs.tabBar()
+    index = window.tabs.indexOf(window._places[name])
+    qtbot.mouseClick(bar, LEFT, pos=bar.tabRect(index).center())
+
+
+def choose(qtbot: QtBot, panel: SweepsPanel, name: str) -> None:
+    """Choose a routine in the drop-down list by two clicks."""
+    qtbot.mouseClick(panel.choice, LEFT)
+    popup = panel.choice.view()
+    qtbot.waitUntil(popup.isVisible)
+    row = [form.name for form in panel.forms].index(name)
+    place = popup.visualRect(panel.choice.model().index(row, 0)).center()
+    qtbot.wait(QApplication.doubleClickInterval() + 50)  # a list takes no click sooner
+    qtbot.mouseMove(popup.viewport(), place)
+    qtbot.mouseClick(popup.viewport(), LEFT, pos=place)
+    qtbot.waitUntil(lambda: panel.form.name == name)
+
+
+@pytest.mark.slow
+def test_calibrate_photograph_and_reconstruct_by_mouse_alone(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+    # Calibrate: the form begins with depths that the stage reaches; nothing is typed.
+    click_tab(qtbot, window, "sweeps")
+    sweeps = window.panel("sweeps")
+    assert isinstance(sweeps, SweepsPanel)
+    qtbot.waitUntil(lambda: sweeps.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    qtbot.mouseClick(sweeps.run_bar.start_button, LEFT)
+    with qtbot.waitSignal(sweeps.run.over, timeout=WAIT_MS):
+        pass
+    assert "1 PSF good" in sweeps.verdict.toPlainText(), sweeps.verdict.toPlainText()
+    qtbot.mouseClick(sweeps.use_button, LEFT)
+    reconstructions = window.panel("reconstructions")
+    assert isinstance(reconstructions, ReconstructionsPanel)
+    assert window.tabs.currentWidget() is window._places["reconstructions"]
+    # Photograph the scene: another routine of the same panel.
+    click_tab(qtbot, window, "sweeps")
+    choose(qtbot, sweeps, "photograph")
+    qtbot.waitUntil(lambda: sweeps.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    qtbot.mouseClick(sweeps.run_bar.start_button, LEFT)
+    with qtbot.waitSignal(sweeps.run.over, timeout=WAIT_MS):
+        pass
+    (file,) = session.runs_folder.glob("*_photograph/photograph.tif")
+    photograph = read_image(file).pixels
+    qtbot.mouseClick(sweeps.use_button, LEFT)
+    # Reconstruct it.
+    qtbot.mouseClick(reconstructions.form.start, LEFT)
+    assert reconstructions.job is not None, reconstructions._note.text()
+    qtbot.waitUntil(lambda: reconstructions.result is not None, timeout=WAIT_MS)
+    assert reconstructions.viewers.currentWidget() is reconstructions.picture
+    assert reconstructions.result is not None
+    found = read_image(reconstructions.result.path).pixels.astype(float)
+    world, geometry = session.bench.shared["simulated"], session.bench.geometry
+    assert isinstance(world, SimulatedWorld)
+    assert geometry.pixel_pitch_um is not None
+    truth = world.ground_truth(photograph.shape, geometry.pixel_pitch_um)
+    assert found.shape == truth.shape
+    assert np.corrcoef(found.ravel(), truth.ravel())[0, 1] > 0.7  # the photograph itself: about 0
+    assert abs(np.corrcoef(photograph.ravel(), truth.ravel())[0, 1]) < 0.5
