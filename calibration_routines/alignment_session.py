@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from calibration_routines.display_io import DisplayBench
 from calibration_routines.spot_camera import SpotCamera, SpotLook
-from instrument.errors import BenchError
+from instrument.errors import BenchError, SettingsError
 from recon.holography import Display
 from recon.holography.pose_fit import PoseProbe
 
@@ -59,6 +59,29 @@ class AlignmentSettings:
     division: tuple[int, int] = (3, 5)
     section_pictures: int = 8
     refinements: int = 4
+
+    def __post_init__(self) -> None:
+        problems = [
+            (name, f"{name} must be a finite number above 0, not {getattr(self, name):g}")
+            for name in ("reach", "depth_um", "roll_mrad", "scale", "tilt_mrad")
+            if not 0 < getattr(self, name) < float("inf")
+        ]
+        problems += [
+            (name, f"{name} must be at least {least}, not {getattr(self, name)}")
+            for name, least in (
+                ("spots", 1),
+                ("max_frames", 1),
+                ("moves", 0),
+                ("section_pictures", 1),
+                ("refinements", 1),
+            )
+            if getattr(self, name) < least
+        ]
+        if min(self.division) < 1:
+            words = f"the SLM has at least one row and one column of sections, not {self.division}"
+            problems.append(("division", words))
+        if problems:
+            raise SettingsError(problems)
 
     @property
     def last_frames(self) -> int:

@@ -34,6 +34,8 @@ class Outlook:
         Of its frames, with the camera's present exposure; None where the next frame depends on the last one.
     cost : PlanEstimate or None
         Of the plan.
+    free_bytes : int or None
+        On the disk that the runs go to.
     path : tuple of mapping
         Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits.
     """
@@ -41,6 +43,7 @@ class Outlook:
     reasons: tuple[str, ...] = ()
     plan: Plan | None = None
     cost: PlanEstimate | None = None
+    free_bytes: int | None = None
     path: tuple[dict[str, float], ...] = ()
 
 
@@ -136,12 +139,10 @@ class Procedure(Protocol):
         """
 
 
-def outlook_of(
-    bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = (), *, by_hand: bool = False
-) -> Outlook:
-    """Return the outlook of a plan that was checked; with ``by_hand`` it goes nowhere."""
+def outlook_of(bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = ()) -> Outlook:
+    """Return the outlook of a plan that was checked."""
     abilities = abilities_of(bench, folder or bench.config.data_folder)
-    return Outlook(tuple(reasons), plan, estimate(plan, abilities), () if by_hand else path_of(plan))
+    return Outlook(tuple(reasons), plan, estimate(plan, abilities), abilities.free_bytes, path_of(plan))
 
 
 def path_of(plan: Plan) -> tuple[dict[str, float], ...]:

@@ -214,9 +214,10 @@ class ProcedurePanel(Panel):
         lines = list(outlook.reasons)
         if outlook.cost is not None:
             cost = outlook.cost
+            free = "" if outlook.free_bytes is None else f" of {size(outlook.free_bytes)} free"
             lines.insert(
                 0,
-                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}, {duration(cost.seconds)} of "
+                f"{count(cost.frames, 'frame')}, {size(cost.total_bytes)}{free}, {duration(cost.seconds)} of "
                 f"exposure and motion, {count(cost.moves, 'move')}",
             )
         self._say("\n".join(lines), wrong=False)

@@ -8,6 +8,7 @@ from typing import Any
 from calibration_routines.alignment_session import AlignmentSettings
 from calibration_routines.display_procedures import AlignmentProcedure
 from gui.forms.field import Field, Form, field_of
+from instrument.errors import SettingsError
 
 _SECTIONS = AlignmentSettings().division
 
@@ -15,6 +16,9 @@ _SECTIONS = AlignmentSettings().division
 def _make(values: Mapping[str, Any]) -> AlignmentProcedure:
     settings = dict(values)
     slm_calibration, out = settings.pop("slm_calibration"), settings.pop("out")
+    for name in ("rows", "columns"):
+        if settings[name] < 1:
+            raise SettingsError([(name, f"at least one is needed, not {settings[name]}")])
     settings["division"] = (settings.pop("rows"), settings.pop("columns"))
     return AlignmentProcedure(
         settings=AlignmentSettings(**settings), slm_calibration=slm_calibration, out=out
@@ -36,6 +40,23 @@ ALIGNMENT = Form(
             AlignmentSettings, "roll_mrad", "Rotation", "Largest to look for", unit="mrad", advanced=True
         ),
         field_of(AlignmentSettings, "scale", "Scale error", "Largest to look for", advanced=True),
+        field_of(AlignmentSettings, "spots", "Spots", "In a search picture", "whole", advanced=True),
+        field_of(
+            AlignmentSettings,
+            "section_pictures",
+            "Section pictures",
+            "In the last measurement of the sections",
+            "whole",
+            advanced=True,
+        ),
+        field_of(
+            AlignmentSettings,
+            "refinements",
+            "Refinements",
+            "Pictures of the last measurement of depth, tilts and brightness",
+            "whole",
+            advanced=True,
+        ),
         field_of(
             AlignmentProcedure,
             "slm_calibration",

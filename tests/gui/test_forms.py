@@ -12,7 +12,8 @@ from calibration_routines.sweep_procedure import SweepProcedure
 from calibration_routines.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT
 from gui.forms.as_python import script
-from gui.forms.routines import AXIAL, BEADS, LATERAL, PLAN, ROUTINES
+from gui.forms.routines import AXIAL, BEADS, LATERAL, PHOTOGRAPH, PLAN, ROUTINES, SLM
+from instrument.config_file import display_text
 from instrument.errors import BenchError, SettingsError
 
 Z = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3}
@@ -87,21 +88,30 @@ positions = { kind = "points", points_um = [[0, 0, 8e4], [0, 0, 9e4]] }
 """
 
 
+FAST = {"average": 1, "dark_frames": 1}
+
+
 @pytest.mark.parametrize(
     ("form", "changed"),
     [
-        (AXIAL, {"planes": 2, "average": 1, "dark_frames": 1}),
+        (AXIAL, {"planes": 2, **FAST}),
+        (LATERAL, {"half_field_x_um": 0.0, "half_field_y_um": 0.0, "spacing_um": 1e3, **FAST}),
+        (PHOTOGRAPH, FAST),
         (PLAN, {"text": POINT}),
+        (SLM, {"levels": 8}),
     ],
-    ids=["axial", "plan"],
+    ids=lambda value: getattr(value, "name", ""),
 )
 def test_the_python_of_a_form_runs(
     form: Any, changed: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bench = tmp_path / "bench.toml"
-    bench.write_text(BENCH)
+    bench.write_text(BENCH if form is not SLM else display_text().replace("[360, 640]", "[100, 140]"))
     lines = script(form.make(values_of(form, **changed)), bench)
     names: dict[str, Any] = {}
     exec(lines, names)
-    assert names["done"].runs[0].parent == tmp_path / "runs"
-    assert names["done"].verdict[0] in capsys.readouterr().out
+    done = names["done"]
+    written = [*done.runs, *done.files]
+    assert all(path.exists() for path in written)
+    assert written[0].parent == tmp_path / "runs"
+    assert done.verdict[0] in capsys.readouterr().out
