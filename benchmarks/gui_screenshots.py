@@ -4,7 +4,7 @@
     python benchmarks/gui_screenshots.py --out /tmp/shots --size 1920x1080 --panel reconstructions
 
 What the panels show is made first, with the commands that an operator uses: a calibration and a photograph of
-beads, reconstructed as picture and volume in the window itself, and a hologram on a display whose mask is
+beads, reconstructed as picture and volume in the window itself, and a hologram on a display whose mask was
 aligned. ``--work`` keeps that between calls. Needs no screen (QT_QPA_PLATFORM=offscreen). A few minutes.
 """
 
@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
+import shutil
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import numpy as np
-from PySide6.QtCore import QSettings, QtMsgType, qInstallMessageHandler
+from PySide6.QtCore import QSettings, Qt, QtMsgType, qInstallMessageHandler
 from PySide6.QtTest import QTest
 
 import instrument
@@ -66,16 +67,10 @@ scene_distance_mm = 40.84
 scene_depth_mm = 50.0
 """
 SWEEP = ["--z-min", "22", "--z-max", "80", "--planes", "12", "--average", "2"]
+EXPOSURES_MS = {"beads": 1.0, "bars": 60.0}
 PICTURE_Z_MM = "40.84"
-ALIGNED = {
-    "shift_um": "[0.0, 0.0]",
-    "z_um": "0.0",
-    "roll_mrad": "0.0",
-    "pitch_mrad": "0.0",
-    "yaw_mrad": "0.0",
-    "magnification": "0.0",
-    "relay_distortion_um": "0.0",
-}
+DISPLAY = {"holograms", "alignment"}
+"""Panels that are shown on the holographic display instead of the camera."""
 
 
 def main() -> int:
@@ -95,18 +90,22 @@ def main() -> int:
     names = given.panel or list(PANELS)
     qInstallMessageHandler(_quietly)
     apply_theme(application(), given.theme)
-    if set(names) - {"holograms"}:
+    if set(names) - DISPLAY:
         _prepare_camera(work / "camera")
         window = _open(work / "camera", width, height)
         for name in names:
-            if name != "holograms":
+            if name not in DISPLAY:
                 _show(window, name, given.out)
         _close(window)
-    if "holograms" in names:
+    if set(names) & DISPLAY:
         _prepare_display(work / "display")
         window = _open(work / "display", width, height)
-        _hologram(window)
-        _grab(window, given.out / "holograms.png")
+        _align(window)  # holograms need it, too
+        if "alignment" in names:
+            _grab(window, given.out / "alignment.png")
+        if "holograms" in names:
+            _hologram(window)
+            _grab(window, given.out / "holograms.png")
         _close(window)
     return 0
 
@@ -119,21 +118,16 @@ def _prepare_camera(folder: Path) -> None:
     bench.write_text(fast)
     if not list((folder / "runs").glob("*/calibration")):
         _do("calibrate", "axial", "--bench", bench, *SWEEP)
-    for scene in ("beads", "bars"):
+    for scene, exposure_ms in EXPOSURES_MS.items():
         bench.write_text(fast.replace('scene = "beads"', f'scene = "{scene}"'))
         if not (folder / f"{scene}.tif").exists():
-            _do("snap", "--bench", bench, "--out", folder / f"{scene}.tif")
+            _do("snap", "--bench", bench, "--exposure-ms", exposure_ms, "--out", folder / f"{scene}.tif")
     bench.write_text(CAMERA)
 
 
 def _prepare_display(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    text = (Path(instrument.__file__).parent / "display_bench.toml").read_text()
-    for key, value in ALIGNED.items():
-        text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
-        if count != 1:
-            raise SystemExit(f"display_bench.toml has {count} lines {key}; one is expected.")
-    (folder / "bench.toml").write_text(text)
+    shutil.copy(Path(instrument.__file__).parent / "display_bench.toml", folder / "bench.toml")
     write_image(folder / "portrait.png", np.round(255 * load_sample("portrait", (512, 512))).astype(np.uint8))
 
 
@@ -155,6 +149,8 @@ def _open(folder: Path, width: int, height: int) -> MainWindow:
     session.opened.connect(lambda: opened.append(True))
     session.open()
     _wait(lambda: bool(opened), "the bench to open")
+    if folder.name == "camera":
+        _wait(lambda: session.live.newest() is not None, "the first frame")
     QTest.qWait(SETTLE_MS)
     return window
 
@@ -172,7 +168,43 @@ def _show(window: MainWindow, name: str, out: Path) -> None:
     if name == "reconstructions":
         _reconstructions(window, out)
         return
+    if name == "sweeps":
+        _sweep(window)
+    if name == "runs":
+        _first_run(window)
     _grab(window, out / f"{name}.png")
+
+
+def _sweep(window: MainWindow) -> None:
+    """Carry out an axial sweep with the form."""
+    from gui.panels.sweeps import SweepsPanel
+
+    panel = window.panel("sweeps")
+    assert isinstance(panel, SweepsPanel)
+    _wait(lambda: panel.outlook is not None, "the first look at the form")
+    for name, text in {"z_min_um": "22", "z_max_um": "80", "planes": "6", "average": "2"}.items():
+        field: Any = panel.view.widgets[name]
+        field.setFocus()
+        field.selectAll()
+        QTest.keyClicks(field, text)
+    QTest.qWait(SETTLE_MS)
+    _wait(lambda: panel.run_bar.start_button.isEnabled(), "the form to be right")
+    over: list[bool] = []
+    panel.run.over.connect(lambda: over.append(True))
+    panel.run_bar.start_button.click()
+    _wait(lambda: bool(over), "the sweep")
+
+
+def _first_run(window: MainWindow) -> None:
+    """Open the newest run."""
+    from gui.panels.runs import RunsPanel
+
+    panel = window.panel("runs")
+    assert isinstance(panel, RunsPanel)
+    _wait(lambda: panel.table.rowCount() > 0, "the list of runs")
+    panel.table.selectRow(0)
+    first = panel.table.visualItemRect(panel.table.item(0, 0)).center()
+    QTest.mouseClick(panel.table.viewport(), Qt.MouseButton.LeftButton, pos=first)
 
 
 def _reconstructions(window: MainWindow, out: Path) -> None:
@@ -183,7 +215,7 @@ def _reconstructions(window: MainWindow, out: Path) -> None:
     panel = window.panel("reconstructions")
     assert isinstance(panel, ReconstructionsPanel)
     folder = panel.session.runs_folder.parent
-    calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[-1]
+    calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[0]
     form = panel.form
     for kind, scene, prior, tau, shot in (
         (CALIBRATION, "bars", "tv", "", "reconstruct"),
@@ -227,6 +259,8 @@ def _hologram(window: MainWindow) -> None:
     assert isinstance(panel, HologramsPanel)
     panel.picture.setText(str(panel.session.runs_folder.parent / "portrait.png"))
     panel.picture.check()
+    alignments = sorted(panel.session.runs_folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+    panel.alignment.setText(str(alignments[-1]))
     panel.weights_mode.setCurrentText("a fovea, dragged")
     panel.target.set_fovea((0.42, 0.5), 0.24)
     panel.iterations.setText("60")
@@ -237,6 +271,19 @@ def _hologram(window: MainWindow) -> None:
         _wait(lambda job=job: job.is_over, job.title)
         if job.error is not None:
             raise SystemExit(f"{job.title}: {job.error}")
+
+
+def _align(window: MainWindow) -> None:
+    """Find the mask and bring it to its place."""
+    from gui.panels.alignment import AlignmentPanel
+
+    panel = window.show_panel("alignment")
+    assert isinstance(panel, AlignmentPanel)
+    _wait(lambda: panel.run_bar.start_button.isEnabled(), "the form to be right")
+    over: list[bool] = []
+    panel.run.over.connect(lambda: over.append(True))
+    panel.run_bar.start_button.click()
+    _wait(lambda: bool(over), "the alignment")
 
 
 def _grab(window: MainWindow, path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from gui.theme import colours
 from gui.widgets.plot import curve_pen, plot_widget
@@ -23,22 +23,27 @@ class ConvergenceView(QWidget):
         super().__init__(parent)
         self.plot: Any = plot_widget("iteration")
         self.plot.setLogMode(y=True)
-        self.plot.addLegend(offset=(-5, 5), labelTextColor=colours().dim, brush=colours().panel)
         self.plot.setMinimumSize(120, 80)
         self.plot.setToolTip(
             "Residual in units of what the noise explains (1: nothing is left to explain), "
             "and relative change of the result an iteration"
         )
-        self.against_time = QCheckBox("against seconds", self.plot)
-        self.against_time.move(60, 2)
+        self.legend = QLabel()
+        self.legend.setMinimumWidth(10)
+        self.against_time = QCheckBox("seconds")
         self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")
         self.against_time.toggled.connect(self._draw)
         self.curves: dict[str, Any] = {}
+        self._numbers: dict[int, str] = {}
         self._histories: Histories = ()
         self._noise_norm: float | None = None
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(0)
+        row = QHBoxLayout()
+        row.addWidget(self.legend, 1)
+        row.addWidget(self.against_time)
+        layout.addLayout(row)
         layout.addWidget(self.plot, 1)
 
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
@@ -48,7 +53,7 @@ class ConvergenceView(QWidget):
 
     def _draw(self) -> None:
         self.plot.clear()
-        self.curves = {}
+        self.curves, self._numbers = {}, {}
         by_time = self.against_time.isChecked()
         self.plot.setLabel("bottom", "seconds" if by_time else "iteration")
         norm = self._noise_norm or 1.0
@@ -57,6 +62,13 @@ class ConvergenceView(QWidget):
             suffix = "" if len(self._histories) == 1 else f", channel {channel}"
             self._add(f"residual / noise{suffix}", x, [r.data_residual / norm for r in history], 2 * channel)
             self._add(f"change{suffix}", x, [r.change for r in history], 2 * channel + 1)
+        colour = colours().curves
+        self.legend.setText(
+            " &nbsp;".join(
+                f'<span style="color:{colour[number % len(colour)]}">●</span> {name}'
+                for number, name in self._numbers.items()
+            )
+        )
         if self._noise_norm is not None and self._histories:
             pen = pg.mkPen(colours().dim, style=Qt.PenStyle.DashLine)
             self.plot.addItem(pg.InfiniteLine(0.0, angle=0, pen=pen))  # log10 of 1
@@ -66,4 +78,5 @@ class ConvergenceView(QWidget):
         y = np.array(values)
         known = np.isfinite(y) & (y > 0)
         if known.any():
-            self.curves[name] = self.plot.plot(x[known], y[known], pen=curve_pen(number), name=name)
+            self.curves[name] = self.plot.plot(x[known], y[known], pen=curve_pen(number))
+            self._numbers[number] = name

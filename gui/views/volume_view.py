@@ -73,6 +73,9 @@ class VolumeView(QWidget):
         self.front, self.coloured = StretchedImage(), StretchedImage()
         self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
         self.profile = plot_widget("plane")
+        self._along: Any = self.profile.plot(pen=curve_pen(0))
+        self._here: Any = pg.InfiniteLine(pen=colours().dim)
+        self.profile.addItem(self._here)
         self.profile.setToolTip("Values along depth through the chosen pixel, of the views' resolution")
         self._titles = [QLabel() for _ in range(4)]
         for label in self._titles:
@@ -255,7 +258,10 @@ class VolumeView(QWidget):
             return  # of the volume before
         self.slices[held.axis] = held
         if self.mode == "slices":
-            self._show()
+            self._show_slice(held, self.levels.levels)
+            self._name_slices()
+            if held.axis == "y":
+                self._show_profile()
 
     def _show(self) -> None:
         if self._source is None:
@@ -289,21 +295,25 @@ class VolumeView(QWidget):
             label.setText(text)
 
     def _show_slices(self) -> None:
-        levels = self.levels.levels
+        for held in self.slices.values():
+            self._show_slice(held, self.levels.levels)
+        self._name_slices()
+        self._show_profile()
+
+    def _show_slice(self, held: Slice, levels: tuple[float, float]) -> None:
+        if held.axis == "x":
+            self._draw(self.side, np.ascontiguousarray(np.swapaxes(held.pixels, 0, 1)), levels)
+        else:
+            self._draw(self.front if held.axis == "z" else self.top, held.pixels, levels)
+
+    def _name_slices(self) -> None:
         z, y, x = self.point
-        if "z" in self.slices:
-            self._draw(self.front, self.slices["z"].pixels, levels)
-        if "x" in self.slices:
-            self._draw(self.side, np.ascontiguousarray(np.swapaxes(self.slices["x"].pixels, 0, 1)), levels)
-        if "y" in self.slices:
-            self._draw(self.top, self.slices["y"].pixels, levels)
         for label, text in zip(
             self._titles,
             (f"x–y at plane {z + 1}", f"z–y at column {x}", f"x–z at row {y}", f"along depth at ({x}, {y})"),
             strict=True,
         ):
             label.setText(text)
-        self._show_profile()
 
     def _draw(self, view: StretchedImage, image: Plane, levels: tuple[float, float]) -> None:
         """Show an image over the volume's own voxels."""
@@ -320,9 +330,8 @@ class VolumeView(QWidget):
         z, _, x = self.point
         pixels = grey(held.pixels)
         column = min(x * pixels.shape[1] // self._source.shape[2], pixels.shape[1] - 1)
-        self.profile.clear()
-        self.profile.plot(np.arange(1, len(pixels) + 1), pixels[:, column].astype(float), pen=curve_pen(0))
-        self.profile.addItem(pg.InfiniteLine(z + 1, pen=colours().dim))
+        self._along.setData(np.arange(1, len(pixels) + 1), pixels[:, column].astype(float))
+        self._here.setValue(z + 1)
 
     def _place_lines(self) -> None:
         z, y, x = (index + 0.5 for index in self.point)

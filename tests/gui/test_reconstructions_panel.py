@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from gui.session import BenchSession
 from gui.views.reconstruct_form import PSF, VOLUME
 from instrument.images import read_image, write_image
 from instrument.stored_result import open_result
+from instrument.volume_source import VolumeSource
 
 WAIT_MS = 20_000
 SIZE, DEPTHS = 32, 4
@@ -243,3 +245,42 @@ def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPane
     assert bar.low.property("refused")
     qtbot.mouseClick(bar.auto, Qt.MouseButton.LeftButton)
     assert bar.levels[1] == pytest.approx(10, rel=0.01)
+
+
+def test_no_voxel_is_read_in_the_windows_thread(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, monkeypatch
+) -> None:
+    voxels = np.random.default_rng(0).random((6, 64, 48), np.float32)
+    np.save(tmp_path / "v.npy", voxels)
+    threads: set[str] = set()
+    for name in ("plane", "across_y", "across_x"):
+        read = getattr(VolumeSource, name)
+
+        def watched(self, index, read=read):
+            threads.add(threading.current_thread().name)
+            return read(self, index)
+
+        monkeypatch.setattr(VolumeSource, name, watched)
+    panel.open(tmp_path / "v.npy")
+    view = panel.volume
+    qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
+    qtbot.mouseClick(view.slices_button, Qt.MouseButton.LeftButton)
+    view.go_to(5, 9, 8)
+    qtbot.waitUntil(lambda: [view.slices[a].index for a in "zyx"] == [5, 9, 8], timeout=WAIT_MS)
+    assert threads
+    assert threading.main_thread().name not in threads
+
+
+def test_another_volume_ends_the_reading_of_the_first(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
+) -> None:
+    first, second = (np.full((4, 8, 8), value, np.float32) for value in (1, 2))
+    np.save(tmp_path / "a.npy", first)
+    np.save(tmp_path / "b.npy", second)
+    panel.open(tmp_path / "a.npy")
+    panel.open(tmp_path / "b.npy")
+    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
+    assert panel.result.path.name == "b.npy"
+    assert panel.volume.projections.front.max() == 2
+    panel.shutdown()
+    assert not [t for t in threading.enumerate() if t.name == "volume slices"]
