@@ -152,7 +152,7 @@ class Job(QObject):
         """Whether it is too small to be told of: a value read back every few seconds."""
         self.state = JobState.WAITING
         self.error: BaseException | None = None
-        self._work = work
+        self._work: Work | None = work
         self._context = context
 
     @property
@@ -293,6 +293,8 @@ class JobRunner(QObject):
         thread = threading.Thread(
             target=_do, args=(job._work, job._context), name=f"job: {job.title}", daemon=True
         )
+        # What the work holds (a recording's buffers) goes with its thread, not with whoever keeps the job.
+        job._work = None
         self._threads = [*(t for t in self._threads if t.is_alive()), thread]
         thread.start()
         job.started.emit()

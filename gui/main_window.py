@@ -305,6 +305,7 @@ class MainWindow(QMainWindow):
         done = box.addButton("Done", QMessageBox.ButtonRole.AcceptRole)
         box.addButton("Stop", QMessageBox.ButtonRole.RejectRole)
         box.finished.connect(lambda _: request.confirm() if box.clickedButton() is done else request.refuse())
+        request.withdrawn = box.reject
         self._open(box)
 
     def _open(self, box: QMessageBox) -> None:

@@ -14,8 +14,16 @@ from typing import Any, Literal
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from drivers.camera import Camera
-from drivers.errors import DeviceError, LimitError, StoppedError
-from gui.jobs import Job, JobContext, JobRunner, Work, words_for
+from drivers.device import Device
+from drivers.errors import (
+    DeviceError,
+    DeviceLostError,
+    DeviceNotOpenError,
+    DeviceTimeoutError,
+    LimitError,
+    StoppedError,
+)
+from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
 from instrument.live_camera import LiveCamera
@@ -146,9 +154,8 @@ class BenchSession(QObject):
         job.ended.connect(self._all_tried)
         return job
 
-    def reconnect(self, kind: Kind) -> Job:
-        """Close and open a device again."""
-        self._set_state(kind, DeviceState("opening"))
+    def reconnect(self, kind: Kind) -> None:
+        """Close and open a device again; while a run goes on, say that it has to wait."""
 
         def work(_: JobContext) -> None:
             device = self.bench.devices[kind]
@@ -159,9 +166,13 @@ class BenchSession(QObject):
                 device.close()
             self._open_one(kind)
 
-        job = self.jobs.device(f"Connecting the {kind.replace('_', ' ')}", work, {kind})
+        try:
+            job = self.jobs.device(f"Connecting the {kind.replace('_', ' ')}", work, {kind})
+        except BusyError as error:
+            self.log("warning", str(error))
+            return
+        self._set_state(kind, DeviceState("opening"))
         job.ended.connect(lambda: self._tried(kind))
-        return job
 
     def _open_one(self, kind: Kind) -> None:
         """Open a device, in a job's thread; a failure becomes its state."""
@@ -196,15 +207,17 @@ class BenchSession(QObject):
         """Start the live view; it also goes on by itself after a run."""
         self._live_wanted = True
         if self.is_open("camera") and not self.jobs.is_busy("camera") and not self._closing:
-            self._live_job = self.jobs.device(
-                "Starting the live view", lambda _: self.live.start(), {"camera"}
-            )
+            with contextlib.suppress(BusyError):  # a run goes on: the live view does after it
+                self._live_job = self.jobs.device(
+                    "Starting the live view", lambda _: self.live.start(), {"camera"}
+                )
 
     def stop_live(self) -> None:
         """End the live view until it is started again."""
         self._live_wanted = False
-        if self.live.is_running and self.jobs.exclusive_job is None:
-            self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"})
+        if self.live.is_running:
+            with contextlib.suppress(BusyError):  # a run has ended it already
+                self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"})
 
     # Jobs ----------------------------------------------------------------------------------------
     def device_job(self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False) -> Job:
@@ -264,10 +277,14 @@ class BenchSession(QObject):
         if isinstance(error, DeviceError) and not isinstance(error, LimitError | StoppedError):
             self.note_failure(error)
 
-    def note_failure(self, error: DeviceError) -> None:
-        """Mark the device that an error names as failed."""
+    def note_failure(self, error: DeviceError, *, surely: bool = False) -> None:
+        """Mark the device that an error names as failed, unless it only refused what it was asked."""
         for kind, device in self.bench.devices.items():
-            if error.device.startswith(device.name) and self.state(kind).condition == "open":
+            if (
+                error.device.startswith(device.name)
+                and self.state(kind).condition == "open"
+                and (surely or _is_gone(device, error))
+            ):
                 self._set_state(kind, DeviceState("failed", words_for(error), self.state(kind).simulated))
 
     def _look_after_devices(self) -> None:
@@ -275,7 +292,7 @@ class BenchSession(QObject):
         error = self.live.error
         if error is not None and self.is_open("camera"):
             self.log("error", f"Live view: {words_for(error)}")
-            self.note_failure(error)
+            self.note_failure(error, surely=True)
         for kind, device in self.bench.devices.items():
             if self.is_open(kind) and not device.is_open and not self.jobs.is_busy(kind):
                 text = f"{device.name} was lost. Check its cable and power, then reconnect it."
@@ -292,6 +309,8 @@ class BenchSession(QObject):
         self.jobs.cancel_device_jobs()
         for request in list(self._requests):
             request.refuse()
+            if request.withdrawn is not None:
+                request.withdrawn()
         if self._stopping:
             return
         self._stopping = True
@@ -415,12 +434,25 @@ class BenchSession(QObject):
             self.log(*value)
 
 
+def _is_gone(device: Device, error: DeviceError) -> bool:
+    """Whether an error means that a device cannot be used any more."""
+    if isinstance(error, DeviceLostError | DeviceNotOpenError | DeviceTimeoutError) or not device.is_open:
+        return True
+    try:
+        _ = device.identity
+    except DeviceError:
+        return True
+    return False
+
+
 class OperatorRequest:
     """Something that the operator is asked to do by hand; a job waits for the answer."""
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.answered: Callable[[], None] | None = None
+        self.withdrawn: Callable[[], object] | None = None
+        """Takes the question from the screen when STOP has answered it."""
         self._done = threading.Event()
         self._refused = False
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QComboBox, QFormLayout, QLabel, QPushButton, QWidget
+from PySide6.QtWidgets import QComboBox, QFormLayout, QLabel, QLineEdit, QPushButton, QWidget
 
-from drivers.camera import Camera
+from drivers.camera import Camera, Roi
 from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.widgets.message import TextWindow
@@ -39,8 +38,11 @@ class CameraForm(QWidget):
         self.binning.setToolTip("Sensor pixels summed along each axis")
         self.pixel_format = QComboBox()
         self.pixel_format.setToolTip("Pixel format by its GenICam name")
-        self.region = QLabel("–")
-        self.region.setToolTip("Region of interest in sensor pixels before binning")
+        self.region = QLineEdit()
+        self.region.setToolTip(
+            "Region of interest in sensor pixels before binning: top, left, height, width. Enter sends it"
+        )
+        self.region.returnPressed.connect(self._region_typed)
         self.temperature = QLabel("–")
         self.temperature.setToolTip("Of the sensor or camera, degrees Celsius, where it has a thermometer")
         self.all_button = QPushButton("All settings …")
@@ -90,9 +92,18 @@ class CameraForm(QWidget):
         )
         job.succeeded.connect(self._show)
 
-    def set_region(self, region: Any) -> Job | None:
+    def set_region(self, region: Roi | None) -> Job | None:
         """Send a region (None: the whole sensor) to the camera."""
         return self._set(self.region, "Region", lambda c: c.set_roi(region), idle=True)
+
+    def _region_typed(self) -> None:
+        words = self.region.text().replace(",", " ").split()
+        if len(words) != 4 or not all(word.isdecimal() for word in words):
+            why = f"{self.region.text()!r} is no region: four whole numbers, top, left, height, width."
+            self._panel.refused(self.region, why)
+            return
+        self.region.setModified(False)
+        self.set_region(Roi(*map(int, words)))
 
     def _set(
         self, field: QWidget, what: str, action: Callable[[Camera], object], *, idle: bool = False
@@ -144,7 +155,8 @@ class CameraForm(QWidget):
         _choose(self.binning, [(f"{b} × {b}", b) for b in state.binnings], state.binning)
         _choose(self.pixel_format, [(f, f) for f in state.pixel_formats], state.pixel_format)
         roi = state.roi
-        self.region.setText(f"{roi.height} × {roi.width} at {roi.top}, {roi.left}")
+        if not self.region.isModified() or not self.region.hasFocus():
+            self.region.setText(", ".join(map(str, roi.as_tuple())))
         has_thermometer = state.temperature_c is not None
         self.temperature.setVisible(has_thermometer)
         self._temperature_name.setVisible(has_thermometer)

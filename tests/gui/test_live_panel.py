@@ -83,6 +83,15 @@ def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -
     qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
     qtbot.mouseClick(live.whole_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.height == 240, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
+    _type(qtbot, live.form.region, "8, 16, 100, 200")
+    qtbot.waitUntil(lambda: live.session.bench.camera.roi.as_tuple() == (8, 16, 100, 200), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
+    _type(qtbot, live.form.region, "8, 16, many")
+    assert "four whole numbers" in live.form.region.toolTip()
+    _type(qtbot, live.form.region, "0, 0, 9999, 9999")
+    qtbot.waitUntil(lambda: "cannot read the region" in live.form.region.toolTip(), timeout=WAIT_MS)
+    assert live.session.is_open("camera")
 
 
 def test_a_photograph_by_its_key(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:

@@ -178,3 +178,23 @@ def test_the_red_theme_emits_no_green_or_blue_to_speak_of() -> None:
             if colour.startswith("#"):
                 red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
                 assert max(green, blue) <= 0.55 * red, (field, colour)
+
+
+def test_stop_withdraws_what_the_operator_is_asked(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+    job = session.exclusive_job("By hand", lambda _: session._ask("Please light the scene."))
+    qtbot.waitUntil(lambda: window.question is not None, timeout=WAIT_MS)
+    assert window.question is not None
+    assert "light the scene" in window.question.text()
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.stop()
+    qtbot.waitUntil(lambda: job.is_over and window.question is None, timeout=WAIT_MS)
+    assert job.state is JobState.CANCELLED
+
+
+def test_what_a_device_refuses_is_no_failure_of_it(qtbot: QtBot, window: MainWindow) -> None:
+    session = window.session
+    job = session.camera_job("trigger", lambda camera: camera.trigger())  # it runs free: refused
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    assert job.state is JobState.FAILED
+    assert session.is_open("camera")
