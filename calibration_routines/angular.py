@@ -8,8 +8,9 @@ solid angle seen from the side and the source's own directivity. What remains is
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
@@ -32,7 +33,8 @@ from calibration_routines.sweep_plan import (
     check_sweep,
     sweep_plan,
 )
-from instrument.acquire import acquire
+from instrument.acquire import prepare
+from instrument.atomic import write_text
 from instrument.bench import Bench
 from instrument.errors import BenchError, SettingsError
 from instrument.run_control import RunControl
@@ -48,6 +50,8 @@ LEAST_SEEN = 0.08
 MOST_STEPS = 300
 """More angles to one side of an axis are a mistake."""
 RESPONSE_FILE = "angular_response.json"
+ANGULAR_FILE = "angular.json"
+"""In the run's folder: what its frames are for."""
 _REACH_MARGIN = 0.98  # of the stage's travel
 _SMOOTH_PX, _SUPPORT = 6.0, 0.05  # the pattern is where its smoothed light is above this part of its maximum
 _NEAR_PX = 40.0  # about where the stage says, the pattern is looked for
@@ -201,22 +205,61 @@ def measure_angular_response(
     if on_exposures is not None:
         on_exposures(exposures)
     plan = sweep_plan(points, exposures.exposures_ms)
-    run = acquire(bench, plan, where, on_progress=on_progress, control=control)
+    runner = prepare(bench, plan, where, on_progress=on_progress, control=control)
+    record = {
+        "sweep": asdict(sweep),
+        "geometry": asdict(geometry),
+        "bench": bench.label,
+        "simulated": bool(bench.simulated_kinds),
+    }
+    write_text(runner.path / ANGULAR_FILE, json.dumps(record, indent=1) + "\n")
+    return finish_angular(runner.execute())
+
+
+def finish_angular(run: Run) -> tuple[AngularResponse, Path]:
+    """Compute the response from a complete run, e.g. one that was resumed, and save it in its folder.
+
+    Raises
+    ------
+    CalibrationError
+        When the run is none of the angular response's, is not complete, or too little can be seen.
+    """
+    sweep, geometry, bench, simulated = _read_record(run.path)
     if run.condition is not RunCondition.COMPLETED:
         raise RunEndedError("The run", run)
+    points = sweep.points()
     drift = _drift(run, points)
     images = _images(run, points, drift)
     response = analyse_angular(
         images,
         points.points_um,
-        pitch_um=geometry.pixel_pitch_um,
-        distance_um=1e3 * geometry.diffuser_distance_mm,
+        pitch_um=geometry["pixel_pitch_um"],
+        distance_um=1e3 * geometry["diffuser_distance_mm"],
         emission=sweep.emission,
         findings=() if drift is None else drift.findings,
-        bench=bench.label,
-        simulated=bool(bench.simulated_kinds),
+        bench=bench,
+        simulated=simulated,
     )
     return response, save_response(response, run.path / RESPONSE_FILE)
+
+
+def is_angular(run: Path) -> bool:
+    """Whether a run's frames are those of an angular response."""
+    return (run / ANGULAR_FILE).is_file()
+
+
+def _read_record(run: Path) -> tuple[AngularSweep, dict[str, float], str, bool]:
+    path = run / ANGULAR_FILE
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        names = ("pixel_pitch_um", "diffuser_distance_mm")
+        geometry = {name: float(data["geometry"][name]) for name in names}
+        return AngularSweep(**data["sweep"]), geometry, str(data["bench"]), bool(data["simulated"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}): the run is none of calibrate angular, or the file was "
+            "changed. The frames beside it are not touched."
+        ) from error
 
 
 def analyse_angular(

@@ -20,7 +20,7 @@ from calibration_routines.auto_exposure import AutoExposure, auto_expose, hot_pi
 from calibration_routines.axial_analysis import DarkModel, replace_hot
 from calibration_routines.errors import CalibrationError, RunEndedError
 from drivers.led_array import LedArray
-from instrument.acquire import abilities_of, acquire
+from instrument.acquire import abilities_of, prepare
 from instrument.atomic import whole_file, write_text
 from instrument.bench import Bench
 from instrument.errors import BenchError, SettingsError
@@ -37,6 +37,8 @@ LEAST_LEDS = 24
 """Inside the objective's aperture: fewer, and slopes show in steps, as single LEDs cross the pupil's edge."""
 BANDS = ("red", "green", "blue")
 RESULT_FILE, HEIGHT_FILE = "dpc.json", "height_um.npy"
+SETUP_FILE = "dpc_setup.json"
+"""In the run's folder: what its frames are for."""
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
 
@@ -182,7 +184,42 @@ def measure_diffuser(
     check(dpc_plan(array, setup, bench.camera.exposure_ms), abilities_of(bench, where))
     exposure = _expose(bench, array, setup)
     plan = dpc_plan(array, setup, exposure.exposure_ms)
-    run = acquire(bench, plan, where, on_progress=on_progress, control=control)
+    runner = prepare(bench, plan, where, on_progress=on_progress, control=control)
+    record = {
+        "setup": asdict(setup),
+        "optics": asdict(optics),
+        "exposure_ms": exposure.exposure_ms,
+        "bench": bench.label,
+        "simulated": bool(bench.simulated_kinds),
+    }
+    write_text(runner.path / SETUP_FILE, json.dumps(record, indent=1) + "\n")
+    return finish_diffuser(runner.execute())
+
+
+def is_dpc(run: Path) -> bool:
+    """Whether a run's frames are those of a diffuser's surface."""
+    return (run / SETUP_FILE).is_file()
+
+
+def finish_diffuser(run: Run) -> tuple[DiffuserSurface, Path]:
+    """Compute the surface from a complete run, e.g. one that was resumed, and save it in its folder.
+
+    Raises
+    ------
+    CalibrationError
+        When the run is none of a diffuser's surface, is not complete, or saturates.
+    """
+    path = run.path / SETUP_FILE
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        setup, optics = DpcSetup(**record["setup"]), DpcOptics(**record["optics"])
+        exposure_ms, bench = float(record["exposure_ms"]), str(record["bench"])
+        simulated = bool(record["simulated"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}): the run is none of calibrate dpc, or the file was changed. "
+            "The frames beside it are not touched."
+        ) from error
     if run.condition is not RunCondition.COMPLETED:
         raise RunEndedError("The run", run)
     phase = phase_from_halves(_halves(run), optics)
@@ -194,10 +231,10 @@ def measure_diffuser(
         optics.pitch_um,
         slope,
         deflections_deg(slope, setup.index),
-        bench.label,
-        bool(bench.simulated_kinds),
+        bench,
+        simulated,
     )
-    return surface, _save(surface, setup, optics, exposure, run)
+    return surface, _save(surface, setup, optics, exposure_ms, run)
 
 
 def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
@@ -276,9 +313,7 @@ def _halves(run: Run) -> dict[str, Image]:
     return halves
 
 
-def _save(
-    surface: DiffuserSurface, setup: DpcSetup, optics: DpcOptics, exposure: AutoExposure, run: Run
-) -> Path:
+def _save(surface: DiffuserSurface, setup: DpcSetup, optics: DpcOptics, exposure_ms: float, run: Run) -> Path:
     with whole_file(run.path / HEIGHT_FILE) as file:
         np.save(file, surface.height_um)
     data: dict[str, Any] = {
@@ -288,7 +323,7 @@ def _save(
         "simulated": surface.simulated,
         "setup": asdict(setup),
         "optics": asdict(optics),
-        "exposure_ms": exposure.exposure_ms,
+        "exposure_ms": exposure_ms,
         "height_file": HEIGHT_FILE,
         "pitch_um": surface.pitch_um,
         "figures": surface.figures,

@@ -100,15 +100,7 @@ class AngularProcedure:
                 on_exposures=heard.exposures,
                 control=control,
             )
-        picture = file.with_suffix(".png")
-        save_figure(response_figure(response), picture)
-        return Outcome(
-            verdict=tuple(response_lines(response)),
-            good=not response.findings,
-            runs=(file.parent,),
-            files=(file, picture),
-            result=response,
-        )
+        return response_outcome(response, file)
 
     def _sweep(self, z_um: float) -> AngularSweep:
         return AngularSweep(
@@ -119,6 +111,19 @@ class AngularProcedure:
             self.average,
             self.dark_frames,
         )
+
+
+def response_outcome(response: AngularResponse, file: Path) -> Outcome:
+    """Draw a response beside its file, and say what it is."""
+    picture = file.with_suffix(".png")
+    save_figure(response_figure(response), picture)
+    return Outcome(
+        verdict=tuple(response_lines(response)),
+        good=not response.findings,
+        runs=(file.parent,),
+        files=(file, picture),
+        result=response,
+    )
 
 
 def response_lines(response: AngularResponse) -> list[str]:
@@ -175,15 +180,20 @@ class DpcProcedure:
             surface, file = measure_diffuser(
                 bench, self.setup, folder, on_progress=heard.frame, control=control
             )
-        picture = file.with_suffix(".png")
-        save_figure(surface_figure(surface), picture)
-        return Outcome(
-            verdict=(surface_line(surface),),
-            good=True,
-            runs=(file.parent,),
-            files=(file, picture),
-            result=surface,
-        )
+        return surface_outcome(surface, file)
+
+
+def surface_outcome(surface: DiffuserSurface, file: Path) -> Outcome:
+    """Draw a surface beside its file, and say what it is."""
+    picture = file.with_suffix(".png")
+    save_figure(surface_figure(surface), picture)
+    return Outcome(
+        verdict=(surface_line(surface),),
+        good=True,
+        runs=(file.parent,),
+        files=(file, picture),
+        result=surface,
+    )
 
 
 def surface_line(surface: DiffuserSurface) -> str:

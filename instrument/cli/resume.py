@@ -9,6 +9,9 @@ import typer
 from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
+from calibration_routines.angular import RESPONSE_FILE, finish_angular, is_angular
+from calibration_routines.dpc import RESULT_FILE, finish_diffuser, is_dpc
+from calibration_routines.optics_procedures import response_outcome, surface_outcome
 from calibration_routines.sweep import FOLDER
 from calibration_routines.sweep_words import event_lines
 from instrument.bench import Bench
@@ -33,7 +36,7 @@ def resume(
     Every frame that the run has is read first and held against its checksum; what was found is said. The
     bench is the run's own bench.toml unless --bench names another. A recording cannot go on; one that was
     cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
-    last frame is there.
+    last frame is there, a run of calibrate angular or dpc its response or surface.
     """
     found = Run.open(run)
     if found.plan is None:
@@ -43,6 +46,7 @@ def resume(
         typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
         if is_sweep(run) and not (run / FOLDER).exists():
             _finish(run, None)
+        _finish_others(found)
         return
     with open_and_say(bench or run / BENCH_TOML) as opened:
         home_if_needed(opened, found.plan)
@@ -56,8 +60,10 @@ def resume(
             console = Console(stderr=True)
             watch_resumed(opened, runner, lambda event: print_lines(console, event_lines(event)))
         done = carry_out(opened, runner)
-        if is_sweep(run) and done.condition is RunCondition.COMPLETED:
-            _finish(run, opened)
+        if done.condition is RunCondition.COMPLETED:
+            if is_sweep(run):
+                _finish(run, opened)
+            _finish_others(done)
 
 
 def _finish(run: Path, bench: Bench | None) -> None:
@@ -65,6 +71,19 @@ def _finish(run: Path, bench: Bench | None) -> None:
     with one_task("Analysing") as advance:
         done = finish_sweep(run, bench, on_analysis=advance)
     describe_result(Console(), done)
+
+
+def _finish_others(run: Run) -> None:
+    """Make the result of a complete run of calibrate angular or dpc that has none yet."""
+    if is_angular(run.path) and not (run.path / RESPONSE_FILE).exists():
+        with one_task("Analysing"):
+            outcome = response_outcome(*finish_angular(run))
+    elif is_dpc(run.path) and not (run.path / RESULT_FILE).exists():
+        with one_task("Analysing"):
+            outcome = surface_outcome(*finish_diffuser(run))
+    else:
+        return
+    print_lines(Console(), [*outcome.verdict, *(f"Wrote        {file}" for file in outcome.files)])
 
 
 def _close_recording(run: Run) -> None:

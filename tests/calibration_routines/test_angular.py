@@ -12,8 +12,10 @@ from calibration_routines.angular import AngularSweep, farthest_um, measure_angu
 from calibration_routines.angular_response import AngularResponse, Curve, load_response
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench import Bench, open_bench
+from instrument.cli import main
 from instrument.config_file import parse_config
 from instrument.errors import BenchError, FileError
+from instrument.runner import RunStatus
 from recon.optics.fall_off import gaussian_fall_off
 
 TINY = """
@@ -61,6 +63,26 @@ def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: P
     assert loaded == response
     tan_y, tan_x = (np.tan(np.deg2rad(v)) for v in np.meshgrid([-6.0, 0, 4], [-5.0, 0, 7], indexing="ij"))
     np.testing.assert_allclose(loaded.fall_off()(tan_y, tan_x), world.fall_off(tan_y, tan_x), atol=0.03)
+
+
+def test_a_run_that_was_cut_off_is_resumed_to_its_response(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Cut(BaseException):
+        pass
+
+    def cut(status: RunStatus) -> None:
+        if status.done == 20:
+            raise Cut
+
+    with pytest.raises(Cut):
+        measure_angular_response(bench, AngularSweep(150e3, 12.0, 3.0, average=1), tmp_path, on_progress=cut)
+    (run,) = tmp_path.iterdir()
+    bench.close()
+    assert main(["resume", str(run)]) == 0
+    assert "Cut-off along x" in capsys.readouterr().out
+    assert load_response(run / "angular_response.json").along_x.cut_off_deg == pytest.approx(10.8, abs=0.5)
+    assert (run / "angular_response.png").is_file()
 
 
 def test_angles_from_which_no_light_meets_the_sensor_are_left_out(bench: Bench, tmp_path: Path) -> None:

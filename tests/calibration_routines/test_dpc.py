@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from instrument.bench import Bench, open_bench
 from instrument.cli import main
 from instrument.config_file import led_microscope_text, parse_config
 from instrument.errors import BenchError
+from instrument.runner import RunStatus
 from recon.dpc import SIDES, DpcOptics, deflections_deg, level, phase_from_halves, slopes_deg, transfer
 from recon.errors import InputError
 from recon.optics.led_microscope import led_image
@@ -46,6 +48,28 @@ def test_height_and_slopes_are_the_diffusers(tmp_path: Path) -> None:
     kept = json.loads(file.read_text())
     assert kept["simulated"] is True
     assert np.array_equal(np.load(file.with_name(kept["height_file"])), surface.height_um)
+
+
+def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Cut(BaseException):
+        pass
+
+    def cut(status: RunStatus) -> None:
+        if status.done == 9:
+            raise Cut
+
+    with small_bench() as bench, pytest.raises(Cut):
+        measure_diffuser(bench, replace(SETUP, average=2, dark_frames=2), tmp_path, on_progress=cut)
+    (run,) = tmp_path.iterdir()
+    assert main(["resume", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "Height" in said
+    assert json.loads((run / "dpc.json").read_text())["simulated"] is True
+    assert (run / "dpc.png").is_file()
+    assert main(["resume", str(run)]) == 0  # nothing is left to do
+    assert "Height" not in capsys.readouterr().out
 
 
 def weak_phase(shape: tuple[int, int], amplitude: float) -> npt.NDArray[np.float64]:
