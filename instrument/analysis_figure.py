@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,59 +15,71 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    Panel = Callable[[Axes], None]
+
 _INK = "#22303c"
 _FAINT = "#8496a5"
+_QUIET = "#52667a"
 _ACCENT = "#d1495b"
+_COLUMNS = 3
+_WIDTH_IN, _HEAD_IN, _ROW_IN, _FOOT_IN, _NOTE_IN = 15.5, 1.35, 3.35, 0.3, 0.185
 _COLORS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#6a4c93")
 
 
-def draw_analysis(analysis: Analysis, title: str, *, simulated: bool) -> Figure:
+def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulated: bool) -> Figure:
     """Draw the page: PSF, correlations, depth, field, condition numbers, point tests, grid, figures in words.
+
+    Only panels that have something to show are there; the notes below say what the others lack.
 
     Parameters
     ----------
     analysis : Analysis
     title : str
+        What was analysed, in a reader's words.
+    subtitle : str
+        Where it comes from.
     simulated : bool
         Whether the calibration came from the simulated bench, which the page then says.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15.5, 11.0), dpi=100, facecolor="white")
+    panels = _panels(analysis)
+    rows = -(-len(panels) // _COLUMNS)
+    columns = _note_columns(analysis.notes)
+    note_rows = max(map(len, columns))
+    notes_in = _NOTE_IN * note_rows + (0.35 if note_rows else 0.0)
+    height_in = _HEAD_IN + _ROW_IN * rows + notes_in + _FOOT_IN
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
+    top, bottom = 1 - _HEAD_IN / height_in, (_FOOT_IN + notes_in + 0.35) / height_in
     grid = figure.add_gridspec(
-        3, 4, left=0.045, right=0.985, top=0.905, bottom=0.05, hspace=0.42, wspace=0.26
+        rows,
+        _COLUMNS,
+        left=0.05,
+        right=0.715,
+        top=top,
+        bottom=bottom,
+        hspace=0.44,
+        wspace=0.27,
     )
-    _psf(figure.add_subplot(grid[0, 0]), analysis)
-    _autocorrelation(figure.add_subplot(grid[0, 1]), analysis)
-    _depth_of_field(figure.add_subplot(grid[0, 2]), analysis)
-    _facts(figure.add_subplot(grid[0:2, 3]), analysis)
-    _depth(figure.add_subplot(grid[1, 0]), analysis)
-    _field(figure.add_subplot(grid[1, 1]), analysis)
-    _condition(figure.add_subplot(grid[1, 2]), analysis.condition)
-    tests = analysis.points
-    _profile(
-        figure.add_subplot(grid[2, 0]),
-        _shown(tests.lateral) if tests else None,
-        "Two points across",
-        "pixels",
-        0,
-    )
-    _profile(
-        figure.add_subplot(grid[2, 1]),
-        _shown(tests.axial) if tests else None,
-        "Two points along",
-        "planes",
-        1,
-    )
-    _sixteen(figure.add_subplot(grid[2, 2]), _shown(tests.sixteen) if tests else None, analysis)
-    _voxels(figure.add_subplot(grid[2, 3]), analysis)
-    figure.text(0.045, 0.965, title, fontsize=17, color=_INK, weight="bold", va="center")
+    for number, draw in enumerate(panels):
+        axes = figure.add_subplot(grid[divmod(number, _COLUMNS)])
+        draw(axes)
+        axes.set_title(
+            f"({chr(97 + number)}) {axes.get_title(loc='left')}", fontsize=12, color=_INK, loc="left", pad=6
+        )
+    _facts(figure, analysis, 0.745, top, height_in)
+    y = (_FOOT_IN + notes_in - 0.15) / height_in
+    for x, lines in zip((0.05, 0.53), columns, strict=True):
+        for row, line in enumerate(lines):
+            figure.text(x, y - row * _NOTE_IN / height_in, line, fontsize=9, color=_INK, va="top")
+    figure.text(0.05, 1 - 0.42 / height_in, title, fontsize=18, color=_INK, weight="bold", va="center")
+    figure.text(0.05, 1 - 0.78 / height_in, subtitle, fontsize=10.5, color=_INK, va="center")
     if simulated:
         figure.text(
             0.985,
-            0.965,
+            1 - 0.45 / height_in,
             "SIMULATED",
             fontsize=14,
             weight="bold",
@@ -79,20 +91,62 @@ def draw_analysis(analysis: Analysis, title: str, *, simulated: bool) -> Figure:
     return figure
 
 
+def _panels(analysis: Analysis) -> list[Panel]:
+    """Return what draws each panel that has something to show, in the order of the page."""
+    tests = analysis.points
+    panels: list[Panel] = [lambda axes: _psf(axes, analysis), lambda axes: _autocorrelation(axes, analysis)]
+    if np.isfinite(analysis.axial.hyperfocal_um):
+        panels.append(lambda axes: _depth_of_field(axes, analysis))
+    if analysis.depth is not None:
+        panels.append(lambda axes: _depth(axes, analysis))
+    if len(analysis.field) > 1:
+        panels.append(lambda axes: _field(axes, analysis))
+    panels.append(lambda axes: _condition(axes, analysis.condition))
+    if tests is not None:
+        if (lateral := _shown(tests.lateral)) is not None:
+            panels.append(lambda axes: _profile(axes, lateral, "Two points across", "pixels", 0))
+        if (axial := _shown(tests.axial)) is not None:
+            panels.append(lambda axes: _profile(axes, axial, "Two points along", "planes", 1))
+        if (sixteen := _shown(tests.sixteen)) is not None:
+            panels.append(lambda axes: _sixteen(axes, sixteen, analysis))
+    if len(analysis.grid.z_um) > 1:
+        panels.append(lambda axes: _voxels(axes, analysis))
+    return panels
+
+
+def _note_columns(notes: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the notes as the lines of two columns below the panels, whole notes in each."""
+    import textwrap
+
+    blocks = []
+    for note in notes:
+        first, *others = textwrap.wrap(note, 112)
+        blocks.append([f"•  {first}", *(f"    {line}" for line in others)])
+    left: list[str] = []
+    right: list[str] = []
+    half = sum(map(len, blocks)) / 2
+    for block in blocks:
+        (left if len(left) < half and not right else right).extend(block)
+    return left, right
+
+
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
     """Return the figures in words, for the page and for the terminal."""
     a = analysis
     near, far = a.axial.depth_of_field_um(a.z_um)
     lines = [
-        ("depth analysed", f"{a.z_um / 1e3:.4g} mm"),
+        ("depth analysed", f"{a.z_um / 1e3:.3g} mm"),
         (
             "resolution, 70 % half width",
-            f"{a.lateral.mean_px:.2f} px, {a.lateral.angle_deg(a.pitch_um, a.distance_um):.3f}°, "
+            f"{a.lateral.mean_px:.2f} px (x {a.lateral.half_width_px[1]:.2f}, "
+            f"y {a.lateral.half_width_px[0]:.2f}), "
+            f"{a.lateral.angle_deg(a.pitch_um, a.distance_um):.3f}°, "
             f"{a.lateral.object_um(a.pitch_um, a.distance_um, a.z_um):.3g} µm",
         ),
         (
             "inner product 0.8",
-            f"{a.lateral_inner.mean_px:.2f} px, "
+            f"{a.lateral_inner.mean_px:.2f} px (x {a.lateral_inner.half_width_px[1]:.2f}, "
+            f"y {a.lateral_inner.half_width_px[0]:.2f}), "
             f"{a.lateral_inner.object_um(a.pitch_um, a.distance_um, a.z_um):.3g} µm across; "
             f"{1e6 * a.axial_inner.step_per_um:.3g} /m along",
         ),
@@ -148,21 +202,13 @@ def _shown(trials: Sequence[Trial]) -> Trial | None:
 
 def _style(axes: Axes, title: str, x: str = "", y: str = "") -> None:
     axes.set_title(title, fontsize=11.5, color=_INK, loc="left", pad=5)
-    axes.set_xlabel(x, fontsize=9, color=_INK)
-    axes.set_ylabel(y, fontsize=9, color=_INK)
-    axes.tick_params(labelsize=8, colors=_INK, length=2)
+    axes.set_xlabel(x, fontsize=10, color=_INK)
+    axes.set_ylabel(y, fontsize=10, color=_INK)
+    axes.tick_params(labelsize=9, colors=_INK, length=2)
     axes.grid(True, color="#e3e8ec", linewidth=0.7)
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
         spine.set_edgecolor(_FAINT)
-
-
-def _missing(axes: Axes, title: str, why: str) -> None:
-    _style(axes, title)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.grid(False)
-    axes.text(0.5, 0.5, why, ha="center", va="center", fontsize=9, color=_FAINT, transform=axes.transAxes)
 
 
 def _psf(axes: Axes, a: Analysis) -> None:
@@ -174,7 +220,7 @@ def _psf(axes: Axes, a: Analysis) -> None:
         extent=(-half_x, half_x, half_y, -half_y),
         interpolation="antialiased",
     )
-    _style(axes, f"PSF at {a.z_um / 1e3:.4g} mm", "mm on the sensor")
+    _style(axes, f"PSF at {a.z_um / 1e3:.3g} mm", "x on the sensor, mm", "y, mm")
     axes.grid(False)
 
 
@@ -187,9 +233,9 @@ def _autocorrelation(axes: Axes, a: Analysis) -> None:
     ):
         axes.plot([0, resolution, resolution], [level, level, 0], color=color, linewidth=1, linestyle="--")
         axes.annotate(
-            f"{resolution:.2f} px",
+            f"{level:g} at {resolution:.2f} px",
             (resolution, level),
-            fontsize=8,
+            fontsize=9,
             color=color,
             xytext=(4, 2),
             textcoords="offset points",
@@ -201,9 +247,6 @@ def _autocorrelation(axes: Axes, a: Analysis) -> None:
 
 def _depth_of_field(axes: Axes, a: Analysis) -> None:
     hyperfocal = a.axial.hyperfocal_um
-    if not np.isfinite(hyperfocal):
-        _missing(axes, "Depth of field", "the pattern does not change along the axis")
-        return
     z = np.geomspace(min(0.02 * hyperfocal, 0.5 * a.z_um), 0.97 * hyperfocal, 200)
     reach = [sum(a.axial.depth_of_field_um(float(v))) for v in z]
     axes.loglog(z / 1e3, np.array(reach) / 1e3, color=_COLORS[0], linewidth=1.8)
@@ -211,7 +254,7 @@ def _depth_of_field(axes: Axes, a: Analysis) -> None:
     axes.annotate(
         f"hyperfocal {_mm(hyperfocal)}",
         (hyperfocal / 1e3, reach[len(reach) // 2] / 1e3),
-        fontsize=8,
+        fontsize=9,
         color=_ACCENT,
         rotation=90,
         ha="right",
@@ -219,42 +262,39 @@ def _depth_of_field(axes: Axes, a: Analysis) -> None:
         xytext=(-2, 0),
         textcoords="offset points",
     )
-    _style(axes, "Depth of field", "depth, mm", "mm")
+    _style(axes, "Depth of field", "depth, mm", "depth of field, mm")
 
 
 def _depth(axes: Axes, a: Analysis) -> None:
-    if a.depth is None:
-        _missing(axes, "Similarity along depth", "one depth was calibrated")
-        return
+    assert a.depth is not None  # else there is no such panel
     axes.plot(a.depth.z_um / 1e3, a.depth.to_middle, "o-", color=_COLORS[0], markersize=3, linewidth=1.4)
     axes.axhline(float(a.depth.cross_cut.max()), color=_COLORS[2], linewidth=1, linestyle="--")
     axes.annotate(
         "nearest with farthest, at any shift",
         (a.depth.z_um[0] / 1e3, a.depth.cross_cut.max()),
-        fontsize=7.5,
+        fontsize=9,
         color=_COLORS[2],
         xytext=(2, 3),
         textcoords="offset points",
     )
     axes.set_ylim(0, 1.03)
-    _style(axes, f"Similarity to the PSF at {a.depth.middle_um / 1e3:.4g} mm", "depth, mm", "inner product")
+    _style(axes, f"Similarity to the PSF at {a.depth.middle_um / 1e3:.3g} mm", "depth, mm", "inner product")
 
 
 def _field(axes: Axes, a: Analysis) -> None:
-    if len(a.field) < 2:
-        _missing(axes, "Similarity across the field", "one place of the field was calibrated")
-        return
     angles = [p.angle_deg for p in a.field]
     axes.plot(
         angles, [p.similarity for p in a.field], "o", color=_COLORS[0], markersize=4, label="inner product"
     )
     axes.plot(angles, [p.spot for p in a.field], "s", color=_ACCENT, markersize=4, label="spot size / axis")
-    axes.legend(fontsize=8, frameon=False)
+    axes.legend(fontsize=9, frameon=False)
     axes.set_ylim(bottom=0)
     _style(axes, "Across the field, against the central PSF", "angle, degrees")
 
 
 def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
+    from matplotlib.ticker import LogLocator
+
     styles = {"x": "-", "z": "--", "xz": ":"}
     counts = sorted({c.count for c in curves})
     for curve in curves:
@@ -269,14 +309,16 @@ def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
             linewidth=1.3,
             label=f"{curve.count} in {curve.direction}",
         )
-    axes.legend(fontsize=7, frameon=False, ncols=2)
-    _style(axes, "Local condition number", "separation, voxels")
+    axes.legend(fontsize=8.5, frameon=False, ncols=2)
+    # Plain numbers: the range is often less than a decade, where powers of ten say little.
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0)))
+    _style(axes, "Local condition number", "separation, voxels", "condition number")
+    axes.tick_params(which="minor", labelsize=9, colors=_INK, length=2)
 
 
-def _profile(axes: Axes, trial: Trial | None, title: str, unit: str, axis: int) -> None:
-    if trial is None:
-        _missing(axes, title, "not tested")
-        return
+def _profile(axes: Axes, trial: Trial, title: str, unit: str, axis: int) -> None:
     profile = trial.map.sum(axis=axis)
     separation = trial.separation_planes if axis else trial.separation_px
     at = np.arange(len(profile)) - len(profile) // 2
@@ -284,13 +326,10 @@ def _profile(axes: Axes, trial: Trial | None, title: str, unit: str, axis: int) 
     reach = 2.5 * separation + 2
     axes.set_xlim(-reach, reach)
     verdict = f"dip {trial.dip:.0%}" if trial.resolved else "not resolved"
-    _style(axes, f"{title}, {separation:.3g} {unit}: {verdict}", unit)
+    _style(axes, f"{title}: {separation:.3g} {unit}, {verdict}", unit, "brightness found")
 
 
-def _sixteen(axes: Axes, trial: Trial | None, a: Analysis) -> None:
-    if trial is None:
-        _missing(axes, "16 points", "not tested")
-        return
+def _sixteen(axes: Axes, trial: Trial, a: Analysis) -> None:
     n_z, width = trial.map.shape
     axes.imshow(
         trial.map,
@@ -303,7 +342,7 @@ def _sixteen(axes: Axes, trial: Trial | None, a: Analysis) -> None:
     axes.set_xlim(-reach, reach)
     factor = a.points.sixteen_factor if a.points is not None else None
     verdict = f"resolved at {factor:.2g} x" if factor is not None else "not resolved"
-    _style(axes, f"16 points in x and z: {verdict}", "pixels", "planes")
+    _style(axes, f"16 points: {verdict}", "pixels", "planes")
     axes.grid(False)
 
 
@@ -324,20 +363,16 @@ def _voxels(axes: Axes, a: Analysis) -> None:
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _facts(axes: Axes, a: Analysis) -> None:
-    """Write the figures and notes down the column, spaced so that all of them fit."""
+def _facts(figure: Figure, a: Analysis, x: float, top: float, height_in: float) -> None:
+    """Write the figures in words down the right-hand column."""
     import textwrap
 
-    axes.set_axis_off()
-    rows: list[tuple[str, float, float, str]] = []  # text, indent, size, colour
+    y = top
     for name, value in facts(a):
         if name:
-            rows.append((name, 0.0, 8.5, _FAINT))
-        rows += [(line, 0.02, 9.5, _INK) for line in textwrap.wrap(value, 46)]
-    for note in a.notes:
-        rows += [(line, 0.0, 7.0, _FAINT) for line in textwrap.wrap(note, 62)]
-    step = min(1.0 / sum(size for *_, size, _ in rows), 0.0045)
-    y = 1.03
-    for text, indent, size, color in rows:
-        axes.text(indent, y, text, transform=axes.transAxes, fontsize=size, color=color, va="top")
-        y -= 1.04 * size * step
+            y -= 0.09 / height_in
+            figure.text(x, y, name.strip(), fontsize=9.5, color=_QUIET, va="top")
+            y -= 0.19 / height_in
+        for line in textwrap.wrap(value, 46):
+            figure.text(x, y, line, fontsize=10.5, color=_INK, va="top")
+            y -= 0.2 / height_in

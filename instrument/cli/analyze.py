@@ -10,6 +10,7 @@ import typer
 from instrument.cli.app import command_app, examples, saying_what_is_left
 from instrument.cli.progress import one_task
 from instrument.errors import BenchError, FileError
+from recon.types import Calibration
 
 app = command_app()
 _PAGES = (".pdf", ".png", ".svg")
@@ -134,9 +135,8 @@ def analyze(
     with saying_what_is_left(out, record):
         with one_task("analyze") as advance:
             analysis = analyse(measured, settings, progress=lambda _what, share: advance(share * 100, 100))
-        place = folder.resolve()
-        name = place.parent.name if place.name == "calibration" else place.name
-        figure = draw_analysis(analysis, f"What the camera can do: {name}", simulated=simulated)
+        title, subtitle = _titles(measured, folder)
+        figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
         with whole_file(out) as file:
             save_figure(figure, file)
         described = {
@@ -153,6 +153,24 @@ def analyze(
     for note in analysis.notes:
         typer.echo(f"Note: {note}", err=True)
     typer.echo(f"Wrote {out}, {record}")
+
+
+def _titles(calibration: Calibration, folder: Path) -> tuple[str, str]:
+    """Return what the page is about and where it comes from, for readers who never saw the folder."""
+    bench = str(calibration.provenance.get("bench") or "").split(" SIMULATED")[0]  # the page says that apart
+    geometry, place = calibration.geometry, folder.resolve()
+    name = place.parent.name if place.name == "calibration" else place.name
+    depths_mm = sorted({float(z) / 1e3 for z in calibration.source_positions_um[:, 2]})
+    depths = f"{len(depths_mm)} depths from {depths_mm[0]:.3g} to {depths_mm[-1]:.3g} mm"
+    if len(depths_mm) == 1:
+        depths = f"one depth, {depths_mm[0]:.3g} mm"
+    facts = [
+        f"{len(calibration.psfs)} PSF{'s' if len(calibration.psfs) > 1 else ''} at {depths}",
+        f"pixels of {geometry.pixel_pitch_um:.3g} µm",
+        f"diffuser to sensor {geometry.diffuser_distance_mm:.3g} mm",
+        f"calibration {name}",
+    ]
+    return f"Optical characterisation{f': {bench}' if bench else ''}", "; ".join(facts)
 
 
 def _cutoff(text: str | None) -> tuple[float, float] | None:

@@ -87,7 +87,7 @@ def point_tests(
     if not with_depth:
         inverse = np.array([1 / z_um])
         notes.append(
-            f"At {z_um / 1e3:g} mm the axial window would reach beyond infinity: points were tested across "
+            f"At {z_um / 1e3:.3g} mm the axial window would reach beyond infinity: points were tested across "
             "the axis only. Choose a nearer depth for tests along it."
         )
     planes = np.stack([refocus(calibration, float(1 / v)).psf.mean(axis=0) for v in inverse])

@@ -20,7 +20,7 @@ from recon.analysis.field import (
     convolution_holds_deg,
     field_of_view,
 )
-from recon.analysis.point_tests import PointTests, point_tests
+from recon.analysis.point_tests import PLANES, PointTests, point_tests
 from recon.analysis.points import Noise
 from recon.analysis.resolution import (
     AxialResolution,
@@ -64,7 +64,8 @@ class AnalysisSettings:
     Attributes
     ----------
     z_um : float or None
-        Depth at which resolution is stated and tested; default the middle of the calibrated range in 1/z.
+        Depth at which resolution is stated and tested; default the middle of the calibrated range in 1/z, or
+        a nearer one where the tests along the axis would not fit.
     deflection_deg : float
         Largest deflection by the diffuser, ``beta`` (dissertation: 0.5 degrees).
     cutoff_deg : (float, float) or None
@@ -180,8 +181,8 @@ def analyse(
     small, sensor_shape = _cut_to_light(calibration)
     depths, stack = central_psfs(small)
     planes = stack.mean(axis=1)
-    z_um = settings.z_um or float(2 / (1 / depths[0] + 1 / depths[-1]))
     tell("resolution", 0.0)
+    z_um = settings.z_um or _depth_to_analyse(depths, planes, distance_um, notes)
     # Resolution is a matter of measured pixels: of the calibrated PSF nearest to the depth, not of a blend.
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
     psf = planes[nearest]
@@ -271,6 +272,29 @@ def analyse(
         settings=settings,
         notes=tuple(notes),
     )
+
+
+def _depth_to_analyse(depths: Floats, planes: Array, distance_um: float, notes: list[str]) -> float:
+    """Return the middle of the range in 1/z, or the nearest to it about which depth can be tested at all.
+
+    Far away the planes of the tests along the axis, evenly spaced in 1/z, would reach beyond infinity.
+    """
+    middle = float(2 / (1 / depths[0] + 1 / depths[-1]))
+    reach = max(CONDITION_PLANES, PLANES) // 2
+    for z_um in (middle, *sorted((float(z) for z in depths if z < middle), reverse=True)):
+        nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
+        step = axial_resolution(
+            planes[nearest], float(depths[nearest]), distance_um, INNER_PRODUCT
+        ).step_per_um
+        if 1 / z_um > reach * step / 2:
+            if z_um != middle:
+                notes.append(
+                    f"Analysed at {z_um / 1e3:.3g} mm, not in the middle of the range "
+                    f"({middle / 1e3:.3g} mm in 1/z): from there tests along the axis would reach beyond "
+                    "infinity. --z-mm chooses another depth."
+                )
+            return z_um
+    return middle
 
 
 def _geometry(calibration: Calibration) -> tuple[float, float]:

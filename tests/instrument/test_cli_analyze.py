@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,27 @@ def test_a_page_and_its_figures(
     assert "SIMULATED" in said.out
     assert "hyperfocal distance" in said.out
     assert "One place of the field" in said.err
+
+
+def test_the_depth_is_one_about_which_depth_can_be_tested(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At the middle in 1/z, 92 mm, planes along the axis would reach beyond infinity: not so at 60 mm."""
+    world = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))
+    z_um = [60e3, 92e3, 200e3]
+    psfs = np.stack([world.psf((0.0, 0.0, z), (0.0, 1.0, 0.0), 2) for z in z_um])[:, None]
+    geometry = replace(world.geometry, pixel_pitch_um=26.0)
+    places = np.array([(0.0, 0.0, z) for z in z_um])
+    made = save_calibration(Calibration(psfs, places, geometry=geometry), tmp_path / "far")
+    out = tmp_path / "page.png"
+    assert main(["analyze", str(made), "--out", str(out), "--no-points"]) == 0
+    said = capsys.readouterr()
+    assert "Analysed at 60 mm, not in the middle of the range" in said.err
+    found = json.loads((tmp_path / "page.json").read_text())["analysis"]
+    assert found["z_um"] == 60e3
+    assert {curve["direction"] for curve in found["condition"]} == {"x", "z", "xz"}
+    assert main(["analyze", str(made), "--out", str(out), "--no-points", "--z-mm", "92", "--force"]) == 0
+    assert "Analysed at" not in capsys.readouterr().err
 
 
 def test_a_measured_angular_response_limits_the_view(calibration: Path, tmp_path: Path) -> None:
