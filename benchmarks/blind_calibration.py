@@ -86,15 +86,21 @@ class Bench:
         assert light is not None
         return self.cropped(light)
 
-    def dense(self) -> tuple[np.ndarray, np.ndarray]:
-        """Image of a photograph, and the light of it that reaches the sensor."""
+    def dense(self) -> np.ndarray:
+        """Image of a photograph."""
         portrait = (sample_picture() @ LUMINANCE)[40:552]
         self.world.set_scene(picture(portrait, Z_UM, self.field_um))
         self.world.scene_lit = True
         light = self.world.photons_per_s(GREEN, self.binning)
         assert light is not None
-        truth = self.world.ground_truth((self.size, self.size), self.pitch_um, collected=True)
-        return self.cropped(light), truth
+        return self.cropped(light)
+
+    def truth(self, shift: tuple[float, float]) -> np.ndarray:
+        """Light of the photograph that reaches the sensor, for pixels that look (row, column) aside."""
+        source = (-shift[1] * self.object_um, -shift[0] * self.object_um, Z_UM)
+        return self.world.ground_truth(
+            (self.size, self.size), self.pitch_um, source_um=source, collected=True
+        )
 
 
 def noisy(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -136,23 +142,33 @@ def windowed(image: np.ndarray, row: float, column: float, window: int) -> np.nd
     return result
 
 
-def score(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
-    """PSNR in dB within the picture, after gain and shift; and the image so matched."""
-    whole = shifted(image, *(-v for v in displacement(image, truth)))
+def score(image: np.ndarray, bench: Bench) -> tuple[float, np.ndarray]:
+    """PSNR in dB within the picture against the truth as its pixels see it, and the image with the best gain.
+
+    A blind calibration has no zero: its picture lies a fraction of a pixel beside that of measured PSFs. The
+    shift is found, and the truth rendered for it.
+    """
+    truth = bench.truth((0.0, 0.0))
+    rows, columns = displacement(image, truth)
+    whole = shifted(image, -rows, -columns)
     lit = truth > 0
     spectrum = np.fft.rfft2(whole)
     f_y, f_x = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])[None]
 
-    def matched(shift: np.ndarray) -> np.ndarray:
+    def misfit(shift: np.ndarray) -> float:
         phase = np.exp(-2j * np.pi * (f_y * shift[0] + f_x * shift[1]))
         moved = np.fft.irfft2(spectrum * phase, s=image.shape)
-        return moved * float((moved * truth)[lit].sum() / (moved[lit] ** 2).sum())
+        gain = float((moved * truth)[lit].sum() / (moved[lit] ** 2).sum())
+        return float(np.sqrt(np.mean((gain * moved - truth)[lit] ** 2)) / truth.max())
 
-    def error(shift: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((matched(shift) - truth)[lit] ** 2)))
-
-    found = minimize(error, np.zeros(2), method="Nelder-Mead", options={"xatol": 0.005})
-    return 20 * np.log10(float(truth.max()) / found.fun), matched(found.x)
+    start = np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4]])
+    options = {"initial_simplex": start, "xatol": 0.01, "fatol": 1e-6}
+    by = minimize(misfit, start[0], method="Nelder-Mead", options=options).x
+    seen = bench.truth((float(by[0]) - rows, float(by[1]) - columns))
+    lit = seen > 0
+    gain = float((image * seen)[lit].sum() / (image[lit] ** 2).sum())
+    error = float(np.sqrt(np.mean((gain * image - seen)[lit] ** 2)))
+    return 20 * np.log10(float(seen.max()) / error), gain * whole
 
 
 def on_support(psfs: np.ndarray) -> np.ndarray:
@@ -198,8 +214,8 @@ def main() -> None:
     centre = windowed(mean, 0, 0, window)
     nine, nine_points = measured(bench, 3, rng, window)
     true, true_points = measured(bench, 5, None, window)
-    image, truth = bench.dense()
-    image = noisy(image, rng)
+    image = noisy(bench.dense(), rng)
+    truth = bench.truth((0.0, 0.0))
     if a.keep is not None:
         np.savez(a.keep, raw=raw, image=image, truth=truth, centre=centre, nine=nine, found=found.psfs)
     methods = {
@@ -213,7 +229,7 @@ def main() -> None:
     for name, made in methods.items():
         model = "local" if len(made.psfs) > 1 else "convolution"
         result = reconstruct_volume(image, made, model=model, estimate_background=False, iterations=150)
-        psnr, shown[name] = score(result.volume[0], truth)
+        psnr, shown[name] = score(result.volume[0], bench)
         print(f"{name}: {psnr:.2f} dB", flush=True)
         shown[f"{name}\n{psnr:.1f} dB"] = shown.pop(name)
     if a.out is not None:
