@@ -109,14 +109,14 @@ def apply_theme(app: QApplication, name: str) -> None:
 
 
 def _style(c: Colours) -> str:
+    faint = QColor(c.dim).darker(150).name()
     return f"""
 QWidget {{ font-size: 10pt; }}
 QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; padding: 3px; }}
-QLineEdit, QPlainTextEdit, QTextEdit, QComboBox, QSpinBox, QDoubleSpinBox, QListView, QTreeView, QTableView {{
+QLineEdit, QPlainTextEdit, QTextEdit, QSpinBox, QDoubleSpinBox, QListView, QTreeView, QTableView {{
   background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; padding: 3px 5px;
   selection-background-color: {c.accent}; selection-color: {c.window}; }}
-QLineEdit:focus, QComboBox:focus, QPlainTextEdit:focus, QListView:focus {{ border-color: {c.accent}; }}
-QComboBox::drop-down {{ border: none; width: 18px; }}
+QLineEdit:focus, QPlainTextEdit:focus, QListView:focus {{ border-color: {c.accent}; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 *[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
 QLabel#reason {{ color: {c.error}; font-size: 9pt; }}
@@ -129,7 +129,7 @@ QPushButton, QToolButton {{ background: {c.field}; border: 1px solid {c.line}; b
 QPushButton:hover, QToolButton:hover {{ border-color: {c.accent}; }}
 QPushButton:focus, QToolButton:focus {{ border-color: {c.accent}; }}
 QPushButton:pressed, QPushButton:checked, QToolButton:checked {{ background: {c.accent}; color: {c.window}; }}
-QPushButton:disabled, QToolButton:disabled {{ color: {c.line}; }}
+QPushButton:disabled, QToolButton:disabled {{ color: {faint}; }}
 QPushButton:flat {{ background: transparent; border: none; color: {c.dim}; padding: 2px 6px; }}
 QPushButton:flat:hover, QPushButton:flat:focus {{ color: {c.accent}; }}
 QPushButton#stop {{ background: {c.stop}; color: {c.stop_text}; border: none; border-radius: 5px;

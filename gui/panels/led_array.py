@@ -44,6 +44,8 @@ class LedPanel(Panel):
         self.plot = plot_widget("x", "y", x_unit="mm", y_unit="mm", grid=False)
         self.plot.setAspectLocked(True)
         self.plot.hideButtons()
+        for axis in ("bottom", "left"):  # an LED's place is in its tool tip
+            self.plot.hideAxis(axis)
         self.plot.setMinimumHeight(110)
         self.plot.setToolTip("A click toggles an LED")
         self.spots: Any = pg.ScatterPlotItem(pxMode=False, pen=None)

@@ -80,6 +80,7 @@ class LiveReconstructionPanel(Panel):
         self.browse_button.clicked.connect(self._browse)
         self.plane = QComboBox()
         self.plane.setToolTip("Depth of the scene: which PSF of the calibration is used")
+        self.plane.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.plane.activated.connect(self._rebuild)
         self.run_button = QPushButton("▶ Preview")
         self.run_button.setCheckable(True)
