@@ -63,6 +63,10 @@ class ChartsPanel(Panel):
         if chosen:
             self.open(Path(chosen))
 
+    def theme_changed(self) -> None:
+        """Take over the theme's colours."""
+        self.stability.restyle()
+
     def as_python(self) -> str:
         """Return lines that read the file and draw the map that is shown."""
         name = self.stability.map.currentData()

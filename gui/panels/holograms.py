@@ -33,12 +33,13 @@ from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
+from gui.theme import colours
 from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
 from gui.views.facts import FactsView
 from gui.views.view_grid import ViewGrid
 from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
 from gui.widgets.image_view import ImageView
-from gui.widgets.plot import curve_pen, plot_widget
+from gui.widgets.plot import curve_pen, plot_widget, restyle
 from instrument.errors import BenchError
 from instrument.hologram_job import HologramRequest, HologramResult, field_picture
 from instrument.images import read_image
@@ -461,6 +462,15 @@ class HologramsPanel(Panel):
         """Put an alignment of the mask into the form."""
         self.alignment.setText(str(path))
         self.alignment.editingFinished.emit()
+
+    def theme_changed(self) -> None:
+        """Take over the theme's colours and colour map."""
+        now = colours()
+        for view in (self.target, self.seen, self.phase, self.captured):
+            view.graphics.setBackground(now.window)
+            view.set_colour_map(now.colour_map)
+        restyle(self.plot)
+        self.metrics.restyle()
 
     def shutdown(self) -> None:
         """End the computation."""

@@ -142,13 +142,14 @@ class ReconstructionsPanel(Panel):
     def refresh(self) -> None:
         """List the results in the data folder."""
         folder = self.session.runs_folder
-        job = self.tells(self.jobs.compute("Looking for results", lambda _: find_results(folder)))
+        job = self.tells(
+            self.jobs.compute("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
+        )
         job.succeeded.connect(self._list)
 
-    def _list(self, records: list[Path]) -> None:
+    def _list(self, records: list[tuple[Path, str]]) -> None:
         self.list.clear()
-        for record in records:
-            changed = datetime.fromtimestamp(record.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+        for record, changed in records:
             item = QListWidgetItem(f"{record.stem}\n    {changed}  {record.parent.name}")
             item.setToolTip(str(record))
             item.setData(Qt.ItemDataRole.UserRole, record)
@@ -360,8 +361,21 @@ class ReconstructionsPanel(Panel):
         ]
         return "\n".join([*lines, ""])
 
+    def theme_changed(self) -> None:
+        """Take over the theme's colours and colour map."""
+        for view in (self.picture, self.volume, self.convergence, self.facts):
+            view.restyle()
+
     def shutdown(self) -> None:
         """Close the volume that is shown and end the work."""
         if self.job is not None:
             self.job.cancel()
         self._close_result()
+
+
+def _age(record: Path) -> str:
+    """Return when a record was written; nothing for one that is gone by now."""
+    try:
+        return datetime.fromtimestamp(record.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+    except OSError:
+        return ""

@@ -10,7 +10,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from gui.theme import colours
-from gui.widgets.plot import curve_pen, plot_widget
+from gui.widgets.plot import curve_pen, plot_widget, restyle
 from recon.solvers.stopping import IterationRecord
 
 Histories = tuple[tuple[IterationRecord, ...], ...]
@@ -49,6 +49,11 @@ class ConvergenceView(QWidget):
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
         """Draw histories; ``noise_norm`` is the expected norm of the noise in the residuals' units."""
         self._histories, self._noise_norm = histories, noise_norm
+        self._draw()
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        restyle(self.plot)
         self._draw()
 
     def _draw(self) -> None:

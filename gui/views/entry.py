@@ -108,6 +108,10 @@ class PathEntry(QWidget):
         row.addWidget(entry, 1)
         row.addWidget(self.button)
 
+    def set_browse(self, browse: Browse) -> None:
+        """Choose files, folders, or names to save under from now on."""
+        self._browse = browse
+
     def _choose(self) -> None:
         start = self.entry.text()
         if self._browse == "folder":

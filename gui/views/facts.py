@@ -17,11 +17,18 @@ class FactsView(QTextBrowser):
         super().__init__(parent)
         self.setOpenLinks(False)
         self.setMinimumSize(120, 60)
+        self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        facts, warnings, simulated = self._shown
+        self.show_facts(facts, warnings, simulated=simulated)
 
     def show_facts(
         self, facts: Sequence[tuple[str, str]], warnings: Sequence[str] = (), *, simulated: bool = False
     ) -> None:
         """Show warnings and facts; SIMULATED where it came from the simulated bench."""
+        self._shown = facts, warnings, simulated
         now = colours()
         parts = []
         if simulated:

@@ -118,6 +118,15 @@ class LevelsBar(QWidget):
         if not keep_levels:
             self.to_automatic()
 
+    def restyle(self) -> None:
+        """Take over the colours and the colour map of the theme in use."""
+        now = colours()
+        self.plot.setBackground(now.panel)
+        self._curve.setBrush(now.line)
+        for line in self.region.lines:
+            line.setPen(now.accent)
+        self.map.setCurrentText(now.colour_map)
+
     def _typed(self, _value: float) -> None:
         assert self.low.value is not None
         assert self.high.value is not None

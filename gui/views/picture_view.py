@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtWidgets import QHBoxLayout, QPushButton, QVBoxLayout, QWidget
 
+from gui.theme import colours
 from gui.views.levels_bar import LevelsBar
 from gui.widgets.image_view import ImageView
 
@@ -62,6 +63,11 @@ class PictureView(QWidget):
         self.turned_deg = (self.turned_deg + 90) % 360
         self._show()
 
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        self.image.graphics.setBackground(colours().window)
+        self.levels.restyle()
+
     def _show(self) -> None:
         if (shown := self.shown) is not None:
             self.image.set_colour_map(self.levels.colour_map)
@@ -93,5 +99,5 @@ def as_shown(image: Any, low: float, high: float, table: npt.NDArray[np.uint8]) 
     """Return the 8-bit colours of an image as a view shows it, (height, width, 3)."""
     scaled = np.clip((np.asarray(image, np.float32) - low) * (254 / max(high - low, 1e-12)), 0, 254)
     indices = scaled.astype(np.uint8)
-    colours: npt.NDArray[np.uint8] = table[indices] if indices.ndim == 2 else indices
-    return colours
+    shown: npt.NDArray[np.uint8] = table[indices] if indices.ndim == 2 else indices
+    return shown

@@ -312,7 +312,7 @@ class ReconstructForm(QWidget):
     def _kind_changed(self, _text: str = "") -> None:
         kind = self.kind.currentText()
         volume = kind == VOLUME
-        self._psfs_row._browse = "open" if kind == PSF else "folder"
+        self._psfs_row.set_browse("open" if kind == PSF else "folder")
         self.psfs.setToolTip(
             {
                 CALIBRATION: "A calibration's folder, or a run that holds one",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from dataclasses import dataclass
 from typing import Literal
@@ -53,14 +54,18 @@ class SliceReader(QObject):
             self._wake.notify()
 
     def end(self) -> None:
-        """End the thread and close the volume; waits for the slice being read."""
+        """End the thread, which closes the volume when the slice in progress is read; returns at once."""
         with self._wake:
             self._ending = True
             self._wake.notify()
-        self._thread.join()
-        self._source.close()
 
     def _read(self) -> None:
+        try:
+            self._read_until_the_end()
+        finally:
+            self._source.close()
+
+    def _read_until_the_end(self) -> None:
         while True:
             with self._wake:
                 while not (self._wanted or self._ending):
@@ -70,10 +75,11 @@ class SliceReader(QObject):
                 axis, index = next(iter(self._wanted.items()))
                 del self._wanted[axis]
             reading = {"z": self._source.plane, "y": self._source.across_y, "x": self._source.across_x}
-            try:
-                self._from_thread.emit(Slice(axis, index, reading[axis](index)))
-            except FileError as error:
-                self._from_thread.emit(str(error))
+            with contextlib.suppress(RuntimeError):  # the window is gone: nobody is there to be told
+                try:
+                    self._from_thread.emit(Slice(axis, index, reading[axis](index)))
+                except FileError as error:
+                    self._from_thread.emit(str(error))
 
     def _receive(self, what: Slice | str) -> None:
         if isinstance(what, str):

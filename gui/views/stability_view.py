@@ -12,7 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from gui.theme import colours
-from gui.widgets.plot import curve_pen, plot_widget
+from gui.widgets.plot import curve_pen, plot_widget, restyle
 from recon.stability.failure import Failure
 
 _SPAN = 1.0
@@ -74,6 +74,11 @@ class StabilityView(QWidget):
         """The map that is shown."""
         name = self.map.currentData()
         return None if name is None else self._maps[name]
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        restyle(self.plot)
+        self._draw()
 
     def _choose_map(self) -> None:
         record = self.record

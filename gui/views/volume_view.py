@@ -25,7 +25,7 @@ from gui.theme import colours
 from gui.views.levels_bar import LevelsBar
 from gui.views.slice_reader import Axis, Slice, SliceReader
 from gui.views.stretched_image import StretchedImage
-from gui.widgets.plot import curve_pen, plot_widget
+from gui.widgets.plot import curve_pen, plot_widget, restyle
 from instrument.volume_source import Plane, VolumeSource
 from instrument.volume_views import Projections, grey, in_colour_of_depth, project
 
@@ -242,6 +242,17 @@ class VolumeView(QWidget):
         p = self.projections
         return {"front": p.front, "top": p.top, "side": p.side, "depth": self._coloured(p)}
 
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        now = colours()
+        for view in (self.front, self.side, self.top, self.coloured):
+            view.graphics.setBackground(now.window)
+        restyle(self.profile)
+        self._along.setPen(curve_pen(0))
+        self._here.setPen(now.dim)
+        self.levels.restyle()
+        self._show()
+
     # Inside --------------------------------------------------------------------------------------
     def _take_projections(self, job: Job, found: Projections) -> None:
         if job is not self._job:
@@ -342,6 +353,9 @@ class VolumeView(QWidget):
     def _coloured(self, p: Projections) -> Plane:
         low, high = self.levels.levels
         shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
+        if self.levels.colour_map == "red":  # for eyes used to the dark: no channel but red
+            shown[..., 0] = shown.max(axis=-1)
+            shown[..., 1:] = 0
         return shown.astype(np.float32)
 
     def _depth_words(self, plane: int) -> str:

@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
+from gui.theme import apply_theme
 from gui.views.reconstruct_form import PSF, VOLUME
 from instrument.images import read_image, write_image
 from instrument.stored_result import open_result
@@ -283,4 +284,25 @@ def test_another_volume_ends_the_reading_of_the_first(
     assert panel.result.path.name == "b.npy"
     assert panel.volume.projections.front.max() == 2
     panel.shutdown()
-    assert not [t for t in threading.enumerate() if t.name == "volume slices"]
+    qtbot.waitUntil(
+        lambda: not [t for t in threading.enumerate() if t.name == "volume slices"], timeout=WAIT_MS
+    )
+
+
+def test_the_red_theme_shows_nothing_but_red(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, qapp: QApplication
+) -> None:
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 40, 40), np.float32))
+    panel.open(tmp_path / "v.npy")
+    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
+    apply_theme(qapp, "red")
+    try:
+        panel.theme_changed()
+        shown = panel.volume.coloured.image
+        assert shown[..., 0].max() > 0.5
+        assert shown[..., 1:].max() == 0
+        image = panel.volume.front.grab().toImage()
+        middle = image.pixelColor(image.width() // 2, image.height() // 2)
+        assert middle.red() >= middle.green() == middle.blue() == 0
+    finally:
+        apply_theme(qapp, "dark")
