@@ -16,9 +16,12 @@ def quality_db() -> dict[float | None, float]:
 
 
 def test_points_closer_than_nyquist_gain_little(quality_db: dict[float | None, float]) -> None:
+    # 0.96 dB at this coarse size, against 1.9 dB for the step from 400 to 600 um, and 0.4 dB at the
+    # benchmark's size. How far the solver gets is not why: 1.41, 0.96 and 1.15 dB after 20, 60 and 200
+    # iterations.
     closer = quality_db[200.0] - quality_db[400.0]
     assert closer < 1.0
-    assert closer < quality_db[400.0] - quality_db[600.0]
+    assert closer < 0.6 * (quality_db[400.0] - quality_db[600.0])
 
 
 def test_beyond_nyquist_the_picture_degrades(quality_db: dict[float | None, float]) -> None:
