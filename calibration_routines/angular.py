@@ -37,6 +37,7 @@ from instrument.acquire import prepare
 from instrument.atomic import write_text
 from instrument.bench import Bench
 from instrument.errors import BenchError, SettingsError
+from instrument.plan import Plan
 from instrument.run_control import RunControl
 from instrument.runner import Progress
 from instrument.store import Run, RunCondition
@@ -141,21 +142,55 @@ def farthest_um(bench: Bench, largest_deg: float) -> float:
     BenchError
         When there is no stage, or even its nearest distance is too far for the angle.
     """
+    reach, (low, high) = _reach(bench)
+    z_um = min(_REACH_MARGIN * reach / float(np.tan(np.deg2rad(largest_deg))), high)
+    if not z_um > max(low, 0.0):
+        raise BenchError(
+            f"The stage reaches +-{reach / 1e3:.4g} mm and no nearer than {low / 1e3:.4g} mm: "
+            f"+-{largest_deg:g} degrees are out of its reach. Choose a smaller angle."
+        )
+    return float(z_um)
+
+
+def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None) -> Plan:
+    """Refuse what is out of the stage's reach or does not fit the disk, before anything moves; the plan.
+
+    Raises
+    ------
+    BenchError
+        When the stage does not reach so far; says which angle it reaches from there.
+    PlanError
+        When something else of the plan cannot be done.
+    """
+    reach, (low, high) = _reach(bench)
+    z_um = sweep.z_um
+    if not low <= z_um <= high:
+        raise BenchError(
+            f"The source at z = {z_um / 1e3:.4g} mm is outside the stage's limits {low / 1e3:.4g} to "
+            f"{high / 1e3:.4g} mm. Choose a distance between them, or leave --z out."
+        )
+    needed = z_um * float(np.tan(np.deg2rad(sweep.angles_deg[-1])))
+    if needed > reach:
+        reached = np.floor(np.rad2deg(np.arctan(reach / z_um)))
+        raise BenchError(
+            f"+-{sweep.angles_deg[-1]:g} degrees from z = {z_um / 1e3:.4g} mm are +-{needed / 1e3:.4g} mm, "
+            f"outside the stage's limits of +-{reach / 1e3:.4g} mm: choose --largest {reached:g} at most, a "
+            "nearer --z, or leave --z out for the farthest that spans the angles."
+        )
+    return check_sweep(bench, sweep.points(), folder)
+
+
+def _reach(bench: Bench) -> tuple[float, tuple[float, float]]:
+    """Return how far the source goes to both sides along x and y, and its nearest and farthest z."""
     if bench.stage is None:
         raise BenchError(f"{bench.config.label} has no [stage]: the angular response needs one.")
     limits, offset = bench.stage.limits, bench.config.source.offset_um
     reach = []
     for k, axis in enumerate(("x_um", "y_um")):
         low, high = limits.get(axis, (0.0, 0.0))
-        reach.append(_REACH_MARGIN * min(high + offset[k], -(low + offset[k])))
+        reach.append(min(high + offset[k], -(low + offset[k])))
     low, high = (end + offset[2] for end in limits.get("z_um", (-offset[2], -offset[2])))
-    z_um = min(min(reach) / float(np.tan(np.deg2rad(largest_deg))), high)
-    if not z_um > max(low, 0.0):
-        raise BenchError(
-            f"The stage reaches +-{min(reach) / 1e3:.4g} mm and no nearer than {low / 1e3:.4g} mm: "
-            f"+-{largest_deg:g} degrees are out of its reach. Choose a smaller angle."
-        )
-    return float(z_um)
+    return min(reach), (low, high)
 
 
 def measure_angular_response(
@@ -200,7 +235,7 @@ def measure_angular_response(
             "The angles on the sensor follow from diffuser_distance_mm and pixel_pitch_um: give them in "
             "[geometry] of bench.toml."
         )
-    check_sweep(bench, points, where)
+    check_angular(bench, sweep, where)
     exposures = expose_sweep(bench, points, control=control)
     if on_exposures is not None:
         on_exposures(exposures)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
+from calibration_routines.angular import AngularSweep, check_angular, farthest_um, measure_angular_response
 from calibration_routines.angular_response import CUT_OFF, AngularResponse
 from calibration_routines.beads import (
     BIN_FIRST,
@@ -31,7 +31,6 @@ from calibration_routines.procedure import (
     outlook_of,
     under_control,
 )
-from calibration_routines.sweep_plan import check_sweep
 from instrument.acquire import abilities_of
 from instrument.bench import Bench
 from instrument.calibration_file import save_calibration
@@ -70,7 +69,7 @@ class AngularProcedure:
         """Hold every place against the stage's limits."""
         sweep = self.sweep(bench)
         points = sweep.points()
-        plan = check_sweep(bench, points, folder or bench.config.data_folder)
+        plan = check_angular(bench, sweep, folder or bench.config.data_folder)
         reason = (
             f"{len(points.points_um)} places at z = {sweep.z_um / 1e3:.4g} mm, up to "
             f"+-{self.largest_deg:g} degrees along x and y"
@@ -88,7 +87,7 @@ class AngularProcedure:
     ) -> Outcome:
         """Home, move the source, and save the response with its picture in the run's folder."""
         heard, sweep = listener or Listener(), self.sweep(bench)
-        check_sweep(bench, sweep.points(), folder)
+        check_angular(bench, sweep, folder)
         with under_control(bench, control) as control:
             home_if_needed(bench, heard)
             heard.step("moving the source")

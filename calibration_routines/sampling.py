@@ -130,6 +130,11 @@ def axial_planes(
             "For lenslets the spacing of the planes follows from their diameter and the wavelength "
             "(4 wavelength / p^2): give both, or wavelength_nm in [geometry] of bench.toml."
         )
+    if not (lenslet_um > 1e-3 * wavelength_nm and lenslet_um < 1e6):
+        raise BenchError(
+            f"A lenslet is wider than the wavelength and less than a metre: {lenslet_um:g} um and "
+            f"{wavelength_nm:g} nm make no sense together."
+        )
     step = 4e-3 * wavelength_nm / lenslet_um**2
     number = max(2, 1 + int(np.ceil((1 / z_min_um - 1 / z_max_um) / step - 1e-9)))
     return Sampling(

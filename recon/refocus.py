@@ -58,6 +58,16 @@ class Refocused:
     scales: tuple[float, ...]
     displacement_error_um: float
     expected_similarity: float | None
+    source_um: tuple[float, float] = (0.0, 0.0)
+    """``(x, y)`` of the PSFs it was made of: those nearest to the axis."""
+    calibrated_um: tuple[float, float] = (0.0, float("inf"))
+    """Nearest and farthest calibrated depth."""
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the depth lies outside the calibrated ones, by more than a stage's repeatability."""
+        near, far = self.calibrated_um
+        return not (1 - SAME_DEPTH) * near <= self.z_um <= (1 + SAME_DEPTH) * far
 
     def __str__(self) -> str:
         """Say it in words."""
@@ -66,7 +76,9 @@ class Refocused:
         error = f"light up to {self.displacement_error_um:.1f} um off on the sensor"
         if self.expected_similarity is not None:
             error += f", expected similarity {self.expected_similarity:.3f}"
-        return f"{how} at {sources} mm (Kuo 2020, Eq. 5.2): {error}"
+        x_mm, y_mm = (1e-3 * v for v in self.source_um)
+        place = f" (x = {x_mm:.4g}, y = {y_mm:.4g} mm)" if x_mm or y_mm else ""
+        return f"{how} at {sources} mm{place} (Kuo 2020, Eq. 5.2): {error}"
 
 
 def paraxial_scale(z_from_um: float, z_to_um: float, distance_um: float) -> float:
@@ -159,8 +171,16 @@ def refocus(
         likeness: float | None = 1.0
     else:
         likeness = _expected_similarity(depths, psfs, z_um, members, distance_um)
+    x_um, y_um = central_places(calibration)[members[int(np.argmax(weights))]]
     return Refocused(
-        psf, float(z_um), tuple(float(depths[k]) for k in members), scales, float(error), likeness
+        psf,
+        float(z_um),
+        tuple(float(depths[k]) for k in members),
+        scales,
+        float(error),
+        likeness,
+        (float(x_um), float(y_um)),
+        (float(depths[0]), float(depths[-1])),
     )
 
 
@@ -176,14 +196,12 @@ def at_depth(calibration: Calibration, z_um: float) -> tuple[Calibration, Refocu
     if same.any():
         return calibration, None
     made = refocus(calibration, z_um)
-    nearest = int(np.argmin(np.abs(1 / calibration.source_positions_um[:, 2] - 1 / z_um)))
-    x, y, _ = calibration.source_positions_um[nearest]
     provenance = {**calibration.provenance, "refocused_to_um": z_um, "refocused_from_um": made.from_z_um}
     return (
         replace(
             calibration,
             psfs=made.psf[None],
-            source_positions_um=np.array([[x, y, z_um]]),
+            source_positions_um=np.array([[*made.source_um, z_um]]),
             quality={},
             provenance=provenance,
         ),
@@ -198,6 +216,17 @@ def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Flo
     -------
     ndarray, (n_z,), and ndarray, float32, (n_z, n_channels, height, width)
     """
+    chosen = _central(calibration)
+    depths = calibration.source_positions_um[chosen, 2].astype(np.float64)
+    return depths, calibration.psfs[chosen]
+
+
+def central_places(calibration: Calibration) -> npt.NDArray[np.float64]:
+    """Return ``(x, y)`` of the PSFs that :func:`central_psfs` returns, micrometres: (n_z, 2)."""
+    return np.asarray(calibration.source_positions_um[_central(calibration), :2], np.float64)
+
+
+def _central(calibration: Calibration) -> list[int]:
     positions = calibration.source_positions_um
     if not len(positions):
         raise InputError("The calibration holds no PSF.")
@@ -207,7 +236,7 @@ def central_psfs(calibration: Calibration) -> tuple[npt.NDArray[np.float64], Flo
     # PSFs of one depth may differ a little in z: the stage says where it truly stopped.
     chosen = [members[int(np.argmin(off_axis[members]))] for members in members_of_depths(positions)]
     chosen.sort(key=lambda k: float(positions[k, 2]))
-    return positions[chosen, 2], calibration.psfs[chosen]
+    return chosen
 
 
 def _mixed(

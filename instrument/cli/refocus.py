@@ -42,6 +42,7 @@ def refocus(
 
     from instrument.calibration_file import load_calibration, save_calibration
     from instrument.reconstruction_job import find_calibration
+    from recon.refocus import central_places
     from recon.refocus import refocus as refocused
 
     if not all(0 < z < float("inf") for z in z_mm):
@@ -51,11 +52,10 @@ def refocus(
     folder = find_calibration(calibration)
     measured = load_calibration(folder)
     made = [refocused(measured, 1e3 * z, deflection_deg=deflection_deg) for z in z_mm]
-    positions = measured.source_positions_um
     new = replace(
         measured,
         psfs=np.stack([one.psf for one in made]),
-        source_positions_um=np.array([(*_place(positions, one.z_um), one.z_um) for one in made]),
+        source_positions_um=np.array([(*one.source_um, one.z_um) for one in made]),
         quality={
             "refocused": [
                 {
@@ -74,13 +74,18 @@ def refocus(
         typer.echo("SIMULATED: the calibration comes from the simulated bench")
     for one in made:
         typer.echo(f"{one.z_um / 1e3:g} mm: {one}")
+        if one.extrapolated:
+            near, far = (v / 1e3 for v in one.calibrated_um)
+            typer.echo(
+                f"Warning: {one.z_um / 1e3:g} mm lies outside the calibrated "
+                f"{f'{near:.4g} to {far:.4g} mm' if far > near else f'depth, {near:.4g} mm'}: the pattern is "
+                "extrapolated, by scaling alone. Measure a PSF there where it matters.",
+                err=True,
+            )
+    if len(measured.psfs) > len(central_places(measured)):
+        typer.echo(
+            "Note: the calibration has several places at a depth; the one nearest to the axis was taken, how "
+            "PSFs vary over the field is lost. reconstruct --model local uses all of them.",
+            err=True,
+        )
     typer.echo(f"Wrote {path}")
-
-
-def _place(positions: object, z_um: float) -> tuple[float, float]:
-    """Return x and y of the calibrated source nearest in 1/z to a depth."""
-    import numpy as np
-
-    table = np.asarray(positions)
-    x, y, _ = table[int(np.argmin(np.abs(1 / table[:, 2] - 1 / z_um)))]
-    return float(x), float(y)

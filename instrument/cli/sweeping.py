@@ -31,6 +31,8 @@ from instrument.plan import Plan, estimate
 from instrument.runner import RunStatus
 from instrument.words import count
 
+_MUCH_BYTES = 10e9  # of a sweep, above which the plan says how to need less
+
 
 class Told(Listener):
     """Shows a bar for each step of a procedure; a context, which takes away the last one."""
@@ -144,6 +146,12 @@ def describe_plan(console: Console, bench: Bench, sweep: Sweep, plan: Plan, fold
         f"{cost.seconds:.0f} s of exposure and motion.",
         soft_wrap=True,
     )
+    if cost.total_bytes > _MUCH_BYTES:
+        console.print(
+            f"Note: {cost.total_bytes / 1e9:.0f} GB are much. Fewer frames a PSF (--average), a larger "
+            "--spacing or fewer --planes make it less, and so does binning in [camera].",
+            soft_wrap=True,
+        )
 
 
 def describe_result(console: Console, done: SweepCalibration) -> None:

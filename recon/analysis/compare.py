@@ -6,6 +6,7 @@ by least squares. What is left then is a change of the pattern itself.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -35,6 +36,7 @@ DIMMER = 0.2
 """Relative change of brightness that is worth a word."""
 FRESH = 0.98
 """Inner product after alignment below which the pattern has changed, if the spot has not grown as well."""
+_SAME_PITCH = 1e-3  # relative: pitches of one camera are equal but for how they were written
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,26 @@ class Comparison:
     reasons: tuple[str, ...]
 
 
+def _size(calibration: Calibration) -> str:
+    channels, height, width = calibration.psfs.shape[1:]
+    pitch_um = calibration.geometry.pixel_pitch_um
+    pixels = f"{height} x {width} pixels" + (f" of {pitch_um:.3g} um" if pitch_um is not None else "")
+    return f"{pixels}, {channels} colour{'s' if channels > 1 else ''}"
+
+
+def _refuse_other_cameras(old: Calibration, new: Calibration) -> None:
+    """Refuse what cannot be laid on one another: other pixels are another camera, binning or region."""
+    pitches = [c.geometry.pixel_pitch_um for c in (old, new)]
+    known = [pitch for pitch in pitches if pitch is not None]
+    same_pitch = len(known) < 2 or math.isclose(known[0], known[1], rel_tol=_SAME_PITCH)
+    if old.psfs.shape[1:] == new.psfs.shape[1:] and same_pitch:
+        return
+    raise InputError(
+        f"The cameras or their settings differ: the old PSFs have {_size(old)}, the new ones {_size(new)}. "
+        "Only calibrations of one camera with the same region of interest and binning compare."
+    )
+
+
 def compare(old: Calibration, new: Calibration) -> Comparison:
     """Compare a calibration with an older one of the same camera.
 
@@ -102,11 +124,7 @@ def compare(old: Calibration, new: Calibration) -> Comparison:
     InputError
         When the PSFs differ in size, or depths are not known.
     """
-    if old.psfs.shape[1:] != new.psfs.shape[1:]:
-        raise InputError(
-            f"The old PSFs are {old.psfs.shape[1:]} (channels, height, width), the new ones "
-            f"{new.psfs.shape[1:]}: only calibrations with the same region of interest and binning compare."
-        )
+    _refuse_other_cameras(old, new)
     depths, planes = central_psfs(new)
     chosen = sorted({0, len(depths) // 2, len(depths) - 1})
     exposure = _exposure_ratio(old, new)

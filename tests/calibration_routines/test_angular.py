@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
+from calibration_routines.angular import AngularSweep, check_angular, farthest_um, measure_angular_response
 from calibration_routines.angular_response import AngularResponse, Curve, load_response
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench import Bench, open_bench
@@ -103,6 +103,10 @@ def test_an_angle_out_of_reach_is_refused_before_anything_moves(bench: Bench) ->
         farthest_um(bench, 83.0)
     with pytest.raises(BenchError, match="step <= largest"):
         AngularSweep(1e5, 10.0, 20.0)
+    with pytest.raises(BenchError, match=r"\+-250 mm, outside .* choose --largest 13 at most"):
+        check_angular(bench, AngularSweep(250e3))
+    with pytest.raises(BenchError, match="outside the stage's limits 8 to 300 mm"):
+        check_angular(bench, AngularSweep(400e3, 5.0))
 
 
 def test_curves_between_the_axes_follow_a_gaussian_of_two_widths() -> None:

@@ -327,6 +327,8 @@ def test_axial_spacing_is_the_dissertations() -> None:
     assert "33.3 per metre" in planes.reason
     with pytest.raises(BenchError, match="wavelength"):
         axial_planes(1700.0, 3000.0, Geometry(), lenslet_um=250.0)
+    with pytest.raises(BenchError, match="make no sense together"):
+        axial_planes(1700.0, 3000.0, Geometry(), lenslet_um=1e-300, wavelength_nm=520.0)
 
 
 def test_the_stage_fit_ignores_a_slip_and_finds_scale_and_rotation() -> None:

@@ -109,6 +109,19 @@ def test_a_grid_whose_depths_the_stage_missed_a_little_is_one_depth() -> None:
     assert points[1].similarity > 0.95
 
 
+def test_of_a_field_the_psf_nearest_to_the_axis_is_taken_and_said() -> None:
+    places = [(-8e3, 60e3), (1e3, 60e3), (8e3, 60e3)]
+    psfs = np.stack([true_psf(z, x) for x, z in places])[:, None]
+    field = Calibration(psfs, np.array([(x, 0.0, z) for x, z in places]), geometry=WORLD.geometry)
+    made = refocus(field, 80e3)
+    assert made.source_um == (1e3, 0.0)
+    assert made.extrapolated
+    assert "(x = 1, y = 0 mm)" in str(made)
+    moved, _ = at_depth(field, 80e3)
+    assert moved.source_positions_um.tolist() == [[1e3, 0.0, 80e3]]
+    assert not refocus(calibrated([40e3, 60e3, 100e3]), 75e3).extrapolated
+
+
 def test_rescaling_keeps_the_centre_and_moves() -> None:
     image = np.zeros((41, 61), np.float32)
     image[15:26, 25:36] = 1.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -106,3 +108,10 @@ def test_sizes_must_agree() -> None:
     small = Calibration(old.psfs[..., :100, :100].copy(), old.source_positions_um, geometry=old.geometry)
     with pytest.raises(InputError, match="region of interest"):
         compare(old, small)
+
+
+def test_another_camera_of_as_many_pixels_is_named() -> None:
+    old = calibration(world())
+    other = replace(old, geometry=replace(old.geometry, pixel_pitch_um=6.5))
+    with pytest.raises(InputError, match=r"cameras or their settings differ: .* of 13 um.* of 6.5 um"):
+        compare(old, other)
