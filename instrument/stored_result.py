@@ -95,12 +95,12 @@ class StoredResult:
         facts: list[tuple[str, str]] = []
         if self.verdict:
             facts.append(("Verdict", " ".join(self.verdict)))
-        model = record.get("model") or origin.get("model")
-        if model:
-            reason = record.get("model_reason") or origin.get("model_reason") or ""
-            facts.append(("Model", f"{model}: {reason}" if reason else str(model)))
-        elif record:
-            facts.append(("Model", "convolution: one PSF for the whole field"))
+        chosen = self._chosen()
+        facts += chosen
+        if record and "Model" not in dict(chosen):
+            model = record.get("model") or origin.get("model") or "convolution"
+            reason = record.get("model_reason") or origin.get("model_reason") or "one PSF for the whole field"
+            facts.append(("Model", f"{model}: {reason}"))
         if record:
             method = record.get("method")
             weight = "" if record.get("tau") is None else f", tau {record['tau']:.3g}"
@@ -117,12 +117,23 @@ class StoredResult:
         if erased := inputs.get("erased"):
             facts.append(("Erased", str(erased)))
         if "binning" in inputs:
-            facts.append(("Binning", f"{inputs['binning']} x {inputs['binning']}"))
+            facts.append(("Averaged", f"{inputs['binning']} x {inputs['binning']} pixels"))
         if memory := origin.get("memory"):
             facts.append(("Memory", str(memory)))
         if record:
             facts.append(("Made", f"{record.get('utc', '')} by {record.get('program', '')}"))
         return facts
+
+    def _chosen(self) -> list[tuple[str, str]]:
+        """Return what the program chose and why, one entry a choice."""
+        decisions = (self.record.get("provenance", {}).get("auto") or {}).get("decisions", ())
+        return [
+            (
+                str(d["name"]).capitalize(),
+                f"{d['value']}: {d['why']}{' (as asked)' if d.get('overruled') else ''}",
+            )
+            for d in decisions
+        ]
 
     def close(self) -> None:
         """Close a volume's files."""

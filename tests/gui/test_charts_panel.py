@@ -12,6 +12,9 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from gui.panels.charts import ChartsPanel
+from gui.views.chart_view import describe
+from instrument.chart_reader import read_chart
+from instrument.errors import FileError
 from instrument.images import read_image
 from instrument.stability_file import read_stability
 from recon.stability.shipped import shipped_file
@@ -104,4 +107,72 @@ def test_copied_lines_draw_the_map_and_a_wrong_file_is_told(
     assert read_image(tmp_path / "planted.png").is_colour
     (tmp_path / "other.json").write_text("{}")
     panel.open(tmp_path / "other.json")
-    qtbot.waitUntil(lambda: "holds no stability maps" in panel._note.toolTip(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "neither stability maps nor a chart" in panel._note.toolTip(), timeout=WAIT_MS)
+
+
+POINTS = [
+    # setting, iterations, seconds, PSNR: the third is beaten by the second.
+    ("wiener", 0, 0.01, 12.0),
+    ("admm tv", 10, 0.1, 20.0),
+    ("fista tv", 10, 0.2, 18.0),
+    ("admm tv", 40, 0.4, 26.0),
+    ("fista tv", 40, 0.8, 25.0),
+]
+
+
+def chart(tmp_path: Path) -> Path:
+    points = [
+        {"setting": s, "iterations": n, "seconds": t, "psnr_db": p, "ssim": None, "held_out": 30 - p,
+         "peak_mib": 9.0}
+        for s, n, t, p in POINTS
+    ]  # fmt: skip
+    record = {
+        "schema": 1,
+        "about": {"scene": "beads", "simulated": True},
+        "points": points,
+        "pareto": [],
+        "failed": {"local tv": "one PSF only"},
+        "missing": ["volume l1"],
+    }
+    path = tmp_path / "chart.json"
+    path.write_text(json.dumps(record))
+    return path
+
+
+def test_a_chart_shows_the_front_and_ranks_the_settings(
+    qtbot: QtBot, panel: ChartsPanel, tmp_path: Path
+) -> None:
+    panel.open(chart(tmp_path))
+    view = panel.chart
+    qtbot.waitUntil(lambda: bool(view.front), timeout=WAIT_MS)
+    assert panel.tabs.currentWidget() is view
+    assert [(p["setting"], p["iterations"]) for p in view.front] == [
+        ("wiener", 0), ("admm tv", 10), ("admm tv", 40),
+    ]  # fmt: skip
+    rows = [[view.table.item(r, c).text() for c in range(3)] for r in range(view.table.rowCount())]
+    assert rows == [["● admm tv", "26", "0.4"], ["fista tv", "25", "0.8"], ["● wiener", "12", "0.01"]]
+    assert "SIMULATED" in panel.heading.text()
+    assert "local tv: one PSF only" in panel.heading.toolTip()
+    assert "volume l1: no time" in panel.heading.toolTip()
+    # Less is better for errors, and scores that nobody knows are not on offer.
+    assert [view.measure.itemData(i) for i in range(view.measure.count())] == ["psnr_db", "held_out"]
+    view.measure.setCurrentIndex(1)
+    assert [p["seconds"] for p in view.front] == [0.01, 0.1, 0.4]
+    view.table.selectRow(1)
+    assert describe(view.front[1]) == (
+        "admm tv, 0.1 s, 10 iterations, PSNR (dB) 20, error on pixels held out (noise = 1) 10, memory 9 MiB"
+    )
+    qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
+    names: dict = {}
+    exec(QApplication.clipboard().text(), names)
+    assert names["ranked"][0]["psnr_db"] == 26.0
+
+
+def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel, tmp_path: Path) -> None:
+    path = chart(tmp_path)
+    path.write_text(path.read_text().replace('"schema": 1', '"schema": 7'))
+    with pytest.raises(FileError, match="version 7"):
+        read_chart(path)
+    path.write_text("no JSON")
+    panel.open(path)
+    qtbot.waitUntil(lambda: "cannot be read as JSON" in panel._note.toolTip(), timeout=WAIT_MS)

@@ -140,6 +140,28 @@ def test_a_volume_from_elsewhere_opens_without_a_record(tmp_path, volume, kind):
     assert dict(result.facts())["Size"].startswith("5 x 40 x 30 voxels")
 
 
+def test_what_the_program_chose_is_told_with_its_reasons(tmp_path):
+    write_image(tmp_path / "p.tif", np.ones((20, 30), np.float32))
+    decisions = [
+        {"name": "model", "value": "convolution", "why": "the PSFs differ by 2 %"},
+        {"name": "binning", "value": "2", "why": "nothing finer is resolved", "overruled": True},
+    ]
+    verdict = {"region": "outside", "sentences": ["not reliable: outside."]}
+    record = {
+        "grid": {"shape": [20, 30]},
+        "prior": "tv",
+        "verdict": verdict,
+        "provenance": {"model": "convolution", "auto": {"decisions": decisions}},
+    }
+    (tmp_path / "p.json").write_text(json.dumps(record))
+    result = open_result(tmp_path / "p.tif")
+    facts = result.facts()
+    assert [value for name, value in facts if name == "Model"] == ["convolution: the PSFs differ by 2 %"]
+    assert ("Binning", "2: nothing finer is resolved (as asked)") in facts
+    assert ("Verdict", "not reliable: outside.") in facts
+    assert result.warnings == ("not reliable: outside.",)
+
+
 def test_names_of_records():
     assert record_file(Path("a/v.ome.zarr")).name == "v.json"
     assert record_file(Path("a/v.x.tif")).name == "v.x.json"

@@ -1,0 +1,194 @@
+"""Speed against accuracy: every setting's score as it goes, and the front that no other beats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QComboBox,
+    QHBoxLayout,
+    QHeaderView,
+    QLabel,
+    QSplitter,
+    QTableWidget,
+    QTableWidgetItem,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.theme import colours
+from gui.widgets.plot import curve_pen, plot_widget, restyle
+
+ScoredPoint = Mapping[str, Any]
+MEASURES = {
+    "psnr_db": ("PSNR (dB)", True),
+    "ssim": ("SSIM", True),
+    "nrmse": ("NRMSE", False),
+    "held_out": ("error on pixels held out (noise = 1)", False),
+    "residual": ("residual (noise = 1)", False),
+}
+"""Words for each score, and whether more is better."""
+_NEAR_PX = 12.0
+
+
+class ChartView(QWidget):
+    """A plot of scored points and a table of settings; pointing at either names the other."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._points: Sequence[ScoredPoint] = ()
+        self.measure = QComboBox()
+        self.measure.setToolTip("What is compared")
+        self.measure.currentIndexChanged.connect(lambda _: self._draw())
+        self.plot: Any = plot_widget("seconds of the solver")
+        self.plot.setLogMode(x=True)
+        self.plot.scene().sigMouseMoved.connect(self._moved)
+        self.table = QTableWidget(0, 3)
+        self.table.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
+        self.table.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
+        self.table.verticalHeader().hide()
+        self.table.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        self.table.setToolTip("Settings by their best score; one that is chosen is drawn bold")
+        self.table.itemSelectionChanged.connect(self._draw_curves)
+        self.place = QLabel("The bold line is the front: no setting is both quicker and better.")
+        self.place.setProperty("role", "dim")
+        self.place.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.front: list[ScoredPoint] = []
+        self._curves: list[Any] = []
+        split = QSplitter()
+        split.addWidget(self.plot)
+        split.addWidget(self.table)
+        split.setSizes([620, 330])
+        row = QHBoxLayout()
+        row.addWidget(QLabel("Compare"))
+        row.addWidget(self.measure)
+        row.addStretch()
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(row)
+        layout.addWidget(split, 1)
+        layout.addWidget(self.place)
+
+    def show_points(self, points: Sequence[ScoredPoint]) -> None:
+        """Show points: ``setting``, ``iterations``, ``seconds`` and scores, None where one is not known."""
+        self._points = points
+        self.measure.blockSignals(True)
+        self.measure.clear()
+        for key, (words, _) in MEASURES.items():
+            if any(p.get(key) is not None for p in points):
+                self.measure.addItem(words, key)
+        self.measure.blockSignals(False)
+        self._draw()
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        restyle(self.plot)
+        self._draw_curves()
+
+    @property
+    def key(self) -> str:
+        """The name of the score that is shown."""
+        return str(self.measure.currentData())
+
+    # Inside --------------------------------------------------------------------------------------
+    def _known(self) -> list[ScoredPoint]:
+        return [p for p in self._points if p.get(self.key) is not None and p["seconds"] > 0]
+
+    def _draw(self) -> None:
+        if self.measure.count() == 0:
+            return
+        words, more = MEASURES[self.key]
+        known = self._known()
+        self.front = front_of(known, self.key, more_is_better=more)
+        best: dict[str, ScoredPoint] = {}
+        for point in known:
+            held = best.get(point["setting"])
+            if held is None or _better(point[self.key], held[self.key], more):
+                best[point["setting"]] = point
+        ranked = sorted(best.values(), key=lambda p: p[self.key], reverse=more)
+        self.table.blockSignals(True)
+        self.table.setHorizontalHeaderLabels(["setting", words.split(" (")[0], "seconds"])
+        self.table.setRowCount(len(ranked))
+        on_front = {p["setting"] for p in self.front}
+        for number, point in enumerate(ranked):
+            mark = "● " if point["setting"] in on_front else ""
+            cells = (f"{mark}{point['setting']}", f"{point[self.key]:.4g}", f"{point['seconds']:.3g}")
+            for column, text in enumerate(cells):
+                item = QTableWidgetItem(text)
+                item.setData(Qt.ItemDataRole.UserRole, point["setting"])
+                self.table.setItem(number, column, item)
+        self.table.blockSignals(False)
+        self.plot.setLabel("left", words)
+        self._draw_curves()
+
+    def _draw_curves(self) -> None:
+        self.plot.clear()
+        chosen = {item.data(Qt.ItemDataRole.UserRole) for item in self.table.selectedItems()}
+        known = self._known()
+        for number, name in enumerate(dict.fromkeys(p["setting"] for p in known)):
+            mine = sorted((p for p in known if p["setting"] == name), key=lambda p: p["seconds"])
+            x, y = np.array([(p["seconds"], p[self.key]) for p in mine], float).T
+            bold = name in chosen
+            colour = colours().curves[number % len(colours().curves)]
+            self.plot.plot(
+                x,
+                y,
+                pen=curve_pen(number, 3.0 if bold else 1.0),
+                symbol="o",
+                symbolSize=8 if bold else 4,
+                symbolPen=None,
+                symbolBrush=colour,
+            )
+        if self.front:
+            x, y = np.array([(p["seconds"], p[self.key]) for p in self.front], float).T
+            pen = pg.mkPen(colours().text, width=2.5)
+            self.plot.plot(x, y, pen=pen, symbol="o", symbolSize=11, symbolPen=pen, symbolBrush=None)
+
+    def _moved(self, place: Any) -> None:
+        nearest, distance = None, _NEAR_PX
+        box = self.plot.getPlotItem().vb
+        for point in self._known():
+            at = box.mapViewToScene(pg.Point(math.log10(point["seconds"]), point[self.key]))
+            away = math.hypot(at.x() - place.x(), at.y() - place.y())
+            if away < distance:
+                nearest, distance = point, away
+        if nearest is not None:
+            self.place.setText(describe(nearest))
+
+
+def describe(point: ScoredPoint) -> str:
+    """Return a point in words."""
+    count = point["iterations"]
+    said = [
+        str(point["setting"]),
+        f"{point['seconds']:.3g} s",
+        f"{count} iterations" if count else "one shot",
+    ]
+    for key, (words, _) in MEASURES.items():
+        if point.get(key) is not None:
+            said.append(f"{words} {point[key]:.4g}")
+    if point.get("peak_mib") is not None:
+        said.append(f"memory {point['peak_mib']:.0f} MiB")
+    return ", ".join(said)
+
+
+def front_of(points: Sequence[ScoredPoint], key: str, *, more_is_better: bool) -> list[ScoredPoint]:
+    """Return the points that no other is both quicker and better than, the quickest first."""
+    sign = 1.0 if more_is_better else -1.0
+    front: list[ScoredPoint] = []
+    best = -math.inf
+    for point in sorted(points, key=lambda p: (p["seconds"], -sign * p[key])):
+        if sign * point[key] > best:
+            front.append(point)
+            best = sign * point[key]
+    return front
+
+
+def _better(value: float, than: float, more_is_better: bool) -> bool:
+    return value > than if more_is_better else value < than
