@@ -31,6 +31,16 @@ class Roi:
         return (self.top, self.left, self.height, self.width)
 
 
+@dataclass(frozen=True, slots=True)
+class CameraNoise:
+    """What is known of one frame's noise at the camera's present settings."""
+
+    read_noise_counts: float
+    """Standard deviation of a pixel in the dark, counts."""
+    counts_per_electron: float
+    """Slope of the photon-transfer curve: ``n`` counts of light have the variance ``n`` times this."""
+
+
 class Camera(Device):
     """An area camera.
 
@@ -54,6 +64,11 @@ class Camera(Device):
     @abstractmethod
     def pixel_formats(self) -> tuple[str, ...]:
         """Pixel formats that the camera offers, by their GenICam names."""
+
+    @property
+    def noise(self) -> CameraNoise | None:
+        """The camera's noise, where driver and device know it; most do not tell."""
+        return None
 
     # Settings ----------------------------------------------------------------------------------
     @property

@@ -66,6 +66,8 @@ class Reduction:
 DarkChoice = Literal["auto"] | float | Path
 MosaicChoice = Pattern | Literal["auto"] | None
 """A colour mosaic; None for none; "auto" for what the image's metadata say."""
+NoiseChoice = NoiseModel | float | Literal["estimate"] | None
+"""A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
 Binning = int | None
 """Pixels to average along each axis; None chooses automatically."""
 
@@ -88,6 +90,8 @@ class Job:
         Files with checksums and every setting, JSON-compatible.
     simulated : bool
         Whether any of the input is known to come from the simulated bench.
+    known_noise : NoiseModel or None
+        Of single pixels, where the photograph's metadata tell.
     """
 
     measurement: FloatImage
@@ -98,10 +102,20 @@ class Job:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     simulated: bool = False
     reduction: Reduction | None = None
+    known_noise: NoiseModel | None = None
 
-    def binned_noise(self, noise: NoiseModel | float | None) -> NoiseModel | float | None:
-        """Return what is left of a single pixel's noise after the averaging that made the measurement."""
-        factor = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
+    def binned_noise(self, noise: NoiseChoice) -> NoiseModel | float | None:
+        """Return what is left of a single pixel's noise after the averaging that made the measurement.
+
+        None, for what the photograph's metadata tell, becomes a model where they do; "estimate" None.
+        """
+        if noise == "estimate":
+            return None
+        if noise is None:
+            noise = self.known_noise
+        factor: float = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
+        if factor > 1 and self.provenance.get("mosaic"):
+            factor /= 2  # red and blue have a quarter of the pixels
         if isinstance(noise, NoiseModel):
             return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
         return None if noise is None else noise / factor
@@ -165,6 +179,7 @@ def job_from_files(
             "Pixels": _describe_window(crop, binning, factor, measurement),
             "Erased": erased.reason,
             **_mosaic_note(pattern),
+            **_noise_note(noise_of(image)),
         },
         valid,
         (*warnings, *_saturation(image, erased)),
@@ -179,6 +194,7 @@ def job_from_files(
         },
         psf.is_simulated or image.is_simulated,
         Reduction(1, level.image, crop, factor),
+        noise_of(image),
     )
 
 
@@ -254,6 +270,7 @@ def job_with(
             "Pixels": _describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
             **_mosaic_note(pattern),
+            **_noise_note(noise_of(image)),
         },
         valid,
         _saturation(image, erased),
@@ -269,6 +286,7 @@ def job_with(
         },
         bool(calibration.provenance.get("simulated")) or image.is_simulated,
         Reduction(match, level.image, crop, factor),
+        noise_of(image),
     )
 
 
@@ -349,6 +367,27 @@ def _mosaic_note(pattern: Pattern | None) -> dict[str, str]:
     if pattern is None:
         return {}
     return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
+
+
+def noise_of(image: ImageFile) -> NoiseModel | None:
+    """Return a pixel's noise as the metadata of a photograph tell it, the mean of its frames regarded."""
+    told: Any = image.metadata.get("noise")
+    try:
+        average = float(image.metadata.get("average", 1))
+        model = NoiseModel(
+            float(told["read_noise_counts"]) / average**0.5, float(told["counts_per_electron"]) / average
+        )
+    except (TypeError, KeyError, ValueError, ZeroDivisionError):
+        return None  # somebody else's metadata
+    known = np.isfinite([model.read_noise, model.counts_per_electron]).all()
+    return model if known and min(model.read_noise, model.counts_per_electron) >= 0 else None
+
+
+def _noise_note(noise: NoiseModel | None) -> dict[str, str]:
+    if noise is None:
+        return {}
+    known = f"read noise {noise.read_noise:.3g} counts, {noise.counts_per_electron:.3g} counts an electron"
+    return {"Noise": f"{known}, as the photograph's metadata say, unless --noise is given"}
 
 
 def _matched_mosaic(

@@ -18,13 +18,13 @@ from instrument.reconstruction_job import (
     DarkChoice,
     Job,
     MosaicChoice,
+    NoiseChoice,
     job_from_calibration,
     job_from_files,
     refocused,
 )
 from instrument.volume_job import volume_job
 from recon.gpu.namespace import DEVICES, Device
-from recon.noise import NoiseModel
 from recon.picture import reconstruct
 from recon.result import Reconstruction
 from recon.solvers.base import Keeper
@@ -89,7 +89,7 @@ class Settings:
     crop: Crop | None = None
     binning: Binning = None
     erasures: Choice = "saturated"
-    noise: NoiseModel | float | None = None
+    noise: NoiseChoice = None
     prior: str | None = None
     tau: float | None = None
     iterations: int | None = None

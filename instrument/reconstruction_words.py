@@ -8,7 +8,7 @@ from pathlib import Path
 
 from instrument.erasures import Choice
 from instrument.errors import BenchError
-from instrument.reconstruction_job import DarkChoice
+from instrument.reconstruction_job import DarkChoice, NoiseChoice
 from recon.noise import NoiseModel
 
 
@@ -57,8 +57,8 @@ def parse_binning(text: str) -> int | None:
     return int(text)
 
 
-def parse_noise(text: str | None) -> NoiseModel | float | None:
-    """Read ``COUNTS`` or ``READ,GAIN``: one deviation, or read noise in counts and counts per electron.
+def parse_noise(text: str | None) -> NoiseChoice:
+    """Read ``COUNTS``, ``READ,GAIN`` (read noise in counts, counts per electron) or ``estimate``.
 
     Raises
     ------
@@ -66,6 +66,8 @@ def parse_noise(text: str | None) -> NoiseModel | float | None:
     """
     if text is None:
         return None
+    if text == "estimate":
+        return "estimate"
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -73,6 +75,6 @@ def parse_noise(text: str | None) -> NoiseModel | float | None:
     if len(values) not in (1, 2) or not all(math.isfinite(v) and v >= 0 for v in values):
         raise BenchError(
             f"--noise {text!r} is not understood; write a standard deviation in counts (3.5), or read noise "
-            "in counts and counts per electron (2.1,0.13)."
+            "in counts and counts per electron (2.1,0.13), or estimate."
         )
     return values[0] if len(values) == 1 else NoiseModel(*values)

@@ -82,6 +82,7 @@ def write_snapshot(
 
 def snapshot_facts(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
     """Return what is kept beside a photograph."""
+    noise = bench.camera.noise  # of a frame, whatever the average
     return {
         "bench": bench.label,
         "simulated": bool(bench.simulated_kinds),
@@ -89,5 +90,6 @@ def snapshot_facts(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any
         "light": light.value,
         "average": taken.average,
         "full_scale": taken.full_scale,
+        "noise": None if noise is None else asdict(noise),
         **asdict(taken.metadata),
     }

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from drivers.camera import CameraNoise
 from drivers.device import DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.frame import Frame, FrameMetadata
@@ -248,6 +249,16 @@ class SimulatedCamera(SimulatedCameraSettings):
         counts = expose(light, self._pixels(), exposure_ms * 1e-3, readout, seed)
         saturated_fraction = float(np.count_nonzero(counts == self._full_scale) / counts.size)
         return counts.astype(np.uint8) if self.significant_bits <= 8 else counts, saturated_fraction
+
+    @property
+    def noise(self) -> CameraNoise | None:
+        """Read noise and quantisation, and the gain in counts per electron; None on a noise-free bench."""
+        scale = float(self.world.options.noise)
+        if scale <= 0:
+            return None
+        counts_per_electron = self.gain * self._full_scale / self._spec.full_well_e
+        read = scale * self._spec.read_noise_e * self._binning * counts_per_electron
+        return CameraNoise(float(np.hypot(read, 12**-0.5)), scale**2 * counts_per_electron)
 
     def _region(self) -> tuple[slice, slice]:
         """Return the binned pixels that the region of interest covers."""

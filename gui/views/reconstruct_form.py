@@ -95,7 +95,7 @@ class ReconstructForm(QWidget):
         self.noise = Entry(
             lambda text: parse_noise(text or None),
             tip="Camera noise: standard deviation in counts, or read noise in counts and counts per electron",
-            placeholder="estimated (counts)",
+            placeholder="known, else estimated (counts)",
         )
         self.dark = Entry(parse_dark, "auto", tip="auto, an offset in counts, or the file of a dark frame")
         self.crop = Entry(

@@ -187,9 +187,9 @@ NoiseOption = Annotated[
     str | None,
     typer.Option(
         "--noise",
-        metavar="COUNTS|READ,GAIN",
+        metavar="COUNTS|READ,GAIN|estimate",
         help="Camera noise: one deviation, or read noise in counts and counts per electron. "
-        "Default: estimated.",
+        "Default: as the photograph's metadata say, else estimated.",
         show_default=False,
     ),
 ]
