@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon import fft
+
 Array = npt.NDArray[Any]
 
 LIT = 0.05
 """Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
 difference between neighbours as an edge."""
+MOST_SAMPLES = 4_000_000
 NO_LESS = 1e-4
 """Least variance of the signal in units of the noise', so that ratios to it stay finite."""
 RING = (0.1, 0.25)
@@ -123,34 +126,44 @@ def measure(
 
 
 def _lit_and_edges(volume: Array) -> tuple[float, float]:
-    white = float(np.percentile(volume, 99.5))
+    """Return the shares of lit voxels and of edges, plane by plane: volumes may be as large as the memory."""
+    sample = volume.reshape(-1)[:: max(volume.size // MOST_SAMPLES, 1)]
+    white = float(np.percentile(sample, 99.5))
     if white <= 0:
         white = float(volume.max())
     if white <= 0:
         return 0.0, 0.0
-    lit = float(np.mean(volume > LIT * white))
-    step = np.zeros(volume.shape, bool)
-    for axis in range(volume.ndim):
-        if volume.shape[axis] > 1:
-            differs = np.abs(np.diff(volume, axis=axis)) > LIT * white
-            front = [slice(None)] * volume.ndim
-            front[axis] = slice(0, -1)
-            step[tuple(front)] |= differs
-    return lit, float(np.mean(step))
+    level = LIT * white
+    lit = edges = 0
+    for z, plane in enumerate(volume):
+        step = np.zeros(plane.shape, bool)
+        step[:-1] |= np.abs(np.diff(plane, axis=0)) > level
+        step[:, :-1] |= np.abs(np.diff(plane, axis=1)) > level
+        if z + 1 < len(volume):
+            step |= np.abs(volume[z + 1] - plane) > level
+        lit += int(np.count_nonzero(plane > level))
+        edges += int(np.count_nonzero(step))
+    return lit / volume.size, edges / volume.size
 
 
 def _detail(volume: Array, psfs: Array, noise: float, count: int) -> float:
     """Signal over noise of what a picture's finer half throws onto ``count`` pixels."""
-    shape = tuple(a + b for a, b in zip(volume.shape[1:], psfs.shape[1:], strict=True))
+    shape = fft.fast_shape([a + b for a, b in zip(volume.shape[1:], psfs.shape[1:], strict=True)])
     y, x = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
-    ring = (np.hypot(y, x) > RING[0]) & (np.hypot(y, x) < RING[1])
+    frequency = np.hypot(y, x)
+    ring = (frequency > RING[0]) & (frequency < RING[1])
     if not ring.any():  # a picture of a few pixels has no such frequency
         return 0.0
-    thrown = np.zeros(int(np.count_nonzero(ring)), complex)
+    thrown = np.zeros(int(np.count_nonzero(ring)), np.complex64)
+    padded = np.zeros((2, *shape), np.float32)
+    spectra = np.empty(fft.spectrum_shape(padded.shape), np.complex64)
     for plane, psf in zip(volume, psfs, strict=True):
-        thrown += (np.fft.rfft2(plane, shape) * np.fft.rfft2(psf, shape))[ring]
-    # White noise of this deviation on so many pixels has this power at every frequency.
-    return float(np.sqrt(np.mean(np.abs(thrown) ** 2) / (noise**2 * count)))
+        padded[0, : plane.shape[0], : plane.shape[1]] = plane
+        padded[1, : psf.shape[0], : psf.shape[1]] = psf / noise
+        fft.rfft(padded, out=spectra)
+        thrown += spectra[0][ring] * spectra[1][ring]
+    # White noise of deviation 1 on so many pixels has this power at every frequency.
+    return float(np.sqrt(np.mean(np.abs(thrown) ** 2, dtype=np.float64) / count))
 
 
 def _similarity(psfs: Array) -> float:

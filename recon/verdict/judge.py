@@ -19,7 +19,7 @@ Floats = npt.NDArray[np.float64]
 
 NEIGHBOURS = 12
 """Cases that are asked."""
-RELIABLE, LOST = 0.15, 0.6
+RELIABLE, LOST = 0.05, 0.5
 """Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""
 FAR = 1.5
 """Distance beyond which the nearest case is no witness: a factor of about ``e^1.5`` in one number."""

@@ -1,0 +1,49 @@
+"""The maps that come with the program are those of the catalogue, and explained."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from instrument.stability_file import read_stability
+from recon.stability.catalogue import MAPS
+from recon.stability.shipped import shipped_file
+from recon.verdict.cases import FEATURES, GROUPS, cases_of
+from recon.verdict.evidence import Evidence
+from recon.verdict.judge import FEWEST, STRESSES
+
+DOCS = Path(__file__).parents[3] / "docs"
+SHIPPED = read_stability(shipped_file())["maps"]
+
+
+def test_every_map_of_the_catalogue_is_shipped() -> None:
+    assert set(SHIPPED) == set(MAPS)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_map_is_whole_and_was_made_with_these_axes(name: str) -> None:
+    shipped, stress = SHIPPED[name], MAPS[name]
+    for key, axis in (("x", stress.x), ("y", stress.y)):
+        assert tuple(shipped[key]["values"]) == axis.at(shipped["size"])
+    assert list(shipped["methods"]) == list(stress.methods)
+    wanted = {f.name for f in fields(Evidence)} | {"ix", "iy", "severity"}
+    for method in shipped["methods"].values():
+        assert all(v is not None for row in method["severity"] for v in row)
+        assert all(set(entry) == wanted for entry in method["evidence"])
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_every_map_is_explained_with_its_picture(name: str) -> None:
+    page = (DOCS / "stability.md").read_text("utf-8")
+    assert f"(images/stability/{name}.png)" in page
+    assert (DOCS / "images" / "stability" / f"{name}.png").is_file()
+
+
+def test_every_group_of_methods_has_cases_to_judge_by() -> None:
+    for group in GROUPS:
+        cases = cases_of(group)
+        assert len(cases.severities) >= FEWEST
+        assert 0.1 < (cases.severities >= 1).mean() < 0.9, group
+    assert set(STRESSES) <= set(FEATURES)
