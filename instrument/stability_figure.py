@@ -67,9 +67,13 @@ def _draw(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[str,
         about = record[which]
         getattr(axes, f"set_{which}ticks")(range(count))
         getattr(axes, f"set_{which}ticklabels")([_short(v) for v in about["values"]], fontsize=8)
-        getattr(axes, f"set_{which}label")(f"{about['label']} ({about['unit']})", fontsize=9, color=_INK)
+        getattr(axes, f"set_{which}label")(_named(about), fontsize=9, color=_INK)
     axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=_INK, loc="left")
     return image
+
+
+def _named(axis: Mapping[str, Any]) -> str:
+    return f"{axis['label']} ({axis['unit']})" if axis["unit"] else str(axis["label"])
 
 
 def _short(value: float) -> str:

@@ -89,7 +89,7 @@ def map_record(stress: StressMap, size: Size, cells: Sequence[Cell]) -> dict[str
             "failure": _grid(x, y, lambda k, mine=mine: _failure(mine, k)),
             "boundary": boundary(x, y, grid, logarithmic=stress.x.logarithmic),
             "evidence": [
-                {"ix": c.ix, "iy": c.iy, **{k: round(float(v), 6) for k, v in e.items()}}
+                {"ix": c.ix, "iy": c.iy, **{k: _short(v) for k, v in e.items()}}
                 for c in mine.values()
                 for e in c.evidence
             ],
@@ -156,7 +156,12 @@ def _grid(x: Sequence[float], y: Sequence[float], value: Any) -> list[list[Any]]
 
 def _maybe(cells: Mapping[tuple[int, int], Cell], key: tuple[int, int], name: str) -> float | None:
     value = getattr(cells[key], name) if key in cells else None
-    return None if value is None or not np.isfinite(value) else round(float(value), 5)
+    return None if value is None or not np.isfinite(value) else _short(value)
+
+
+def _short(value: float) -> float:
+    """Five digits: more are noise."""
+    return float(f"{value:.5g}")
 
 
 def _failure(cells: Mapping[tuple[int, int], Cell], key: tuple[int, int]) -> str | None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from recon.scenes import SceneSpec
 from recon.stability.map import Axis, StressMap
-from recon.stability.maps_calibration import ROTATION, SCALE
 from recon.stability.maps_light import BACKGROUND, ELECTRONS, scene_map
 from recon.stability.scene_trial import Options
 
 BEADS = SceneSpec("beads", depths=4, density=0.4, z_near=3.0, z_far=5.0)
 DEPTHS = Axis("depths", "depth planes over the same range", "planes", (2, 4, 8, 12), (2, 8), logarithmic=True)
+ROTATION = Axis("drift_deg", "rotation", "degrees", (0.1, 0.3, 0.6, 1, 2, 4), (0.1, 0.5, 2), logarithmic=True)
+SWELLING = Axis(
+    "drift_scale", "swelling", "relative", (0.001, 0.003, 0.01, 0.03), (0.001, 0.005, 0.02), logarithmic=True
+)
 FARTHEST = Axis(
     "z_far",
     "farthest plane (nearest: 3)",
@@ -53,7 +56,7 @@ MAPS: tuple[StressMap, ...] = (
         "How far may the diffuser turn and swell before points in a volume are lost?",
         BEADS,
         ROTATION,
-        SCALE,
+        SWELLING,
         ("volume l1", "volume tv"),
     ),
     scene_map(

@@ -20,6 +20,8 @@ LIT = 0.05
 """Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
 difference between neighbours as an edge."""
 MOST_SAMPLES = 4_000_000
+NEAR_PX = 2
+"""Shifts up to here belong to the PSF's own sharpness."""
 NO_LESS = 1e-4
 """Least variance of the signal in units of the noise', so that ratios to it stay finite."""
 RING = (0.1, 0.25)
@@ -53,6 +55,8 @@ class Evidence:
         Greatest inner product of PSFs of neighbouring depths; 0 for one depth.
     dimming : float
         Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are.
+    ambiguity : float
+        Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array.
     unsettled : float
         Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
     """
@@ -68,6 +72,7 @@ class Evidence:
     planes: int
     similarity: float
     dimming: float
+    ambiguity: float
     unsettled: float
 
     def as_json(self) -> dict[str, float]:
@@ -121,6 +126,7 @@ def measure(
         planes=len(volume),
         similarity=_similarity(psfs),
         dimming=_dimming(psfs),
+        ambiguity=_ambiguity(psfs[len(psfs) // 2]),
         unsettled=unsettled,
     )
 
@@ -177,6 +183,22 @@ def _similarity(psfs: Array) -> float:
 def _dimming(psfs: Array) -> float:
     norms = np.linalg.norm(psfs.reshape(len(psfs), -1).astype(np.float64), axis=1)
     return float(norms.min() / norms.max()) if norms.max() > 0 else 1.0
+
+
+def _ambiguity(psf: Array) -> float:
+    """Return the highest side peak of a PSF's autocorrelation, over the mean that any PSF has."""
+    shape = fft.fast_shape([2 * n for n in psf.shape])
+    padded = np.zeros((1, *shape), np.float32)
+    padded[0, : psf.shape[0], : psf.shape[1]] = psf
+    spectrum = fft.rfft(padded)
+    correlation = fft.irfft((spectrum * spectrum.conj()).astype(np.complex64), shape[1])[0]
+    peak = float(correlation[0, 0])
+    if peak <= 0:
+        return 0.0
+    near = NEAR_PX
+    correlation[: near + 1, : near + 1] = correlation[: near + 1, -near:] = 0
+    correlation[-near:, : near + 1] = correlation[-near:, -near:] = 0
+    return float(correlation.max()) / peak
 
 
 def averaged(channels: list[Evidence]) -> Evidence:

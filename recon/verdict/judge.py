@@ -17,14 +17,18 @@ from recon.verdict.verdict import Finding, Region, Verdict
 
 Floats = npt.NDArray[np.float64]
 
-NEIGHBOURS = 12
+NEIGHBOURS = 8
 """Cases that are asked."""
 RELIABLE, LOST = 0.05, 0.5
 """Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""
-FAR = 1.5
-"""Distance beyond which the nearest case is no witness: a factor of about ``e^1.5`` in one number."""
+FAR = 2.0
+"""Distance beyond which the nearest case is no witness: a factor of about seven in one number."""
 UNFINISHED = 10.0
 """``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
+REPEATS = 0.7
+"""``ambiguity`` from which nothing is called reliable. The maps' random lenslets have 0.17 to 0.33, smooth
+diffusers 0.5 to 0.6, regular arrays 0.8: with them pictures were lost that looked like good cases.
+"""
 FEWEST = 40
 """Cases that a group needs to be judged by."""
 
@@ -102,9 +106,14 @@ def verdict_on(evidence: Evidence, method: str) -> Verdict:
     elif nearest > FAR:
         region = Region.UNKNOWN
     else:
-        region = Region.INSIDE if share <= RELIABLE else Region.NEAR
+        region = Region.INSIDE if share <= RELIABLE and numbers["ambiguity"] < REPEATS else Region.NEAR
     basis = f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)})"
-    return Verdict(region, method, share, _findings(cases, place, numbers, share), numbers, basis)
+    findings = _findings(cases, place, numbers, share)
+    if numbers["ambiguity"] >= REPEATS:
+        words = f"The PSF repeats itself: moved by some pixels it is {numbers['ambiguity']:.0%} alike"
+        help_ = "No map has such a diffuser; one with elements at random places would help"
+        findings = (Finding("ambiguity", numbers["ambiguity"], 0.0, words, help_), *findings)
+    return Verdict(region, method, share, findings, numbers, basis)
 
 
 def _no_better_than_any(cases: Cases, place: Floats) -> Floats:

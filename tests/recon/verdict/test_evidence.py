@@ -10,6 +10,7 @@ from recon.scenes import SceneSpec, make_scene
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import measure
+from recon.verdict.judge import REPEATS
 
 RNG = np.random.default_rng(1)
 
@@ -55,6 +56,17 @@ def test_details_count_in_units_of_the_noise() -> None:
 
     assert detail(ring, 0.1) == pytest.approx(10 * detail(ring, 1.0))
     assert detail(ring, 0.1) > 2 * detail(flat, 0.1)
+
+
+def test_a_regular_array_is_ambiguous_and_random_lenslets_are_not() -> None:
+    found = {}
+    for optics in ("random", "regular"):
+        scene = make_scene(SceneSpec("sparse-picture", size=40, optics=optics))
+        result = reconstruct(scene.measurement, scene.calibration, iterations=3)
+        assert result.verdict is not None
+        found[optics] = result.verdict.evidence["ambiguity"]
+    assert found["random"] < 0.5
+    assert found["regular"] > REPEATS
 
 
 def test_only_a_limit_leaves_a_run_unsettled() -> None:

@@ -23,6 +23,7 @@ def evidence(detail: float = 20.0, unexplained: float = 0.02, **others: float) -
         "planes": 1,
         "similarity": 0.0,
         "dimming": 1.0,
+        "ambiguity": 0.2,
         "unsettled": 0.0,
     }
     return Evidence(**{**numbers, "detail": detail, "unexplained": unexplained, **others})  # type: ignore[arg-type]
@@ -70,6 +71,12 @@ def test_what_no_map_saw_is_not_called_reliable() -> None:
     # More light than any case had is as good as the most.
     assert judge.verdict_on(evidence(5000, 0.03), "admm tv").region is Region.INSIDE
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
+
+
+def test_a_psf_that_repeats_itself_is_never_called_reliable() -> None:
+    regular = judge.verdict_on(evidence(30, 0.03, ambiguity=0.82), "admm tv")
+    assert regular.region is Region.NEAR
+    assert regular.findings[0].stress == "ambiguity"
 
 
 def test_a_verdict_is_a_record() -> None:
