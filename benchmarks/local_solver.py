@@ -29,7 +29,7 @@ from recon.scenes.lenslets import stamp
 from recon.solvers import Fista, Solver, StoppingRules
 from recon.threads import set_threads
 from recon.volume.channel import ChannelProblem
-from recon.volume.reconstruct import _prepare
+from recon.volume.reconstruct import prepare_volume
 
 READ_NOISE = 2.0
 
@@ -99,7 +99,7 @@ def main() -> None:
     places = [(r, c) for r in np.linspace(-0.4, 0.4, 5) * size for c in np.linspace(-0.4, 0.4, 5) * size]
     psfs = np.stack([cast(size, np.array([[r, c, 1.0]]))[None] for r, c in places])
     positions = np.array([(-10 * c, -10 * r, 20_000.0) for r, c in places])
-    scaled = _prepare(counts, Calibration(psfs, positions), None, None, NoiseModel(READ_NOISE, 1.0))
+    scaled = prepare_volume(counts, Calibration(psfs, positions), None, None, NoiseModel(READ_NOISE, 1.0))
     top = size - 1 - size // 2  # of the sensor's part of a field of sensor and PSF
     window = slice(top, top + size)
     curves: dict[str, list[tuple[float, float]]] = {}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from instrument.erasures import Choice
+from instrument.erasures import Choice as ErasuresChoice
 from instrument.errors import BenchError
 from instrument.preparation import Crop
 from instrument.reconstruction_job import (
@@ -24,6 +24,7 @@ from instrument.reconstruction_job import (
     refocused,
 )
 from instrument.volume_job import volume_job
+from recon.auto import Choice, Wishes, choose, choose_picture
 from recon.gpu.namespace import DEVICES, Device
 from recon.picture import reconstruct
 from recon.result import Reconstruction
@@ -82,13 +83,15 @@ class Settings:
         Colour mosaic of which the photograph is a raw frame, "auto" for what its metadata say.
     tau, noise, iterations, time_s, tolerance, stop_at_noise
         As :func:`recon.reconstruct`. Without ``iterations`` and ``time_s`` a default count applies.
+    wishes : recon.auto.Wishes or None
+        With the model ``"auto"``: choices that are not to be left to the program.
     """
 
     model: ModelName = "auto"
     dark: DarkChoice = "auto"
     crop: Crop | None = None
     binning: Binning = None
-    erasures: Choice = "saturated"
+    erasures: ErasuresChoice = "saturated"
     noise: NoiseChoice = None
     prior: str | None = None
     tau: float | None = None
@@ -97,6 +100,7 @@ class Settings:
     tolerance: float | None = None
     stop_at_noise: bool = False
     mosaic: MosaicChoice = "auto"
+    wishes: Wishes | None = None
 
     def limit(self, default: int) -> int | None:
         """Return the largest count of iterations: as given, or the default, or none where time is the end."""
@@ -209,9 +213,23 @@ class PictureRequest:
             erasures=None if job.valid is None else ~job.valid,
             tolerance=given.tolerance,
             stop_at_noise=given.stop_at_noise,
+            wishes=given.wishes,
             callback=watch,
             cancel=cancel,
             keeper=keeper,
+        )
+
+    def explain(self, job: Job) -> Choice:
+        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`."""
+        given = self.settings
+        return choose_picture(
+            job.measurement,
+            job.calibration,
+            z_um=self.z_um,
+            prior=given.prior or "tv",
+            noise=job.binned_noise(given.noise),
+            erasures=None if job.valid is None else ~job.valid,
+            wishes=given.wishes,
         )
 
     def share(self, record: IterationRecord) -> float:
@@ -229,10 +247,10 @@ class VolumeRequest:
         The photograph.
     psfs : Path
         As :func:`instrument.volume_job.volume_job`.
-    estimate_background : bool
-        Estimate a smooth background as well.
     positive_background : bool
         One that is nowhere negative.
+    estimate_background : bool or None
+        Estimate a smooth background as well; None: ``"auto"`` decides, other models do.
     scratch : Path or None
         Folder on a fast disk for what does not fit into memory.
     memory_gib : float or None
@@ -244,8 +262,8 @@ class VolumeRequest:
 
     image: Path
     psfs: Path
-    estimate_background: bool = True
     positive_background: bool = False
+    estimate_background: bool | None = None
     scratch: Path | None = None
     memory_gib: float | None = None
     device: Device = "cpu"
@@ -292,11 +310,27 @@ class VolumeRequest:
             device=self.device,
             iterations=given.limit(VOLUME_ITERATIONS),
             time_s=given.time_s,
-            tolerance=1e-3 if given.tolerance is None else given.tolerance,
             stop_at_noise=given.stop_at_noise,
+            tolerance=given.tolerance,
+            wishes=given.wishes,
             callback=watch,
             cancel=cancel,
             keeper=keeper,
+        )
+
+    def explain(self, job: Job) -> Choice:
+        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`."""
+        given = self.settings
+        wishes = given.wishes or Wishes()
+        if wishes.background is None:
+            wishes = replace(wishes, background=self.estimate_background)
+        return choose(
+            job.measurement,
+            job.calibration,
+            prior=known_volume_prior(given.prior or "tv"),
+            noise=job.binned_noise(given.noise),
+            erasures=None if job.valid is None else ~job.valid,
+            wishes=wishes,
         )
 
     def share(self, record: IterationRecord) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,9 @@ from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS as VOLUME_PRIORS
 from recon.volume.model import MODELS, ModelName
+
+if TYPE_CHECKING:
+    from recon.auto.decide import Wishes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -64,6 +67,7 @@ def reconstruct(
     erasures: npt.ArrayLike | None = None,
     initial: Reconstruction | None = None,
     field: Field = "sensor",
+    wishes: Wishes | None = None,
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
     judged: bool = True,
@@ -81,9 +85,11 @@ def reconstruct(
         Depth of the scene; chooses the nearest calibrated PSF. Needed when there are several.
     model : str
         ``"convolution"`` (one PSF for the whole field), ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5; for
-        PSFs from several places of the field), or ``"auto"``: by how much the PSFs of that depth differ. The
-        latter two have a solver of their own, take the priors of :func:`recon.reconstruct_volume` and start
-        from zero.
+        PSFs from several places of the field). The latter two have a solver of their own, take the priors of
+        :func:`recon.reconstruct_volume` and start from zero. ``"auto"``: the smallest model, field, binning
+        and colours that explain the data (:func:`recon.auto.choose_picture`), on the measurement's pixels
+        whatever was chosen; ``choice`` says what and why. With a bare PSF image, another method, prior or a
+        start it is one convolution of everything.
     method : str
         A name from :func:`recon.methods.method_names`: ``"admm"``, ``"admm-sensor"``
         (for dense scenes on many pixels), ``"fista"``, ``"wiener"``.
@@ -109,6 +115,8 @@ def reconstruct(
         Start from this one's ``state``.
     field : "sensor" or "full"
         Return the part opposite to the sensor, or everything that can reach it.
+    wishes : recon.auto.Wishes, optional
+        With ``"auto"``: choices that are not to be left to the program.
     callback : callable, optional
         ``callback(record, image)`` after each iteration; ``image()`` makes the present picture.
     cancel : threading.Event, optional
@@ -131,6 +139,29 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
+    chosen = isinstance(calibration, Calibration) and keeper is None and _is_able(method, prior, initial)
+    if model == "auto" and chosen:
+        from recon.auto.picture import reconstruct_chosen
+
+        return reconstruct_chosen(
+            measurement,
+            calibration,
+            z_um=z_um,
+            prior=str(prior),
+            tau=tau,
+            iterations=iterations,
+            time_s=time_s,
+            tolerance=tolerance,
+            stop_at_noise=stop_at_noise,
+            noise=noise,
+            background=background,
+            erasures=erasures,
+            field=field,
+            wishes=wishes,
+            callback=callback,
+            cancel=cancel,
+            judged=judged,
+        )
     varying = _varying_model(calibration, z_um, model, method, prior, initial)
     if varying is not None and varying[0] != "convolution":
         assert isinstance(calibration, Calibration)
@@ -242,6 +273,11 @@ def _verdict(
     return verdict_on(evidence, method_name(method, prior))
 
 
+def _is_able(method: str, prior: str | Prior, initial: Reconstruction | None) -> bool:
+    """Tell whether PSFs may vary over the field: that solver has priors of its own, and starts from zero."""
+    return method == "admm" and isinstance(prior, str) and prior in VOLUME_PRIORS and initial is None
+
+
 def _varying_model(
     calibration: Calibration | npt.ArrayLike,
     z_um: float | None,
@@ -253,7 +289,7 @@ def _varying_model(
     """Return the camera model and why, where there is a choice; None for one convolution."""
     if model not in MODELS:
         raise InputError(_unknown("model", model, MODELS))
-    able = method == "admm" and isinstance(prior, str) and prior in VOLUME_PRIORS and initial is None
+    able = _is_able(method, prior, initial)
     if model == "convolution" or (model == "auto" and not able):
         return None
     if not isinstance(calibration, Calibration):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.verdict import Verdict
+
+if TYPE_CHECKING:
+    from recon.auto.choice import Choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,3 +84,5 @@ class Reconstruction:
     state: npt.NDArray[Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     verdict: Verdict | None = None
+    choice: Choice | None = None
+    """What was chosen and why, where the program chose (``model="auto"``)."""

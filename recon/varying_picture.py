@@ -17,7 +17,7 @@ from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.volume.channel import PRIORS
-from recon.volume.model import ModelName, choose_model, one_depth, sort_by_depth
+from recon.volume.model import Extent, ModelName, choose_model, one_depth, sort_by_depth
 from recon.volume.reconstruct import reconstruct_volume
 
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -67,6 +67,8 @@ def reconstruct_varying(
     keeper: Keeper | None,
     stop_at_noise: bool,
     judged: bool = True,
+    estimate_background: bool = False,
+    extent: Extent | None = None,
 ) -> Reconstruction:
     """Reconstruct a picture with the local or low-rank model. Parameters as :func:`recon.reconstruct`."""
     if prior not in PRIORS:
@@ -86,7 +88,8 @@ def reconstruct_varying(
         tau=tau,
         axis_weights=(0.0, 1.0, 1.0),
         model=model,
-        estimate_background=False,
+        estimate_background=estimate_background,
+        extent=extent,
         background=background,
         erasures=erasures,
         noise=noise,

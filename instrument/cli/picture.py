@@ -14,14 +14,24 @@ from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs, write_reconstruction
 from instrument.reconstruction_job import Job
 from instrument.reconstruction_request import PICTURE_ITERATIONS, PictureRequest
+from recon.auto import Choice
 from recon.result import Reconstruction
 from recon.solvers.stopping import IterationRecord, StopReason
 
 
 def reconstruct_to_picture(
-    request: PictureRequest, outputs: Outputs, *, rotate_deg: int, checkpoint: Path | None, force: bool
+    request: PictureRequest,
+    outputs: Outputs,
+    *,
+    rotate_deg: int,
+    checkpoint: Path | None,
+    force: bool,
+    explain: bool = False,
 ) -> None:
-    """Reconstruct, tell, write; exit code 130 where it was interrupted."""
+    """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
+    if explain:
+        tell_choice(request.explain(request.prepare()))
+        return
     outputs.check(0, overwrite=force)
     with saying_what_is_left(*outputs.files()):
         job = request.prepare()
@@ -41,6 +51,13 @@ def reconstruct_to_picture(
         count = len(result.history)
         typer.echo(f"Interrupted after {count} iterations: this is the picture so far.", err=True)
         raise typer.Exit(130)
+
+
+def tell_choice(choice: Choice) -> None:
+    """Print what was chosen and why, and what one step up and down would cost."""
+    for line in choice.lines():
+        typer.echo(line)
+    typer.echo(f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it")
 
 
 def _solve(job: Job, request: PictureRequest, keeper: CheckpointFolder | None) -> Reconstruction:
@@ -66,7 +83,10 @@ def _write(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) 
 
 def _tell(result: Reconstruction) -> None:
     weight = "" if result.tau is None else f", tau {result.tau:.3g}"
-    if "model" in result.provenance:
+    if result.choice is not None:
+        for line in result.choice.brief():
+            typer.echo(line)
+    elif "model" in result.provenance:
         typer.echo(f"{'Model':<12}{result.provenance['model']}: {result.provenance['model_reason']}")
     typer.echo(f"{'Method':<12}{result.method}, prior {result.prior}{weight}")
     count = len(result.history)

@@ -13,11 +13,13 @@ from instrument.cli.reconstruct_options import (
     BlockOption,
     CalibrationOption,
     CheckpointOption,
+    ChooseOption,
     CropOption,
     DarkOption,
     DeviceOption,
     DistanceOption,
     ErasuresOption,
+    ExplainOption,
     FigureOption,
     FilmOption,
     ForceOption,
@@ -68,6 +70,8 @@ app = command_app()
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --bayer RGGB --bin 2",
         "diffuserbench reconstruct --calibration field/ --image photo.tif --model local",
         "diffuserbench reconstruct runs/2026-11-21-recording --video --calibration demo/calibration",
+        "diffuserbench reconstruct --volume field/ --image photo.tif --explain",
+        "diffuserbench reconstruct --volume field/ --image photo.tif --choose planes=all",
     )
 )
 def reconstruct(
@@ -77,8 +81,10 @@ def reconstruct(
     calibration: CalibrationOption = None,
     volume: VolumeOption = None,
     model: ModelOption = "auto",
-    background: BackgroundOption = True,
     positive_background: PositiveBackgroundOption = False,
+    explain: ExplainOption = False,
+    choices: ChooseOption = None,
+    background: BackgroundOption = None,
     z_mm: DistanceOption = None,
     dark: DarkOption = "auto",
     crop: CropOption = None,
@@ -132,7 +138,12 @@ def reconstruct(
         tolerance=tolerance,
         stop_at_noise=stop_at_noise,
         bayer=bayer,
+        choices=choices,
     )
+    if explain and model != "auto":
+        raise BenchError(
+            f"--explain says what --model auto chooses; --model {model} leaves nothing to choose."
+        )
     videos_only = {
         "RUN": run is not None,
         "--warm": warm is not None,
@@ -148,7 +159,9 @@ def reconstruct(
             "--volume": volume is not None,
             "--figure": figure is not None,
             "--method": method is not Method.ADMM,
-            "--no-background": not background,
+            "--background/--no-background": background is not None,
+            "--explain": explain,
+            "--choose": bool(choices),
             "--positive-background": positive_background,
             "--bayer": bayer not in ("auto", "none"),
             "--checkpoint": checkpoint is not None,
@@ -217,11 +230,12 @@ def reconstruct(
             outputs,
             checkpoint=checkpoint,
             force=force,
+            explain=explain,
         )
         return
     volumes_only = {
-        "--no-background": not background,
         "--positive-background": positive_background,
+        "--background/--no-background": background is not None,
         "--scratch": scratch is not None,
         "--memory": memory_gib is not None,
         "--device": device != "cpu",
@@ -246,4 +260,5 @@ def reconstruct(
         rotate_deg=int(rotate),
         checkpoint=checkpoint,
         force=force,
+        explain=explain,
     )

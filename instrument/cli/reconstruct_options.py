@@ -8,10 +8,13 @@ from typing import Annotated
 
 import typer
 
+from instrument.errors import BenchError
 from instrument.mosaic import mosaic_named
 from instrument.preparation import Crop
 from instrument.reconstruction_request import PICTURE_ITERATIONS, Settings, known_model
 from instrument.reconstruction_words import parse_binning, parse_dark, parse_erasures, parse_noise
+from recon.auto import Wishes
+from recon.errors import InputError
 
 
 class Method(enum.StrEnum):
@@ -132,12 +135,34 @@ ModelOption = Annotated[
     typer.Option(
         "--model",
         metavar="auto|convolution|local|lowrank",
-        help="Camera model; local, lowrank: PSFs from several places of the field. auto: by their PSFs.",
+        help="Camera model; local, lowrank: PSFs from several places of the field. auto: the smallest model, "
+        "depths, field, binning and colours that explain the data.",
+    ),
+]
+ExplainOption = Annotated[
+    bool,
+    typer.Option(
+        "--explain",
+        help="Say what auto would choose, why, and what one step up or down would cost; reconstruct nothing.",
+    ),
+]
+ChooseOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--choose",
+        metavar="NAME=VALUE",
+        help="Overrule one of auto's choices (repeatable): model=, planes=all, field=all, binning=N, "
+        "channels=all|merged, background=on|off.",
+        show_default=False,
     ),
 ]
 BackgroundOption = Annotated[
-    bool,
-    typer.Option("--background/--no-background", help="Of a volume: estimate a smooth background as well."),
+    bool | None,
+    typer.Option(
+        "--background/--no-background",
+        help="Of a volume: estimate a smooth background as well. Default: auto decides; other models: yes.",
+        show_default=False,
+    ),
 ]
 DistanceOption = Annotated[
     float | None,
@@ -329,6 +354,7 @@ def parse_settings(
     tolerance: float | None,
     stop_at_noise: bool,
     bayer: str,
+    choices: list[str] | None = None,
 ) -> Settings:
     """Understand the options that pictures and volumes share.
 
@@ -351,4 +377,24 @@ def parse_settings(
         tolerance=tolerance,
         stop_at_noise=stop_at_noise,
         mosaic=mosaic_named(bayer),
+        wishes=_wishes(model, choices),
     )
+
+
+def _wishes(model: str, choices: list[str] | None) -> Wishes | None:
+    if not choices:
+        return None
+    if model != "auto":
+        raise BenchError(
+            f"--choose overrules what --model auto chooses; it does not go with --model {model}."
+        )
+    pairs = {}
+    for text in choices:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise BenchError(f"--choose {text!r} is not understood; write NAME=VALUE, say binning=1.")
+        pairs[name.strip()] = value.strip()
+    try:
+        return Wishes.parse(pairs)
+    except InputError as error:
+        raise BenchError(f"--choose: {error}") from error

@@ -8,6 +8,7 @@ import typer
 
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.checkpoint_option import checkpoint_for, say_what_is_kept
+from instrument.cli.picture import tell_choice
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
 from instrument.reconstruction_file import Outputs
@@ -17,9 +18,17 @@ from recon.solvers.stopping import IterationRecord, StopReason
 
 
 def reconstruct_to_volume(
-    request: VolumeRequest, outputs: Outputs, *, checkpoint: Path | None, force: bool
+    request: VolumeRequest,
+    outputs: Outputs,
+    *,
+    checkpoint: Path | None,
+    force: bool,
+    explain: bool = False,
 ) -> None:
-    """Reconstruct, tell, write; exit code 130 where it was interrupted."""
+    """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
+    if explain:
+        tell_choice(request.explain(request.prepare()))
+        return
     outputs.check(0, overwrite=force)
     limit = request.settings.limit(VOLUME_ITERATIONS)
     with saying_what_is_left(*outputs.files()):
@@ -38,7 +47,11 @@ def reconstruct_to_volume(
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
         say_what_is_kept(keeper, result.stop_reasons)
-        typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+        if result.choice is not None:
+            for line in result.choice.brief():
+                typer.echo(line)
+        else:
+            typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
         typer.echo(f"{'Memory':<12}{result.provenance['memory']}")
         count = max(len(history) for history in result.histories)
         typer.echo(

@@ -78,6 +78,8 @@ class ChannelProblem:
         With l1: leave out planes that stay empty.
     memory_gib, scratch, device : optional
         As :func:`recon.reconstruct_volume`.
+    acceptance_px : float, optional
+        As :class:`recon.volume.model.Extent`.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class ChannelProblem:
         memory_gib: float | None = None,
         scratch: Path | str | None = None,
         device: Device = "cpu",
+        acceptance_px: float | None = None,
     ) -> None:
         # Before any work: what is missing for the device is said at once.
         self._namespace = array_namespace(device)
@@ -122,7 +125,7 @@ class ChannelProblem:
             )
         else:
             fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in scaled.depths.fields]
-            self.camera = self._varying(fields, model)
+            self.camera = self._varying(fields, model, acceptance_px)
             self._central = Convolution3D(scaled.depths.central[:, own] * scale, (height, width))
 
     def _convolution(self, psfs: Array, scratch: Path | str | None) -> Convolution3D:
@@ -138,14 +141,20 @@ class ChannelProblem:
             self._storage = memory.Storage(memory.scratch_for(self.plan, scratch), self.plan.room)
         return camera
 
-    def _varying(self, fields: list[FieldOfPsfs], model: ModelName) -> SpatiallyVarying:
+    def _varying(
+        self, fields: list[FieldOfPsfs], model: ModelName, acceptance_px: float | None
+    ) -> SpatiallyVarying:
         shape = (self.valid.shape[0], self.valid.shape[1])
-        field_shape, _ = field_of(shape, fields[0].psfs.shape[2:])
+        field_shape, (row, column) = field_of(shape, fields[0].psfs.shape[2:])
+        support = None
+        if acceptance_px is not None:
+            off_axis = np.hypot(np.arange(field_shape[0])[:, None] - row, np.arange(field_shape[1]) - column)
+            support = np.broadcast_to(off_axis <= acceptance_px, (len(fields), *field_shape))
         grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
         camera = (
-            local_convolution(fields, shape, grid_shape=grid)
+            local_convolution(fields, shape, support=support, grid_shape=grid)
             if model == "local"
-            else low_rank(fields, shape, error=LOW_RANK_ERROR, grid_shape=grid)
+            else low_rank(fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid)
         )
         volumes = 12 if self.prior.startswith("tv") else 6
         size = 4 * int(np.prod(camera.domain_shape))

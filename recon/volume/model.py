@@ -31,6 +31,22 @@ _SEARCH_PX, _SEARCH_PART = 16.0, 0.1
 """A PSF is looked for this many pixels, and this part of its displacement, about where its source says."""
 
 
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How much of the PSFs and of the field a reconstruction models.
+
+    Attributes
+    ----------
+    psf_window : (int, int) or None
+        Height and width of the central part of the PSFs; None: all of them.
+    acceptance_px : float or None
+        Only object pixels this near to the axis are modelled, where PSFs vary over the field; None: all.
+    """
+
+    psf_window: tuple[int, int] | None = None
+    acceptance_px: float | None = None
+
+
 @dataclass(frozen=True)
 class Depths:
     """A calibration sorted by depth.
@@ -69,6 +85,22 @@ class Depths:
                 differences += float(np.sum((psf - seen)[:, shown].astype(np.float64) ** 2))
                 norms += float(np.sum(seen[:, shown].astype(np.float64) ** 2))
         return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
+
+    def within(self, window: tuple[int, int]) -> Depths:
+        """Return the depths with PSFs cut to a central window (height, width)."""
+        cut = tuple(
+            slice(n // 2 - m // 2, n // 2 - m // 2 + m)
+            for n, m in zip(self.central.shape[2:], window, strict=True)
+        )
+        fields = [FieldOfPsfs(f.psfs[..., cut[0], cut[1]], f.points) for f in self.fields]
+        return replace(self, central=self.central[..., cut[0], cut[1]], fields=fields)
+
+    def divided(self, gains: npt.NDArray[np.float32]) -> Depths:
+        """Return the depths with every depth's PSFs divided by a number, (n_z,)."""
+        if (gains == 1).all():
+            return self
+        fields = [FieldOfPsfs(f.psfs / g, f.points) for f, g in zip(self.fields, gains, strict=True)]
+        return replace(self, central=self.central / gains[:, None, None, None], fields=fields)
 
 
 def sort_by_depth(calibration: Calibration) -> Depths:

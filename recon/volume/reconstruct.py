@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,12 @@ from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
-from recon.volume.model import Depths, ModelName, choose_model, sort_by_depth
+from recon.volume.model import Depths, Extent, ModelName, choose_model, members_of_depths, sort_by_depth
 from recon.volume.positive_background import in_turns, is_negative, may_go_on
 from recon.volume.result import VolumeGrid, VolumeReconstruction
+
+if TYPE_CHECKING:
+    from recon.auto.decide import Wishes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -50,14 +53,16 @@ def reconstruct_volume(
     noise: NoiseModel | float | None = None,
     iterations: int | None = None,
     time_s: float | None = None,
-    tolerance: float = 1e-3,
     stop_at_noise: bool = False,
+    tolerance: float | None = None,
     drop_empty: bool = True,
     field: Field = "sensor",
     initial: VolumeReconstruction | None = None,
     memory_gib: float | None = None,
     scratch: Path | str | None = None,
     device: Device = "cpu",
+    extent: Extent | None = None,
+    wishes: Wishes | None = None,
     callback: Progress | None = None,
     cancel: threading.Event | None = None,
     judged: bool = True,
@@ -80,10 +85,14 @@ def reconstruct_volume(
         Weights of the z, y and x differences of TV. Default: by the voxels' shape where the geometry is known
         (:meth:`~recon.volume.result.VolumeGrid.axis_weights`), else 1.
     model : str
-        ``"auto"``, ``"convolution"``, ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5).
+        ``"convolution"``, ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5); or ``"auto"``: the smallest model,
+        depths, field, binning and colours that explain the data (:func:`recon.auto.choose`). The result is on
+        the measurement's pixels and all calibrated depths whatever was chosen; ``choice`` says what and why.
+        With a start, another device, a memory limit or a scratch folder, only the model is chosen.
     estimate_background : bool, optional
-        Estimate a smooth background as well (Eq. 6.2). Default: unless ``background`` is given. Stray light
-        that the model cannot explain otherwise ends up as haze in the outermost planes.
+        Estimate a smooth background as well (Eq. 6.2). Default: with ``"auto"`` where the data show one, else
+        unless ``background`` is given. Stray light that the model cannot explain otherwise ends up as haze in
+        the outermost planes.
     positive_background : bool
         Where the estimated background comes out negative, improve volume and a background ``>= 0`` in turn:
         up to three runs more, each with ``iterations`` of its own.
@@ -91,7 +100,7 @@ def reconstruct_volume(
         As :func:`recon.reconstruct`.
     iterations, time_s, tolerance : optional
         When to stop, whichever comes first. Without ``iterations`` and ``time_s``: 200 iterations. ``time_s``
-        is shared evenly by the channels.
+        is shared evenly by the channels. Default tolerance: 1e-3; ``"auto"`` sets it by the model.
     stop_at_noise : bool
         Also stop as soon as a channel's residual is down to the expected noise.
     drop_empty : bool
@@ -107,6 +116,10 @@ def reconstruct_volume(
     device : "cpu" or "gpu"
         Where to compute. The GPU needs CuPy (``pip install "diffuserbench[gpu]"``), about three times the
         memory that the CPU takes, and the convolution model.
+    extent : Extent, optional
+        How much of the PSFs and of the field to model; default all.
+    wishes : recon.auto.Wishes, optional
+        With ``"auto"``: choices that are not to be left to the program.
     callback : callable, optional
         ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one, and may be
         called until ``callback`` returns.
@@ -125,8 +138,38 @@ def reconstruct_volume(
     """
     if prior not in PRIORS:
         raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
-    scaled = _prepare(measurement, calibration, background, erasures, noise)
+    free = initial is None and keeper is None and extent is None and scratch is None and memory_gib is None
+    if model == "auto" and device == "cpu" and free:
+        return _chosen(
+            measurement,
+            calibration,
+            prior=prior,
+            tau=tau,
+            axis_weights=axis_weights,
+            estimate_background=estimate_background,
+            positive_background=positive_background,
+            background=background,
+            erasures=erasures,
+            noise=noise,
+            iterations=iterations,
+            time_s=time_s,
+            tolerance=tolerance,
+            stop_at_noise=stop_at_noise,
+            judged=judged,
+            drop_empty=drop_empty,
+            field=field,
+            wishes=wishes,
+            callback=callback,
+            cancel=cancel,
+        )
+    tolerance = 1e-3 if tolerance is None else tolerance
+    scaled = prepare_volume(measurement, calibration, background, erasures, noise, extent)
     name, reason = choose_model(scaled.depths, model)
+    # l1 counts light on the sensor: a near plane, whose PSF is brighter, must not be the cheaper explanation.
+    gains = plane_gains(scaled) if prior == "l1" else np.ones(len(scaled.depths.z_um), np.float32)
+    as_measured = scaled
+    scaled = replace(scaled, depths=scaled.depths.divided(gains))
+    per_plane = gains[:, None, None]
     smooth = background is None if estimate_background is None else estimate_background
     try:
         rules = StoppingRules(
@@ -154,14 +197,18 @@ def reconstruct_volume(
             memory_gib=memory_gib,
             scratch=scratch,
             device=device,
+            acceptance_px=None if extent is None else extent.acceptance_px,
         )
-        start = None if initial is None else run.start(_channel(initial.volume, channel), window)
+        start = None if initial is None else run.start(_channel(initial.volume, channel) * per_plane, window)
         solver, relative = run.solver(tau, start)
         scale = float(scaled.noise[channel]) / scaled.energy
 
         def tell(solver: Solver, record: IterationRecord, scale: float = scale) -> None:
             if callback is not None:
-                callback(record, lambda: solver.solution[0][:, window[0], window[1]] * np.float32(scale))
+                callback(
+                    record,
+                    lambda: solver.solution[0][:, window[0], window[1]] * (np.float32(scale) / per_plane),
+                )
 
         if stop_at_noise:
             rules = replace(rules, noise_norm=_noise_norm(scaled, channel))
@@ -187,7 +234,7 @@ def reconstruct_volume(
                     tell if callback is not None else None,
                     cancel,
                 )
-        volumes.append(outcome.solution[0][:, window[0], window[1]] * np.float32(scale))
+        volumes.append(outcome.solution[0][:, window[0], window[1]] * (np.float32(scale) / per_plane))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
@@ -196,7 +243,7 @@ def reconstruct_volume(
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
-    verdict = _verdict(measurement, scaled, volume, outcomes, tolerance, prior) if judged else None
+    verdict = _verdict(measurement, as_measured, volume, outcomes, tolerance, prior) if judged else None
     return VolumeReconstruction(
         volume=np.ascontiguousarray(volume),
         grid=grid,
@@ -241,6 +288,82 @@ def _noise_norm(scaled: Scaled, channel: int = 0) -> float:
     return float(np.sqrt(np.count_nonzero(scaled.valid[channel])))
 
 
+def plane_gains(scaled: Scaled) -> npt.NDArray[np.float32]:
+    """Return the energy of every depth's central PSF, relative to their root mean square, (n_z,)."""
+    energy = np.sqrt(np.sum(scaled.depths.central.astype(np.float64) ** 2, axis=(1, 2, 3)))
+    relative = energy * np.sqrt(len(energy)) / max(float(np.linalg.norm(energy)), 1e-30)
+    return np.where(relative > 0, relative, 1.0).astype(np.float32)
+
+
+def _chosen(
+    measurement: npt.ArrayLike,
+    calibration: Calibration,
+    *,
+    prior: VolumePrior,
+    axis_weights: npt.ArrayLike | None,
+    estimate_background: bool | None,
+    positive_background: bool,
+    background: npt.ArrayLike | None,
+    erasures: npt.ArrayLike | None,
+    noise: NoiseModel | float | None,
+    tolerance: float | None,
+    field: Field,
+    wishes: Wishes | None,
+    callback: Progress | None,
+    **others: Any,
+) -> VolumeReconstruction:
+    """Choose, reconstruct what was chosen, and bring it back; parameters as :func:`reconstruct_volume`."""
+    from recon.auto.decide import Wishes, choose
+    from recon.auto.run import reduce, shown, whole_volume
+
+    wishes = wishes or Wishes()
+    if wishes.background is None:
+        asked = True if positive_background else estimate_background
+        wishes = replace(wishes, background=asked)
+    if wishes.tolerance is None:
+        wishes = replace(wishes, tolerance=tolerance)
+    if field == "full":  # what can reach the sensor is asked for, on its pixels
+        wishes = replace(wishes, field="all", binning=1)
+    if axis_weights is not None and np.ndim(axis_weights) == 2:  # one row a depth
+        wishes = replace(wishes, planes="all")
+    choice = choose(
+        measurement,
+        calibration,
+        prior=prior,
+        noise=noise,
+        background=background,
+        erasures=erasures,
+        wishes=wishes,
+    )
+    small = reduce(choice, measurement, calibration, noise=noise, background=background, erasures=erasures)
+    result = reconstruct_volume(
+        small.measurement,
+        small.calibration,
+        prior=prior,
+        axis_weights=axis_weights,
+        model=choice.model,
+        estimate_background=choice.background,
+        positive_background=positive_background,
+        erasures=small.erasures,
+        noise=small.noise,
+        tolerance=choice.tolerance,
+        field=field,
+        extent=small.extent,
+        callback=None if callback is None else lambda record, now: callback(record, shown(small, now)),
+        **others,
+    )
+    psfs = calibration.psfs
+    depths = Depths(_depths_um(calibration), psfs[:1], [])
+    height, width = np.shape(measurement)[:2]
+    window, centre = _window(field, (height, width), (psfs.shape[2], psfs.shape[3]))
+    return whole_volume(result, small, _grid(calibration, depths, window, centre))
+
+
+def _depths_um(calibration: Calibration) -> npt.NDArray[np.float64]:
+    positions = calibration.source_positions_um
+    return np.array([float(np.mean(positions[g, 2])) for g in members_of_depths(positions)])
+
+
 def _uncertified(empty: list[EmptyPlanes]) -> list[str]:
     return [
         f"Stopped before it was certain that {len(e.planes)} depth planes are empty: on one of them the "
@@ -262,13 +385,15 @@ def _channel(volume: Array, channel: int) -> Array:
     return chosen
 
 
-def _prepare(
+def prepare_volume(
     measurement: npt.ArrayLike,
     calibration: Calibration,
     background: npt.ArrayLike | None,
     erasures: npt.ArrayLike | None,
     noise: NoiseModel | float | None,
+    extent: Extent | None = None,
 ) -> Scaled:
+    """Check, subtract the background, sort by depth, scale; parameters as :func:`reconstruct_volume`."""
     data, valid, saturated = data_of(measurement, background, erasures)
     depths = sort_by_depth(calibration)
     psfs = depths.central
@@ -279,6 +404,9 @@ def _prepare(
         )
     require_same_pixels(psfs[0], data)
     warnings = [*saturated, *depths.warnings]
+    if extent is not None and extent.psf_window is not None:
+        depths = depths.within(extent.psf_window)
+        psfs = depths.central
     for z, psf in enumerate(psfs):
         warnings += [f"Depth {z}: {text}" for text in check_psf(psf)]
     deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,9 @@ import numpy.typing as npt
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.verdict import Verdict
 from recon.volume.empty_planes import EmptyPlanes
+
+if TYPE_CHECKING:
+    from recon.auto.choice import Choice
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,3 +107,5 @@ class VolumeReconstruction:
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     verdict: Verdict | None = None
+    choice: Choice | None = None
+    """What was chosen and why, where the program chose (``model="auto"``)."""

@@ -112,10 +112,15 @@ def test_erasures_of_four_fifths():
 def test_channels():
     b = measurement()
     result = reconstruct_volume(
-        np.stack([b, 2 * b, 0.5 * b, b], axis=-1), calibration(), prior="l1", iterations=30, noise=2.0
+        np.stack([b, 2 * b, 0.5 * b, b], axis=-1),
+        calibration(),
+        prior="l1",
+        model="convolution",
+        iterations=30,
+        noise=2.0,
     )
     assert result.volume.shape == (DEPTHS, SIZE, SIZE, 4)
-    single = reconstruct_volume(b, calibration(), prior="l1", iterations=30, noise=2.0)
+    single = reconstruct_volume(b, calibration(), prior="l1", model="convolution", iterations=30, noise=2.0)
     np.testing.assert_allclose(result.volume[..., 0], single.volume, atol=1e-3 * single.volume.max())
     assert len(result.histories) == len(result.stop_reasons) == 4
 
@@ -157,7 +162,7 @@ def test_refuses_what_does_not_fit_or_puts_it_on_disk(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="Bin the images or take fewer depths"):
         reconstruct_volume(measurement(), calibration(), memory_gib=1e-4, scratch=tmp_path)
     result = reconstruct_volume(measurement(), calibration(), iterations=5, memory_gib=half, scratch=tmp_path)
-    same = reconstruct_volume(measurement(), calibration(), iterations=5)
+    same = reconstruct_volume(measurement(), calibration(), model="convolution", iterations=5)
     np.testing.assert_array_equal(result.volume, same.volume)
     assert not list(tmp_path.iterdir()), "scratch files are removed"
     assert "GiB of the state in files" in result.provenance["memory"]
@@ -181,7 +186,7 @@ def test_only_what_does_not_fit_goes_to_disk(tmp_path, monkeypatch, prior):
     kind = "tv" if prior == "tv" else "l1"
     plan = memory.plan(kind, (1, DEPTHS, 80, 80), calibration().psfs.size, DEPTHS * SIZE**2)
     limit = (plan.work + 0.6 * plan.state) / (1 - memory.KEPT_FREE) / memory.GIB
-    settings = {"prior": prior, "iterations": 5, "estimate_background": False}
+    settings = {"prior": prior, "iterations": 5, "estimate_background": False, "model": "convolution"}
     result = reconstruct_volume(measurement(), calibration(), memory_gib=limit, scratch=tmp_path, **settings)
     assert 0.3 * plan.state < stores[-1].on_disk < 0.8 * plan.state
     same = reconstruct_volume(measurement(), calibration(), **settings)
@@ -401,7 +406,7 @@ def test_a_background_is_not_negative(prior):
         iterations=60,
         callback=lambda r, v: seen.append(v().shape),
     )
-    free = reconstruct_volume(b, calibration(), prior=prior, iterations=60)
+    free = reconstruct_volume(b, calibration(), prior=prior, iterations=60, estimate_background=True)
     assert free.background.min() < -50
     assert len(free.histories[0]) <= 60
     assert result.background.min() >= 0

@@ -1,0 +1,171 @@
+"""``model="auto"`` against every fixed model, on 28 simulated scenes that it was not tuned on.
+
+    python benchmarks/auto_model.py [--tuning] [--only NAME] [--out docs/benchmarks]
+
+Each scene is rendered lenslet by lenslet (``recon.scenes``) and reconstructed with the convolution,
+low-rank and local models, each without and with a background, all depths, all pixels; and once with ``auto``.
+Errors are against the truth (PSNR after the best factor; volumes through a blur of one voxel), times are
+processor seconds, those of choosing included. The largest model is the local one with a background. ``--out``
+writes auto-model.csv, auto-model-table.md and auto-model.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import platform
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from auto_scenes import FAMILY_PRIOR, JUDGED, TUNING
+
+import recon
+from recon.scenes import SceneSpec, TestScene, make_scene, score
+from recon.threads import set_threads
+
+MODELS = ("convolution", "lowrank", "local")
+LARGEST = "local + background"
+ITERATIONS = 150
+WITHIN_DB = 0.5
+
+
+def solve(scene: TestScene, model: str, background: bool | None) -> tuple[float, float, object]:
+    """Return PSNR, processor seconds and what was chosen."""
+    prior = FAMILY_PRIOR[scene.spec.family]
+    settings = {"prior": prior, "erasures": scene.erasures, "iterations": ITERATIONS, "judged": False}
+    began = time.process_time()
+    if scene.spec.is_picture and not background:
+        result = recon.reconstruct(
+            scene.measurement, scene.calibration, z_um=float(scene.z_um[0]), model=model, **settings
+        )
+        found = result.image
+    else:
+        result = recon.reconstruct_volume(
+            scene.measurement, scene.calibration, model=model, estimate_background=background, **settings
+        )
+        found = result.volume[0] if scene.spec.is_picture else result.volume
+    seconds = time.process_time() - began
+    return score(found, scene.truth).psnr_db, seconds, result.choice
+
+
+def judge(name: str, spec: SceneSpec) -> dict[str, object]:
+    """Run every model on one scene."""
+    scene = make_scene(spec)
+    fixed = {}
+    for model in MODELS:
+        for background in (False, True):
+            label = f"{model} + background" if background else model
+            fixed[label] = solve(scene, model, background)[:2]
+    found, seconds, choice = solve(scene, "auto", None)
+    best = max(fixed, key=lambda k: fixed[k][0])
+    smooth = " + background" if choice.background else ""
+    row = {
+        "scene": name,
+        "best": best,
+        "best_db": fixed[best][0],
+        "best_s": fixed[best][1],
+        "largest_db": fixed[LARGEST][0],
+        "largest_s": fixed[LARGEST][1],
+        "auto": f"{choice.model}{smooth}, {len(choice.planes)}/{choice.n_planes} planes, bin {choice.binning}"
+        + (", colours merged" if choice.merged else ""),
+        "auto_db": found,
+        "auto_s": seconds,
+    }
+    for label, (decibels, spent) in fixed.items():
+        row[f"{label} dB"], row[f"{label} s"] = decibels, spent
+    print(
+        f"{name:24} best {row['best']:24} {row['best_db']:6.2f} dB {row['best_s']:6.2f} s | auto "
+        f"{found:6.2f} dB {seconds:6.2f} s of {row['largest_s']:6.2f} s | {row['auto']}",
+        flush=True,
+    )
+    return row
+
+
+def summary(rows: list[dict]) -> str:
+    """Say whether the bars are met."""
+    near = sum(r["auto_db"] >= r["best_db"] - WITHIN_DB for r in rows)
+    ratio = float(np.median([r["auto_s"] / r["largest_s"] for r in rows]))
+    gap = float(np.median([r["auto_db"] - r["best_db"] for r in rows]))
+    return (
+        f"auto is within {WITHIN_DB} dB of the best fixed model on {near} of {len(rows)} scenes "
+        f"({near / len(rows):.0%}), at a median of {ratio:.2f} times the largest model's time; median "
+        f"difference {gap:+.2f} dB."
+    )
+
+
+def write(rows: list[dict], folder: Path) -> None:
+    """Write table and picture."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "auto-model.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(
+            {k: f"{v:.3f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows
+        )
+    lines = [
+        f"{summary(rows)} {datetime.now(UTC):%Y-%m-%d}, {platform.processor() or platform.machine()}, one "
+        "thread, processor seconds.",
+        "",
+        "| scene | best fixed model | dB | s | auto chose | dB | s | largest: dB | s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        mark = "" if r["auto_db"] >= r["best_db"] - WITHIN_DB else " **missed**"
+        lines.append(
+            f"| {r['scene']} | {r['best']} | {r['best_db']:.2f} | {r['best_s']:.2f} | {r['auto']} | "
+            f"{r['auto_db']:.2f}{mark} | {r['auto_s']:.2f} | {r['largest_db']:.2f} | {r['largest_s']:.2f} |"
+        )
+    (folder / "auto-model-table.md").write_text("\n".join(lines) + "\n")
+    draw(rows, folder / "auto-model.png")
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Draw difference and time for every scene."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 0.27 * len(rows) + 1.4), sharey=True)
+    y = np.arange(len(rows))
+    gap = np.array([r["auto_db"] - r["best_db"] for r in rows])
+    left.axvspan(-WITHIN_DB, 0, color="0.9", label=f"within {WITHIN_DB} dB")
+    left.barh(y, gap, color=np.where(gap >= -WITHIN_DB, "tab:blue", "tab:red"))
+    left.set_yticks(y, [r["scene"] for r in rows], fontsize=8)
+    left.invert_yaxis()
+    left.set_xlabel("auto minus best fixed model (dB)")
+    left.legend(fontsize=8)
+    ratio = np.array([r["auto_s"] / r["largest_s"] for r in rows])
+    right.barh(y, ratio, color="tab:green")
+    right.axvline(0.5, color="k", lw=0.8)
+    right.axvline(float(np.median(ratio)), color="k", lw=0.8, ls=":", label=f"median {np.median(ratio):.2f}")
+    right.set_xlabel("time of auto over the largest model's")
+    right.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--tuning", action="store_true", help="the scenes it was tuned on instead")
+    parser.add_argument("--only", help="scenes whose name holds this")
+    parser.add_argument("--out", type=Path, help="folder for table and picture")
+    arguments = parser.parse_args()
+    set_threads(1)
+    make_scene("beads", size=32)  # compile
+    scenes = [s for s in (TUNING if arguments.tuning else JUDGED) if (arguments.only or "") in s[0]]
+    rows = [judge(name, spec) for name, spec in scenes]
+    print(summary(rows))
+    if arguments.out is not None:
+        write(rows, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

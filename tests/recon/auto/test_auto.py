@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import recon
+from recon import InputError
+from recon.auto import Wishes, choose, choose_picture
+from recon.auto.reduced import binned, enlarged, reduced_calibration
+from recon.scenes import make_scene, score
+
+
+def decision(choice, name):
+    return next(d for d in choice.decisions if d.name == name)
+
+
+@pytest.fixture(scope="module")
+def beads():
+    return make_scene("beads", size=40, depths=6, grid=3, layers=(0.0, 0.15), density=0.5, seed=31)
+
+
+@pytest.fixture(scope="module")
+def chosen_beads(beads):
+    return recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1")
+
+
+def test_empty_planes_are_left_out_and_come_back_empty(beads, chosen_beads):
+    choice = chosen_beads.choice
+    assert choice is not None
+    assert 1 < len(choice.planes) < 6
+    assert 5 in choice.planes
+    assert chosen_beads.volume.shape == beads.truth.shape
+    rest = [z for z in range(6) if z not in choice.planes]
+    assert not chosen_beads.volume[rest].any()
+    np.testing.assert_allclose(chosen_beads.grid.z_um, beads.calibration.source_positions_um[::9, 2])
+    assert chosen_beads.provenance["auto"]["planes"] == list(choice.planes)
+    json.dumps(chosen_beads.provenance["auto"], allow_nan=False)
+
+
+def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
+    whole = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", model="local")
+    auto_db = score(chosen_beads.volume, beads.truth).psnr_db
+    assert auto_db > score(whole.volume, beads.truth).psnr_db - 0.5
+    assert auto_db > score(np.roll(chosen_beads.volume, 1, axis=1), beads.truth).psnr_db + 1
+
+
+def test_every_choice_says_why_and_can_be_overruled(beads):
+    wishes = Wishes.parse(
+        {"model": "local", "planes": "all", "binning": "1", "background": "off", "field": "all"}
+    )
+    choice = choose(beads.measurement, beads.calibration, prior="l1", wishes=wishes)
+    assert (choice.model, choice.planes, choice.background) == ("local", tuple(range(6)), False)
+    assert choice.psf_window == (40, 40)
+    assert [d.name for d in choice.decisions if d.overruled] == [
+        "model", "planes", "field", "binning", "background"
+    ]  # fmt: skip
+    free = choose(beads.measurement, beads.calibration, prior="l1")
+    assert free.model != "convolution"
+    model = decision(free, "model")
+    assert model.down is not None
+    assert model.down.time < 1
+    assert model.down.error_db < 0
+    assert all(d.why for d in free.decisions)
+    assert any(line.lstrip().startswith("one step down") for line in free.lines())
+
+
+def test_one_psf_that_does_not_vary_takes_a_convolution():
+    scene = make_scene("sparse-picture", size=40, grid=1)
+    result = recon.reconstruct(scene.measurement, scene.calibration)
+    assert result.choice is not None
+    assert result.choice.model == "convolution"
+    assert decision(result.choice, "model").up is None
+    fixed = recon.reconstruct(scene.measurement, scene.calibration, model="convolution")
+    assert fixed.choice is None
+    if not result.choice.background and result.choice.binning == 1:
+        np.testing.assert_array_equal(result.image, fixed.image)
+
+
+def test_soft_psfs_are_binned_and_sharp_ones_are_not():
+    soft = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0)
+    result = recon.reconstruct(soft.measurement, soft.calibration)
+    assert result.choice is not None
+    assert result.choice.binning > 1
+    assert result.image.shape == soft.truth.shape
+    fine = recon.reconstruct(soft.measurement, soft.calibration, model="convolution")
+    assert score(result.image, soft.truth).psnr_db > score(fine.image, soft.truth).psnr_db - 0.5
+    # In the same units, not only of the same look.
+    assert result.image.sum() == pytest.approx(fine.image.sum(), rel=0.05)
+    sharp = make_scene("sparse-picture", size=64)
+    assert choose_picture(sharp.measurement, sharp.calibration).binning == 1
+
+
+def test_equal_colours_are_merged_and_different_ones_are_not():
+    grey = make_scene("sparse-picture", size=40, channels=3, grid=1)
+    result = recon.reconstruct(grey.measurement, grey.calibration)
+    assert result.choice is not None
+    assert result.choice.merged
+    assert result.image.shape == (40, 40, 3)
+    apart = recon.reconstruct(grey.measurement, grey.calibration, wishes=Wishes(channels="all"))
+    assert score(result.image, grey.truth).psnr_db > score(apart.image, grey.truth).psnr_db - 0.3
+    assert result.image.sum() == pytest.approx(apart.image.sum(), rel=0.03)
+    colourful = make_scene("sparse-picture", size=40, channels=3, colourful=True)
+    assert not choose_picture(colourful.measurement, colourful.calibration).merged
+    # A prism: colours differ in the PSF and not in the scene.
+    rainbow = make_scene("sparse-picture", size=40, channels=3, dispersion=0.8, optics="smooth")
+    assert not choose_picture(rainbow.measurement, rainbow.calibration).merged
+
+
+def test_a_strong_background_is_noticed_and_none_is_added_to_one_that_was_given():
+    stray = make_scene("beads", size=40, depths=4, density=0.5, background=2.0)
+    assert choose(stray.measurement, stray.calibration, prior="l1").background
+    given = choose(stray.measurement, stray.calibration, prior="l1", background=stray.background)
+    assert not given.background
+    assert "given" in decision(given, "background").why
+
+
+@pytest.mark.parametrize("n", [12, 13, 20, 21])
+@pytest.mark.parametrize("factor", [2, 3])
+def test_binned_and_enlarged_keep_place_and_light(n, factor):
+    rng = np.random.default_rng(0)
+    from recon.operators import PadCropConvolution
+
+    psf = np.zeros((1, n, n), np.float32)
+    psf[0, n // 2, n // 2] = 1
+    image = np.zeros((n, n), np.float32)
+    place = n // 2 + factor
+    image[place, n // 2] = 1.0
+    # A point two blocks' worth off the axis: the binned camera finds it at its binned place.
+    small_psf, small = binned(psf, factor), binned(image, factor)
+    m = small.shape[0]
+    camera = PadCropConvolution(small_psf / small_psf.sum(), (m, m))
+    x = np.zeros(camera.domain_shape, np.float32)
+    x[0, camera.centre[0] + 1, camera.centre[1]] = 1
+    seen = camera.forward(x)[0]
+    assert np.unravel_index(np.argmax(seen), seen.shape) == np.unravel_index(np.argmax(small), small.shape)
+    found = np.zeros((m, m), np.float32)
+    found[m // 2 + 1, m // 2] = factor**2
+    back = enlarged(found, factor, (n, n))
+    assert np.unravel_index(np.argmax(back), back.shape) == (place, n // 2)
+    smooth = rng.random((m, m)).astype(np.float32)
+    assert enlarged(np.full_like(smooth, 3.0), factor, (n, n)).sum() == pytest.approx(3 * n * n / factor**2)
+
+
+def test_fewer_depths_keep_their_psfs(beads):
+    small = reduced_calibration(beads.calibration, 2, (1, 4))
+    assert small.psfs.shape == (18, 1, 20, 20)
+    np.testing.assert_array_equal(
+        np.unique(small.source_positions_um[:, 2]), np.sort(beads.calibration.source_positions_um[[9, 36], 2])
+    )
+    assert small.geometry.pixel_pitch_um == 2 * beads.calibration.geometry.pixel_pitch_um
+
+
+def test_mistakes_are_named(beads):
+    with pytest.raises(InputError, match="no choice 'modle'"):
+        Wishes.parse({"modle": "local"})
+    with pytest.raises(InputError, match="whole number"):
+        Wishes.parse({"binning": "0"})
+    with pytest.raises(InputError, match="one of on, off"):
+        Wishes.parse({"background": "maybe"})
+    with pytest.raises(InputError, match="priors"):
+        choose_picture(beads.measurement, beads.calibration, prior="none")
