@@ -48,8 +48,10 @@ EMPTY = 0.03
 """Share of the coarse pass's light below which a plane is empty, unless a neighbour is not."""
 VARYING_COST = 3.0
 """Operator applications an iteration of conjugate gradients, relative to a convolution."""
-SAMPLES = 5.0
-"""Pixels over the full width of a PSF's autocorrelation at half its height. With 3.5 a sharp picture lost 1.6
+LEAST_SIDE = 20
+"""Pixels along the longest side that binning leaves at least."""
+SAMPLES = 7.0
+"""Pixels over the full width of a PSF's autocorrelation at half its height. With 5 a soft picture lost 0.6
 dB: priors bring back more than the PSF's width says."""
 SETTLED = {"convolution": 1e-3, "varying": 8e-3}
 """Change an iteration at which pictures were seen to be within 0.2 dB of the end: the solver of varying PSFs,
@@ -393,7 +395,7 @@ def _binning(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
     side = max(depths.central.shape[2:])
     if not np.isfinite(sharpest):
         sharpest = float(side)
-    fitting = min(max(1, int(sharpest / SAMPLES)), max(1, side // COARSE_PX))
+    fitting = min(max(1, int(sharpest / SAMPLES)), max(1, side // LEAST_SIDE))
     asked = wishes.binning is not None
     binning = wishes.binning or (fitting if whole else 1)
     why = (
