@@ -58,6 +58,7 @@ COMMANDS: Mapping[str, Command] = {
         ANALYSIS, "what a calibration's optics can do: one page and JSON", "instrument.cli.analyze"
     ),
     "compare": Command(ANALYSIS, "two calibrations: what moved, is a new one due", "instrument.cli.compare"),
+    "chart": Command(ANALYSIS, "time and memory against error, for every method", "instrument.cli.chart"),
     "stability": Command(
         ANALYSIS, "map where methods fail, against pairs of stresses", "instrument.cli.stability"
     ),

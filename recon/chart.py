@@ -1,0 +1,332 @@
+"""Speed against accuracy: every applicable setting on one problem, scored as it goes.
+
+A run is scored at several counts of iterations on the way, with the time the solver had spent by then
+without the scoring. With a ground truth the score is PSNR, SSIM and NRMSE; always also the residual relative
+to the noise, and the error on pixels that were held out: 5 % of them are erased, reconstructed from the rest
+and predicted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.auto.reduced import binned, enlarged, reduced_calibration
+from recon.noise import NoiseModel
+from recon.operators.local_convolution import field_of
+from recon.picture import reconstruct
+from recon.preparation import channel_noise, data_of
+from recon.scenes.score import score
+from recon.solvers.stopping import IterationRecord
+from recon.types import Calibration
+from recon.volume.channel import ChannelProblem, VolumePrior
+from recon.volume.model import ModelName, members_of_depths
+from recon.volume.reconstruct import prepare_volume, reconstruct_volume
+
+Array = npt.NDArray[Any]
+Measure = Literal["psnr_db", "held_out"]
+
+COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
+"""Iterations at which a run is scored."""
+HELD_SHARE = 0.05
+PICTURE_METHODS = ("admm", "admm-sensor", "fista")
+PICTURE_PRIORS: tuple[VolumePrior, ...] = ("tv", "l1", "nonnegative")
+VOLUME_PRIORS: tuple[VolumePrior, ...] = ("tv", "l1")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One way to reconstruct.
+
+    Attributes
+    ----------
+    method : str
+        A name of :func:`recon.methods.method_names`, or ``"volume"``.
+    model, prior : str
+    binning : int
+    background : bool
+        Whether a smooth one is estimated as well.
+    """
+
+    method: str
+    model: ModelName
+    prior: str
+    binning: int = 1
+    background: bool = False
+
+    @property
+    def name(self) -> str:
+        """Say it briefly."""
+        parts = [self.method, self.model, self.prior]
+        if self.background:
+            parts.append("background")
+        if self.binning > 1:
+            parts.append(f"bin {self.binning}")
+        return " ".join(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One score of one setting.
+
+    Attributes
+    ----------
+    setting : str
+        Its name.
+    iterations : int
+        0 for one-shot methods.
+    seconds : float
+        Wall time of the solver up to here.
+    residual : float
+        Norm of the residual over that of the noise, on the pixels that were used.
+    held_out : float
+        Root mean square error of the predicted held-out pixels, in units of the noise.
+    psnr_db, ssim, nrmse : float
+        Against the truth; NaN without one.
+    peak_mib : float
+        Memory at the run's peak beyond what the process took before it; NaN where it was not measured.
+    """
+
+    setting: str
+    iterations: int
+    seconds: float
+    residual: float
+    held_out: float
+    psnr_db: float = float("nan")
+    ssim: float = float("nan")
+    nrmse: float = float("nan")
+    peak_mib: float = float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it with None for what is not known."""
+        return {k: None if v != v else v for k, v in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class ChartProblem:
+    """What is reconstructed over and over.
+
+    Attributes
+    ----------
+    measurement : ndarray, (height, width)
+        One channel, counts, background subtracted.
+    calibration : Calibration
+    volume : bool
+        Whether all depths take part; else the calibration holds one depth.
+    erasures : ndarray of bool or None
+    noise : NoiseModel, float or None
+    truth : ndarray or None
+        (height, width), or (n_z, height, width).
+    """
+
+    measurement: npt.NDArray[np.float32]
+    calibration: Calibration
+    volume: bool
+    erasures: npt.NDArray[np.bool_] | None = None
+    noise: NoiseModel | float | None = None
+    truth: npt.NDArray[np.float32] | None = None
+
+
+def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
+    """Return every applicable setting, the quick ones first."""
+    varies = len(problem.calibration.psfs) > len(members_of_depths(problem.calibration.source_positions_um))
+    models: tuple[ModelName, ...] = ("convolution", "lowrank", "local") if varies else ("convolution",)
+    found: list[Setting] = []
+    for binning in _binnings(problem):
+        if not problem.volume:
+            found.append(Setting("wiener", "convolution", "none", binning))
+            found += [
+                Setting(method, "convolution", prior, binning)
+                for prior in PICTURE_PRIORS
+                for method in PICTURE_METHODS
+            ]
+        for prior in VOLUME_PRIORS:
+            for model in models:
+                for background in (False, True):
+                    if problem.volume or model != "convolution" or background:
+                        found.append(Setting("volume", model, prior, binning, background))
+    return tuple(sorted(found, key=_cost))
+
+
+def _binnings(problem: ChartProblem) -> list[int]:
+    """Return the binnings that leave enough pixels; erased ones cannot be averaged with others."""
+    largest = max(problem.measurement.shape)
+    return [1, *(b for b in (2, 4) if largest // b >= 24 and problem.erasures is None)]
+
+
+def _cost(setting: Setting) -> float:
+    """Rough order of time."""
+    slow = {"convolution": 1.0, "lowrank": 20.0, "local": 30.0}[setting.model]
+    method = {"wiener": 0.01, "admm": 1.0, "fista": 1.5, "admm-sensor": 2.0, "volume": 3.0}[setting.method]
+    return slow * method / setting.binning**2
+
+
+def run_setting(
+    problem: ChartProblem,
+    setting: Setting,
+    *,
+    limit_s: float | None = None,
+    counts: Sequence[int] = COUNTS,
+    seed: int = 0,
+) -> list[Point]:
+    """Reconstruct once and score on the way.
+
+    Parameters
+    ----------
+    limit_s : float, optional
+        Wall seconds after which the run stops.
+    counts : sequence of int
+        Iterations to score at, ascending.
+    seed : int
+        Of the pixels held out; the same for all settings that are compared.
+    """
+    judge = _Judge(problem, setting, seed)
+    points: list[Point] = []
+
+    def note(record: IterationRecord, now: Callable[[], Array]) -> None:
+        if record.iteration in counts:
+            points.append(judge.point(now(), record.iteration, record.seconds))
+
+    common: dict[str, Any] = {
+        "erasures": judge.erasures,
+        "noise": judge.noise,
+        "field": "full",
+        "iterations": counts[-1],
+        "time_s": limit_s,
+        "judged": False,
+    }
+    if setting.method == "volume":
+        reconstruct_volume(
+            judge.measurement,
+            judge.calibration,
+            prior=setting.prior,  # type: ignore[arg-type]
+            model=setting.model,
+            estimate_background=setting.background,
+            tolerance=1e-7,
+            callback=note,
+            **common,
+        )
+        return points
+    one_shot = setting.method == "wiener"
+    if one_shot:
+        common |= {"iterations": None, "time_s": None}
+    result = reconstruct(
+        judge.measurement,
+        judge.central,
+        method=setting.method,
+        model="convolution",
+        prior=setting.prior,
+        tolerance=None if one_shot else 1e-7,
+        callback=None if one_shot else note,
+        **common,
+    )
+    return [judge.point(result.image, 0, result.seconds)] if one_shot else points
+
+
+class _Judge:
+    """Holds pixels out, and scores what was found from the rest."""
+
+    def __init__(self, problem: ChartProblem, setting: Setting, seed: int) -> None:
+        self.problem, self.setting = problem, setting
+        factor = setting.binning
+        shape = problem.measurement.shape
+        kept = np.ones(shape, bool) if problem.erasures is None else ~problem.erasures
+        # Blocks of the coarsest binning, so that every setting predicts the same light.
+        block = _binnings(problem)[-1]
+        coarse = tuple(-(-n // block) for n in shape)
+        held = np.random.default_rng(seed).random(coarse) < HELD_SHARE
+        held = np.repeat(np.repeat(held, block, 0), block, 1)[: shape[0], : shape[1]]
+        self.measurement = binned(problem.measurement, factor)
+        self.calibration = reduced_calibration(problem.calibration, factor, None)
+        self.held = binned((held & kept).astype(np.float32), factor) > 0.5
+        self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
+        self.erasures = self.held | ~self.kept
+        data, valid, _ = data_of(problem.measurement, None, None if kept.all() else ~kept)
+        self.noise = channel_noise(data[0], valid[0], problem.noise) / factor
+        self._camera: ChannelProblem | None = None
+
+    @property
+    def central(self) -> Calibration:
+        positions = self.calibration.source_positions_um
+        nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
+        return replace(
+            self.calibration,
+            psfs=self.calibration.psfs[nearest : nearest + 1],
+            source_positions_um=positions[nearest : nearest + 1],
+        )
+
+    def point(self, found: Array, iterations: int, seconds: float) -> Point:
+        """Score a picture or volume of the full field."""
+        planes = found[None] if found.ndim == 2 else found
+        predicted = self._predict(planes)
+        error = (self.measurement - predicted) / self.noise
+        held, used = error[self.held & self.kept], error[~self.erasures]
+        point = Point(
+            self.setting.name,
+            iterations,
+            seconds,
+            float(np.sqrt(np.mean(used**2))),
+            float(np.sqrt(np.mean(held**2))) if held.size else float("nan"),
+        )
+        if self.problem.truth is None:
+            return point
+        seen = self._on_sensor(planes)
+        shown = enlarged(seen, self.setting.binning, self.problem.measurement.shape)
+        truth = self.problem.truth
+        marks = score(shown if self.problem.volume else shown[0], truth, volume=self.problem.volume)
+        return replace(point, psnr_db=marks.psnr_db, ssim=marks.ssim, nrmse=marks.nrmse)
+
+    def _on_sensor(self, planes: Array) -> Array:
+        height, width = self.measurement.shape
+        (_, (row, column)) = field_of((height, width), self.calibration.psfs.shape[2:])
+        top, left = row - height // 2, column - width // 2
+        return planes[:, top : top + height, left : left + width]
+
+    def _predict(self, planes: Array) -> Array:
+        """Return the measurement that the setting's own model makes of what was found."""
+        camera = self._problem()
+        full = tuple(
+            s + p - 1 for s, p in zip(self.measurement.shape, self.calibration.psfs.shape[2:], strict=True)
+        )
+        window = (slice(0, full[0]), slice(0, full[1]))
+        placed = camera.start(planes, window)
+        predicted: Array = camera.camera.forward(placed)[0]
+        if self.setting.background:
+            predicted = predicted + camera.background(placed)
+        return predicted * np.float32(self.noise)
+
+    def _problem(self) -> ChannelProblem:
+        if self._camera is None:
+            scaled = prepare_volume(
+                self.measurement,
+                self.central if self.setting.method != "volume" else self.calibration,
+                None,
+                self.erasures,
+                self.noise,
+            )
+            self._camera = ChannelProblem(
+                scaled,
+                0,
+                self.setting.model,
+                smooth=self.setting.background,
+                prior="nonnegative",
+                weights=np.ones((len(scaled.depths.z_um), 3)),
+            )
+        return self._camera
+
+
+def pareto(points: Iterable[Point], measure: Measure) -> list[Point]:
+    """Return the points that no other is both quicker and better than, the quickest first."""
+    better = 1.0 if measure == "psnr_db" else -1.0
+    front: list[Point] = []
+    best = -np.inf
+    for point in sorted(points, key=lambda p: (p.seconds, -better * getattr(p, measure))):
+        value = better * getattr(point, measure)
+        if value > best:
+            front.append(point)
+            best = value
+    return front

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.chart import ChartProblem, Point, Setting, pareto, run_setting, settings_for
+from recon.scenes import make_scene
+
+
+def problem(family="sparse-picture", **changes):
+    scene = make_scene(family, size=32, **changes)
+    return ChartProblem(
+        scene.measurement,
+        scene.calibration,
+        not scene.spec.is_picture,
+        scene.erasures,
+        scene.noise,
+        scene.truth,
+    )
+
+
+def test_scores_come_on_the_way_and_get_better():
+    points = run_setting(problem(), Setting("admm", "convolution", "tv"), counts=(2, 10, 40))
+    assert [p.iterations for p in points] == [2, 10, 40]
+    assert points[0].seconds < points[1].seconds < points[2].seconds
+    assert points[0].psnr_db < points[2].psnr_db
+    assert points[0].held_out > points[2].held_out
+    assert points[2].held_out > points[2].residual
+
+
+def test_held_out_pixels_were_not_looked_at():
+    """A pixel that was used would be predicted about as well as the others."""
+    whole = problem()
+    garbled = ChartProblem(
+        whole.measurement + np.float32(0), whole.calibration, False, None, whole.noise, whole.truth
+    )
+    from recon.chart import _Judge
+
+    judge = _Judge(garbled, Setting("admm", "convolution", "nonnegative"), 0)
+    assert 0.02 < judge.held.mean() < 0.1
+    spoilt = whole.measurement.copy()
+    spoilt[judge.held] = 1e5
+    points = [
+        run_setting(
+            ChartProblem(m, whole.calibration, False, None, 5.0, whole.truth),
+            Setting("admm", "convolution", "tv"),
+            counts=(20,),
+        )[0]
+        for m in (whole.measurement, spoilt)
+    ]
+    assert points[0].psnr_db == pytest.approx(points[1].psnr_db, abs=1e-3)
+    assert points[1].held_out > 100 * points[0].held_out
+
+
+def test_settings_fit_the_problem():
+    single = settings_for(problem())
+    assert {s.model for s in single} == {"convolution"}
+    assert single[0].method == "wiener"
+    varying = settings_for(problem(grid=3))
+    assert {s.model for s in varying} == {"convolution", "lowrank", "local"}
+    volume = settings_for(problem("beads", depths=3))
+    assert {s.method for s in volume} == {"volume"}
+    assert len({s.name for s in varying}) == len(varying)
+    assert not any(s.binning > 1 for s in settings_for(problem(erased=0.2)))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        Setting("wiener", "convolution", "none"),
+        Setting("fista", "convolution", "l1"),
+        Setting("volume", "lowrank", "l1", 1, True),
+    ],
+)
+def test_kinds_of_settings_run(setting):
+    points = run_setting(problem(grid=3), setting, counts=(3,))
+    assert len(points) == 1
+    assert np.isfinite([points[0].psnr_db, points[0].held_out, points[0].ssim]).all()
+
+
+def test_the_front_is_what_nothing_beats():
+    made = [
+        Point("slow good", 1, 9.0, 1.0, 1.0, 30.0),
+        Point("slow bad", 1, 8.0, 1.0, 4.0, 20.0),
+        Point("quick", 1, 1.0, 1.0, 2.0, 25.0),
+        Point("same time, worse", 1, 1.0, 1.0, 3.0, 24.0),
+    ]
+    assert [p.setting for p in pareto(made, "psnr_db")] == ["quick", "slow good"]
+    assert [p.setting for p in pareto(made, "held_out")] == ["quick", "slow good"]
