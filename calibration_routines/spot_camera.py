@@ -34,7 +34,9 @@ class SpotLook:
     spots : tuple of Spot
         Places in the field of view, and the poses they were computed for.
     brightness : ndarray, float64, (n,)
-        In units of an ideal spot.
+        In units of an ideal spot; for sections' spots all of their light, in arbitrary units.
+    of_whole_slm : bool
+        Whether each spot is made by the whole SLM, not by a section of it.
     """
 
     frame: Array
@@ -42,6 +44,7 @@ class SpotLook:
     columns: Array
     spots: tuple[Spot, ...]
     brightness: Array
+    of_whole_slm: bool
 
 
 class SpotCamera:
@@ -201,7 +204,8 @@ class SpotCamera:
         captured = self._captured(window, lobes)
         brightness = found / (self._spot_area() * captured * (np.sinc(y) * np.sinc(x)) ** 2)
         if self._on_look is not None:
-            self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal))
+            whole = all(spot.section is None for spot in spots)
+            self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
         return brightness, float(np.median(around))
 
     def _ask(self) -> None:

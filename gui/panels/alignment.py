@@ -59,6 +59,7 @@ class AlignmentPanel(ProcedurePanel):
         self.after = DisplacementPlot("After")
         self.pose = PoseView()
         super().__init__(session, [ALIGNMENT], "Align", parent)
+        self._older: Any = self.score.plot([], [])
         self._points: Any = self.score.plot([], [])
         self._best: Any = self.progress.plot([], [])
         self._rings: Any = pg.ScatterPlotItem()
@@ -79,7 +80,7 @@ class AlignmentPanel(ProcedurePanel):
         self._first: SpotLook | None = None
         self._newest: SpotLook | None = None
         self._tried = ""
-        self._scores: list[tuple[float, float]] = []
+        self._scores: list[list[tuple[float, float]]] = []
         self._brightest: list[float] = []
         self.run.look.connect(self._looked_at)
         self.theme_changed()
@@ -123,40 +124,38 @@ class AlignmentPanel(ProcedurePanel):
         foot.addWidget(self.before_button)
         foot.addWidget(self.now_button)
         column.addLayout(foot)
+        plots = QSplitter()
+        plots.addWidget(self.score)
+        plots.addWidget(self.progress)
         search = QSplitter(Qt.Orientation.Vertical)
-        search.addWidget(self.score)
-        search.addWidget(self.progress)
-        search.setSizes([260, 160])
+        search.addWidget(picture)
+        search.addWidget(plots)
+        search.setSizes([340, 240])
+        search.setChildrenCollapsible(False)
         fields = QSplitter(Qt.Orientation.Vertical)
         fields.addWidget(self.before.plot)
         fields.addWidget(self.after.plot)
-        found = QSplitter()
-        found.addWidget(fields)
-        found.addWidget(self.pose)
-        found.setSizes([500, 500])
         self.tabs = QTabWidget()
         self.tabs.setDocumentMode(True)
-        self.tabs.addTab(search, "Score against hypothesis")
-        self.tabs.addTab(found, "Displacement and pose")
-        split = QSplitter()
-        split.addWidget(picture)
-        split.addWidget(self.tabs)
-        split.setSizes([480, 620])
-        split.setChildrenCollapsible(False)
-        return split
+        self.tabs.addTab(search, "Spots and scores")
+        self.tabs.addTab(fields, "Displacement")
+        self.tabs.addTab(self.pose, "Pose")
+        return self.tabs
 
     def _looked_at(self, look: SpotLook) -> None:
         self._newest = look
         self._first = self._first or look
+        if not look.of_whole_slm:  # sections' spots are another measure
+            self._show_spots()
+            return
         tried = _tried_most(look)
         if tried != self._tried:
             self._tried, self._scores = tried, []
         poses = [spot.pose for spot in look.spots]
         if tried:
-            self._scores += [
-                (float(getattr(pose, tried)), float(score))
-                for pose, score in zip(poses, look.brightness, strict=True)
-            ]
+            self._scores.append(
+                [(float(getattr(p, tried)), float(b)) for p, b in zip(poses, look.brightness, strict=True)]
+            )
         self._brightest.append(float(look.brightness.max()))
         self._draw_plots()
         self._show_spots()
@@ -172,22 +171,25 @@ class AlignmentPanel(ProcedurePanel):
         ring, warning = pg.mkPen(colours().accent, width=1), pg.mkPen(colours().warning, width=2)
         pens = [warning if n == best else ring for n in range(len(look.spots))]
         self._rings.setData(x=look.columns + 0.5, y=look.rows + 0.5, size=14, brush=None, pen=pens)
-        brightest = f"the brightest at {look.brightness[best]:.0%} of the ideal"
-        self.spot_words.setText(f"{len(look.spots)} spots, each a hypothesis; {brightest}")
+        brightest = (
+            f", the brightest at {look.brightness[best]:.0%} of the ideal" if look.of_whole_slm else ""
+        )
+        self.spot_words.setText(f"{len(look.spots)} spots{brightest}")
+        self.spot_words.setToolTip("Each spot is a hypothesis about the mask's pose")
 
     def _draw_plots(self) -> None:
-        x, y = (np.array(values) for values in zip(*self._scores, strict=True)) if self._scores else ([], [])
-        dots = {
-            "symbol": "o",
-            "symbolSize": 5,
-            "symbolPen": None,
-            "symbolBrush": pg.mkBrush(colours().accent),
-        }
-        self._points.setData(x, y, pen=None, **dots)
+        dots = {"symbol": "o", "symbolSize": 5, "symbolPen": None}
+        accent, dim = pg.mkBrush(colours().accent), pg.mkBrush(colours().line)
+        older = [point for points in self._scores[:-1] for point in points]
+        for curve, points, brush in (
+            (self._older, older, dim),
+            (self._points, self._scores[-1] if self._scores else [], accent),
+        ):
+            x, y = np.array(points, float).reshape(-1, 2).T
+            curve.setData(x, y, pen=None, symbolBrush=brush, **dots)
         self.score.setLabel("bottom", _TRIED.get(self._tried, "hypothesis"))
-        self._best.setData(
-            np.arange(1, len(self._brightest) + 1), np.array(self._brightest), pen=curve_pen(), **dots
-        )
+        taken = np.arange(1, len(self._brightest) + 1)
+        self._best.setData(taken, np.array(self._brightest), pen=curve_pen(), symbolBrush=accent, **dots)
 
 
 def _tried_most(look: SpotLook) -> str:

@@ -127,14 +127,15 @@ class RunsPanel(Panel):
         stored = sorted(run.records)
         self.slider.setEnabled(len(stored) > 1)
         self.slider.setRange(0, max(0, len(stored) - 1))
-        self.slider.setValue(0)
+        middle = len(stored) // 2  # the first ones are dark
+        self.slider.setValue(middle)
         self.about.setPlainText("\n".join(_about(run)))
         goes_on = run.plan is not None and run.condition not in (RunCondition.RUNNING,)
         self._can_resume = goes_on and (bool(run.missing()) or _lacks_calibration(run.path))
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
         self.use_button.setEnabled((path / FOLDER).is_dir())
-        self._show_frame(0)
+        self._show_frame(middle)
 
     def as_python(self) -> str:
         """Return lines that read the run, or go on with it where it did not end."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
-import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QColor
@@ -26,8 +25,6 @@ _COLUMNS = (
     ("off (px)", "Distance from where the others, or the stage, say the pattern is"),
     ("verdict", "What is wrong; the whole text as tool tip"),
 )
-_LEAST_SHOWN = 0.1
-"""Signal to noise has a logarithmic axis."""
 _VERDICT = len(_COLUMNS) - 1
 
 
@@ -58,10 +55,9 @@ class PsfTable(QWidget):
         header.setSectionResizeMode(_VERDICT, QHeaderView.ResizeMode.Stretch)
         self.table.currentCellChanged.connect(lambda row, *_: self.chosen.emit(row))
         self.plot: Any = plot_widget("PSF", "signal / noise")
-        self.plot.setLogMode(y=True)
         self.plot.setMinimumHeight(90)
         self._points: Any = self.plot.plot([], [])
-        self._least: Any = pg.InfiniteLine(angle=0, pos=np.log10(MIN_SNR))
+        self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
         self.plot.addItem(self._least)
         self._qualities: list[PsfQuality | None] = []
         split = QSplitter(Qt.Orientation.Vertical)
@@ -129,7 +125,7 @@ class PsfTable(QWidget):
         brushes = [pg.mkBrush(colours().warning if q.findings else colours().ok) for _, q in known]
         self._points.setData(
             [number for number, _ in known],
-            [max(q.snr, _LEAST_SHOWN) for _, q in known],
+            [q.snr for _, q in known],
             pen=pg.mkPen(colours().line),
             symbol="o",
             symbolSize=7,
