@@ -403,8 +403,13 @@ class LivePanel(Panel):
 
     def _light_the_scene(self) -> None:
         """Begin with something to see, where the simulated world can light it by itself."""
-        if self.session.config.scene.control == "simulated" and self.light is Light.DARK:
+        if self.session.config.scene.control != "simulated" or self.light is not Light.DARK:
+            return
+        if "led_array" in self.session.kinds:
             self.switch_light(Light.SCENE)
+        else:  # nobody is asked to darken a point source that may not be there
+            job = self.session.device_job("Light: scene", lambda _: self.session.bench.scene_on(), {"light"})
+            self.tells(job).ended.connect(self._show_light)
 
     def _show_light(self) -> None:
         now = self.light
