@@ -28,7 +28,6 @@ def run(config: BenchConfig) -> int:
     settings = QSettings("diffuserbench", "diffuserbench")
     apply_theme(app, theme_of(settings))
     session = BenchSession(config)
-    window = MainWindow(session, settings)
     sys.excepthook = _ToLog(session)
     waker = QTimer()
     waker.timeout.connect(lambda: None)
@@ -39,6 +38,7 @@ def run(config: BenchConfig) -> int:
         session.stop()
         session.close()
 
+    # Before the window is made: Python's own KeyboardInterrupt would get lost in one of Qt's callbacks.
     before = {}
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
@@ -46,8 +46,10 @@ def run(config: BenchConfig) -> int:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, end)
     try:
+        window = MainWindow(session, settings)
         window.show()
-        session.open()
+        if not session.is_closing:
+            session.open()
         status = app.exec()
         session.join()
     finally:

@@ -345,6 +345,11 @@ class BenchSession(QObject):
         if self._live_wanted and not self._closing:
             self.start_live()
 
+    @property
+    def is_closing(self) -> bool:
+        """Whether the end has begun."""
+        return self._closing
+
     # The end -------------------------------------------------------------------------------------
     def close(self) -> None:
         """End safely: jobs cancelled, light off, motion stopped, devices closed; ``closed`` follows."""

@@ -136,6 +136,12 @@ class Recorder:
         KeyboardInterrupt, SystemExit
             After the run was marked as aborted and the bench made safe.
         """
+        try:
+            return self._execute()
+        finally:
+            self._stream = None  # its buffers go at once, whoever keeps the recorder
+
+    def _execute(self) -> Run:
         stream = self._stream = FrameStream(self._bench.camera, self.n_buffers)
         reader = stream.reader()
         try:
