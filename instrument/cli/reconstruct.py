@@ -33,6 +33,7 @@ from instrument.cli.reconstruct_options import (
     ModelOption,
     NoiseOption,
     OutOption,
+    OverTimeOption,
     PositiveBackgroundOption,
     PriorOption,
     PsfOption,
@@ -112,6 +113,7 @@ def reconstruct(
     video: VideoOption = False,
     warm: WarmOption = None,
     block: BlockOption = None,
+    over_time: OverTimeOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     fps: FpsOption = None,
@@ -148,6 +150,7 @@ def reconstruct(
         "RUN": run is not None,
         "--warm": warm is not None,
         "--block": block is not None,
+        "--over-time": over_time is not None,
         "--workers": workers is not None,
         "--scheduler": scheduler is not None,
         "--fps": fps is not None,
@@ -173,11 +176,17 @@ def reconstruct(
         }
         if given := [option for option, is_given in no_videos.items() if is_given]:
             raise BenchError(f"With --video these do not apply: {', '.join(given)}. Leave them out.")
-        if run is None:
-            raise BenchError("--video needs a recording: diffuserbench reconstruct RUN --video ...")
         from instrument.cli.video import reconstruct_to_video
         from instrument.video.reconstruction import VideoRequest
+        from recon.video.joint import OVER_TIME
 
+        chosen = next((name for name in OVER_TIME if name == over_time), None)
+        if over_time is not None and chosen is None:
+            raise BenchError(f"--over-time {over_time!r} is not known; choose one of {', '.join(OVER_TIME)}.")
+        if chosen is not None and warm is not None:
+            raise BenchError("--warm does not apply with --over-time: frames are solved together.")
+        if run is None:
+            raise BenchError("--video needs a recording: diffuserbench reconstruct RUN --video ...")
         reconstruct_to_video(
             VideoRequest(
                 run=run,
@@ -189,7 +198,9 @@ def reconstruct(
                 rotate_deg=int(rotate),
                 fps=fps,
                 film=film,
-                **{k: v for k, v in (("warm_iterations", warm), ("block", block)) if v is not None},
+                block=block,
+                over_time=chosen,
+                **({} if warm is None else {"warm_iterations": warm}),
             ),
             workers=workers,
             scheduler=scheduler,

@@ -74,7 +74,16 @@ BlockOption = Annotated[
         "--block",
         min=1,
         metavar="N",
-        help="Of a video: frames that hang together. Default: 32.",
+        help="Of a video: frames that hang together. Default: 32, with --over-time 16.",
+        show_default=False,
+    ),
+]
+OverTimeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--over-time",
+        metavar="tv|lowrank",
+        help="Of a video: a prior over time, frames of a block solved together.",
         show_default=False,
     ),
 ]

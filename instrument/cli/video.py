@@ -28,10 +28,13 @@ def reconstruct_to_video(
     plan = prepared.job.plan
     if plan.settings["simulated"]:
         typer.echo("SIMULATED   recording or PSF come from the simulated bench")
-    typer.echo(
-        f"{'Video':<12}{len(plan.frames)} frames in {len(prepared.job.blocks)} blocks of {plan.block}: "
+    how = (
         f"{plan.cold_iterations} iterations for the first of a block, {plan.warm_iterations} for the others"
+        if plan.over_time is None
+        else f"{plan.cold_iterations} iterations, prior over time {plan.over_time}"
     )
+    blocks = f"{len(prepared.job.blocks)} blocks of {plan.block}"
+    typer.echo(f"{'Video':<12}{len(plan.frames)} frames in {blocks}: {how}")
     for warning in prepared.warnings:
         typer.echo(f"Warning: {warning}", err=True)
     if prepared.resumed:

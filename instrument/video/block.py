@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,8 @@ from instrument.video.job import VideoJob
 from instrument.video.output import VideoPictures
 from recon.threads import set_threads
 from recon.video import VideoSolver
+from recon.video.joint import solve_together
+from recon.video.solver import Floats
 
 _kept = threading.local()
 """A thread's last job with its solver, whose arrays are dear to make: ``(folder, plan, job, solver)``."""
@@ -68,23 +70,37 @@ def solve_block(
     if threads is not None:
         set_threads(threads)
     job, solver = _solver_for(Path(job_folder))
+    plan = job.plan
     if job.is_done(number):
         return BlockReport(number, 0, 0, time.perf_counter() - began_s)
     pictures = VideoPictures(Path(output), write=True)
-    frames = FrameArray(Path(job.plan.run) / FRAMES)
+    frames = FrameArray(Path(plan.run) / FRAMES)
     reduction = job.reduction
     block = job.blocks[number]
-    solver.begin()
     written = 0
+    if plan.over_time is None or len(block) == 1:
+        solved = _one_by_one(solver, (reduction.apply(frames.read(index)) for index in block))
+    else:
+        stack = np.stack([reduction.apply(frames.read(index)) for index in block])
+        together = solve_together(
+            solver.camera, stack, plan.over_time, iterations=plan.cold_iterations, ended=ended
+        )
+        solved = iter([] if together is None else together)
     for index in block:
-        if ended():
+        picture = None if ended() else next(solved, None)
+        if picture is None:
             raise CancelledError
-        picture = solver.next(reduction.apply(frames.read(index)))
         if not pictures.is_written(index):
-            pictures.write(index, np.ascontiguousarray(np.rot90(picture, job.plan.rotate_deg // 90)))
+            pictures.write(index, np.ascontiguousarray(np.rot90(picture, plan.rotate_deg // 90)))
             written += 1
     job.mark_done(number)
     return BlockReport(number, len(block), written, time.perf_counter() - began_s)
+
+
+def _one_by_one(solver: VideoSolver, frames: Iterable[Floats]) -> Iterator[Floats]:
+    solver.begin()
+    for frame in frames:
+        yield solver.next(frame)
 
 
 def _solver_for(folder: Path) -> tuple[VideoJob, VideoSolver]:

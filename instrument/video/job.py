@@ -29,6 +29,7 @@ from instrument.plain_json import plain
 from instrument.preparation import Crop
 from instrument.reconstruction_job import Reduction
 from recon.video import VideoCamera, blocks_of
+from recon.video.joint import OverTimeName
 
 FORMAT = 1
 _JSON, _CAMERA, _DONE = "job.json", "camera.npz", "done"
@@ -49,6 +50,8 @@ class VideoPlan:
     block : int
         Frames a block, by number.
     cold_iterations, warm_iterations : int
+    over_time : str or None
+        A prior over time, with which the frames of a block are solved together (then ``cold_iterations``).
     rotate_deg : int
         By how much pictures are turned, counter-clockwise.
     picture_shape : tuple of int
@@ -63,6 +66,7 @@ class VideoPlan:
     block: int
     cold_iterations: int
     warm_iterations: int
+    over_time: OverTimeName | None
     rotate_deg: int
     picture_shape: tuple[int, ...]
     settings: dict[str, Any]

@@ -28,6 +28,7 @@ from instrument.video.mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, writ
 from instrument.video.output import VideoPictures, create_output
 from instrument.volume_zarr import is_zarr_name
 from recon.video import PRIORS, video_camera
+from recon.video.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
 from recon.video.solver import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS
 
 
@@ -49,8 +50,11 @@ class VideoRequest:
         would make pictures depend on the machine: they do not apply.
     warm_iterations : int
         Of the frames after a block's first.
-    block : int
-        Frames a block.
+    block : int or None
+        Frames a block; None: 32, with a prior over time 16.
+    over_time : "tv", "lowrank" or None
+        A prior that joins the frames of a block (:mod:`recon.video.joint`); then every frame has the
+        ``iterations``, 60 by default.
     rotate_deg : int
     fps : float or None
         Of the film; None: the recording's own rate, else 25.
@@ -65,7 +69,8 @@ class VideoRequest:
     z_um: float | None = None
     settings: Settings = field(default_factory=Settings)
     warm_iterations: int = WARM_ITERATIONS
-    block: int = BLOCK
+    block: int | None = None
+    over_time: OverTimeName | None = None
     rotate_deg: int = 0
     fps: float | None = None
     film: bool = True
@@ -149,13 +154,17 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
         crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
         reduction = replace(reduction, crop=crop)
+    if request.over_time is not None and not camera.flat:
+        raise BenchError("--over-time takes grey recordings.")
+    usual = COLD_ITERATIONS if request.over_time is None else JOINT_ITERATIONS
     plan = VideoPlan(
         run=str(run.path.resolve()),
         frames=frames,
         n_frames=run.n_frames,
-        block=request.block,
-        cold_iterations=settings.iterations or COLD_ITERATIONS,
+        block=request.block or (BLOCK if request.over_time is None else JOINT_BLOCK),
+        cold_iterations=settings.iterations or usual,
         warm_iterations=request.warm_iterations,
+        over_time=request.over_time,
         rotate_deg=request.rotate_deg,
         picture_shape=picture.measurement.shape,
         settings=_settings(request, picture, camera.weight),

@@ -192,13 +192,18 @@ class SensorAdmm(Solver):
             self._adapt()
             self._splits.sweep(0)
         steps = self.data_steps if self.iteration else max(self.data_steps, FIRST_DATA_STEPS)
+        misfit = self._update(steps)
+        primal, dual, change = self._splits.residuals()
+        data = float(np.sqrt(misfit)) if np.isfinite(misfit) else np.inf
+        return IterationRecord(0, 0.0, 0.5 * data**2 + self._splits.value(), data, primal, dual, change)
+
+    def _update(self, steps: int) -> float:
+        """Update objects and splits; return the squared data residual."""
         misfit = 0.0
         for channel in range(len(self._y)):  # one after the other, so that the caches hold it
             misfit += self._solve(channel, steps)
             self._splits.sweep(self.relax, channel)
-        primal, dual, change = self._splits.residuals()
-        data = float(np.sqrt(misfit)) if np.isfinite(misfit) else np.inf
-        return IterationRecord(0, 0.0, 0.5 * data**2 + self._splits.value(), data, primal, dual, change)
+        return misfit
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint taken from a solver of the same problem."""
@@ -215,7 +220,7 @@ class SensorAdmm(Solver):
         E, Y, P = self._E[channel], self._Y, self._P
         H = self._spectrum[channel % len(self._spectrum)]
         weight = self._weight[channel]
-        T = (self._laplace_rows, self._laplace_columns, *self._mu[:, channel].astype(y.dtype))
+        T = (self._laplace_rows, self._laplace_columns, *self._quadratic(channel).astype(y.dtype))
         kernels, columns = self._kernels, slice(self._left, self._left + p.shape[1])
 
         fft.rfft(y, out=Y)
@@ -258,8 +263,17 @@ class SensorAdmm(Solver):
 
     def _adapt(self) -> None:
         """Tell the preconditioners of new penalties."""
-        for preconditioner, mu in zip(self._preconditioners, self._mu.T, strict=True):
-            preconditioner.set_penalties(*mu)
+        for channel, preconditioner in enumerate(self._preconditioners):
+            preconditioner.set_penalties(*self._quadratic(channel))
+
+    def _quadratic(self, channel: int) -> Array:
+        """Return the penalties of differences and of pixels in the quadratic problem."""
+        penalties: Array = self._mu[:, channel] + np.array([0.0, self._extra_penalty()])
+        return penalties
+
+    def _extra_penalty(self) -> float:
+        """Return what a subclass' split of the object itself adds to the pixels' penalty."""
+        return 0.0
 
     def _first_penalties(self) -> Array:
         """Guess penalties from the object's mean, which the data tells through the PSF's sum."""

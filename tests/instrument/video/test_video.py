@@ -217,6 +217,15 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) 
         pass
 
 
+@pytest.mark.parametrize("over_time", ["tv", "lowrank"])
+def test_with_a_prior_over_time(recording: Path, video: Path, tmp_path: Path, over_time: str) -> None:
+    solved(request(recording, tmp_path, over_time=over_time, film=False))
+    stack, alone = pictures(tmp_path), pictures(video)
+    there = [t for t in range(11) if t != MISSING]
+    assert np.isnan(stack[MISSING]).all()
+    assert 15 < psnr(stack[there], alone[there]) < 60  # like, but not the same
+
+
 def test_turned_cropped_binned(recording: Path, tmp_path: Path) -> None:
     settings = Settings(dark=20.0, binning=2, iterations=3)
     solved(request(recording, tmp_path, rotate_deg=90, film=False, settings=settings, warm_iterations=1))

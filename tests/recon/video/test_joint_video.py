@@ -1,0 +1,160 @@
+"""Priors over time: each prox against a plain minimiser, the joint solver against its problem."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from recon import InputError
+from recon.operators import PadCropConvolution
+from recon.priors import NonNegativity, TotalVariation
+from recon.solvers import SensorAdmm
+from recon.video import video_camera
+from recon.video.joint import JointAdmm, OverTimeName, solve_together
+from recon.video.over_time import LowRankPlusSparse, TemporalTotalVariation
+
+
+def dual_minimum(course: np.ndarray, threshold: float) -> np.ndarray:
+    """Total variation denoising by its dual, box-constrained least squares."""
+    n = len(course)
+    D = np.diff(np.eye(n), axis=0)
+    found = minimize(
+        lambda p: 0.5 * np.sum((course - D.T @ p) ** 2),
+        np.zeros(n - 1),
+        jac=lambda p: -D @ (course - D.T @ p),
+        bounds=[(-threshold, threshold)] * (n - 1),
+        method="L-BFGS-B",
+        options={"ftol": 1e-15, "gtol": 1e-12, "maxiter": 5000},
+    )
+    return course - D.T @ found.x
+
+
+@given(
+    st.lists(st.floats(-5, 5, allow_nan=False, width=32), min_size=2, max_size=14),
+    st.floats(0.01, 4),
+)
+@settings(max_examples=60, deadline=None)
+def test_temporal_total_variation_is_denoised_exactly(values: list[float], threshold: float) -> None:
+    stack = np.array(values)[:, None, None]
+    found = TemporalTotalVariation(2.0).prox(stack, threshold / 2)
+    np.testing.assert_allclose(found[:, 0, 0], dual_minimum(stack[:, 0, 0], threshold), atol=2e-4)
+
+
+def test_temporal_total_variation_of_whole_stacks() -> None:
+    stack = np.random.default_rng(0).standard_normal((9, 5, 7))
+    found = TemporalTotalVariation(1.0).prox(stack, 0.3)
+    for row, column in np.ndindex(5, 7):
+        np.testing.assert_allclose(found[:, row, column], dual_minimum(stack[:, row, column], 0.3), atol=2e-4)
+    assert TemporalTotalVariation(2.0).value(stack) == pytest.approx(2 * np.abs(np.diff(stack, axis=0)).sum())
+
+
+def test_low_rank_plus_sparse_settles_at_the_minimum_and_tells_the_parts() -> None:
+    rng = np.random.default_rng(0)
+    background = np.outer(np.linspace(1, 2, 12), rng.uniform(1, 2, 400)).reshape(12, 20, 20)
+    activity = np.zeros((12, 20, 20))
+    activity[4, 5, 6], activity[8:10, 12, 3] = 3, 2
+    prior = LowRankPlusSparse(2.0, 0.3)
+    stack = background + activity
+    for _ in range(200):
+        found = prior.prox(stack, 0.5)
+    assert prior.sparse is not None
+    assert set(zip(*np.nonzero(np.abs(prior.sparse) > 0.5), strict=True)) == {
+        (4, 5, 6),
+        (8, 12, 3),
+        (9, 12, 3),
+    }
+    # Optimality: the rest is a subgradient of both norms.
+    rest = (stack - found) / 0.5
+    singular = np.linalg.svd(rest.reshape(12, -1), compute_uv=False)
+    assert singular[0] == pytest.approx(2.0, rel=1e-2)
+    assert np.abs(rest).max() == pytest.approx(0.3, rel=1e-2)
+
+
+def problem(n_frames: int = 4) -> tuple[PadCropConvolution, np.ndarray]:
+    rng = np.random.default_rng(1)
+    psf = rng.random((1, 12, 14)) ** 6
+    psf /= np.linalg.norm(psf)
+    camera = PadCropConvolution(psf, (12, 14), n_channels=n_frames, dtype=np.float64)
+    scene = np.zeros(camera.domain_shape)
+    scene[:, 8:14, 9:16] = 5
+    scene[2:, 10:12, 11:13] += 6
+    return camera, camera.forward(scene) + 0.3 * rng.standard_normal(camera.range_shape)
+
+
+def test_without_weight_over_time_frames_are_what_they_are_alone() -> None:
+    camera, data = problem()
+    prior = TotalVariation(0.3) + NonNegativity()
+    alone, joint = (
+        SensorAdmm(camera, data, prior),
+        JointAdmm(camera, data, prior, TemporalTotalVariation(0.0)),
+    )
+    for _ in range(300):
+        alone.advance()
+        joint.advance()
+    np.testing.assert_allclose(joint.solution, alone.solution, atol=2e-3 * alone.solution.max())
+
+
+@pytest.mark.parametrize("over_time", [TemporalTotalVariation(0.5), LowRankPlusSparse(4.0, 0.4)])
+def test_the_joint_solver_reaches_a_minimum(over_time: TemporalTotalVariation | LowRankPlusSparse) -> None:
+    camera, data = problem()
+    joint = JointAdmm(camera, data, NonNegativity(), over_time)
+    for _ in range(700):
+        joint.advance()
+    x = joint.solution
+    np.testing.assert_allclose(joint._split, x, atol=1e-3 * x.max())
+
+    def value(at: np.ndarray) -> float:
+        if isinstance(over_time, LowRankPlusSparse):
+            # The value of an infimal convolution, by its own prox run to the end at a tiny step.
+            fresh = LowRankPlusSparse(over_time.weight_rank, over_time.weight_sparse)
+            for _ in range(400):
+                fresh.prox(at, 1e-2)
+            prior = fresh.value(at)
+        else:
+            prior = over_time.value(at)
+        return 0.5 * float(np.sum((camera.forward(at) - data) ** 2)) + prior
+
+    best = value(x)
+    rng = np.random.default_rng(2)
+    for size in (1e-2, 1e-1, 1.0):
+        for _ in range(5):
+            other = np.maximum(x + size * rng.standard_normal(x.shape) * (rng.random(x.shape) < 0.2), 0)
+            assert value(other) > best - 1e-3 * abs(best)
+
+
+def test_time_helps_where_frames_are_alike() -> None:
+    rng = np.random.default_rng(0)
+    psf = (rng.random((24, 28)) ** 8).astype(np.float32)
+    scene = np.zeros((24, 28), np.float32)
+    scene[8:14, 9:16] = 1
+    wide = PadCropConvolution(psf[None], (24, 28))
+    whole = np.zeros(wide.domain_shape, np.float32)
+    top, left = wide.centre[0] - 12, wide.centre[1] - 14
+    whole[0, top : top + 24, left : left + 28] = scene
+    clean = wide.forward(whole)[0]
+    frames = (clean + 0.1 * clean.max() * rng.standard_normal((8, 24, 28))).astype(np.float32)
+    camera = video_camera(frames[0], psf)
+
+    def error(name: OverTimeName, weight: float) -> float:
+        found = solve_together(camera, frames, name, weight=weight)
+        assert found is not None
+        return float(np.mean((found - scene) ** 2))
+
+    alone = error("tv", 0.0)
+    assert error("tv", 1.0) < 0.8 * alone
+    assert error("lowrank", 1.0) < 1.2 * alone  # it takes some of the background's light
+    assert error("lowrank", 30.0) > 2 * alone
+    assert solve_together(camera, frames, "tv", ended=lambda: True) is None
+
+
+def test_colour_and_single_frames_are_refused() -> None:
+    frames = np.random.default_rng(0).random((3, 20, 20, 3)).astype(np.float32)
+    camera = video_camera(frames[0], frames[0, ..., 0] ** 4)
+    with pytest.raises(InputError, match="grey"):
+        solve_together(camera, frames, "tv")
+    grey = video_camera(frames[0, ..., 0], frames[0, ..., 0] ** 4)
+    with pytest.raises(InputError, match="two frames"):
+        solve_together(grey, frames[:1, ..., 0], "tv")
