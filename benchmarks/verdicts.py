@@ -1,6 +1,6 @@
 """How often is a reconstruction called reliable that failed? Verdicts on unseen simulated scenes.
 
-    python benchmarks/verdicts.py --count 150 --keep verdicts.jsonl --out docs/benchmarks/verdicts.md
+    python benchmarks/verdicts.py --count 100 --keep verdicts.jsonl --out docs/benchmarks/verdicts.md
     python benchmarks/verdicts.py --count 0 --keep verdicts.jsonl        judge what was kept once more
 
 Scenes of all five families, with seeds, diffusers (random and regular lenslets, smooth) and combinations of
@@ -31,6 +31,8 @@ from recon.verdict.judge import verdict_on
 from recon.verdict.verdict import Region
 
 FIRST_SEED = 50_000
+TUNED_BELOW = 389
+"""Scenes before this one served to set the thresholds; those from it on are reported apart."""
 PICTURE_METHODS, VOLUME_METHODS = ("admm tv", "admm l1", "wiener"), ("volume tv", "volume l1")
 
 
@@ -135,33 +137,38 @@ def main() -> None:
     """Run, judge, tabulate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=150, help="scenes to add")
-    parser.add_argument("--first", type=int, default=0, help="the first one's number")
+    parser.add_argument("--first", type=int, default=389, help="the first one's number")
     parser.add_argument("--keep", type=Path, default=Path("verdicts.jsonl"))
     parser.add_argument("--out", type=Path)
     a = parser.parse_args()
     set_threads(1)
     run(a.first, a.count, a.keep)
     entries = [json.loads(line) for line in a.keep.read_text(encoding="utf-8").splitlines()]
-    lines, figures = table(entries)
+    held_out = [e for e in entries if e["index"] >= TUNED_BELOW]
+    lines, figures = table(held_out)
+    before, _ = table([e for e in entries if e["index"] < TUNED_BELOW])
     print("\n".join(lines))
     print(
         f"called reliable but failed: {figures['wrong']:.1%}; "
         f"good ones called reliable: {figures['kept']:.1%}"
     )
     if a.out is not None:
-        scenes = len({e["index"] for e in entries})
+        scenes = len({e["index"] for e in held_out})
         head = [
             "# Verdicts on unseen scenes",
             "",
-            "    python benchmarks/verdicts.py --count 150 --out docs/benchmarks/verdicts.md",
+            "    python benchmarks/verdicts.py --count 100 --out docs/benchmarks/verdicts.md",
             "",
             f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, {scenes} simulated scenes of five families "
             "that are in no stability map:",
             "other seeds, other diffusers, several stresses at once. The truth says what failed; the verdict",
-            "saw the data alone.",
+            "saw the data alone. That twelve similar cases are asked and not eight was decided with scenes",
+            "389 to 443 in view; nothing else was.",
             "",
         ]
-        a.out.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
+        tuned = len({e["index"] for e in entries} - {e["index"] for e in held_out})
+        tail = ["", f"On {tuned} scenes more, on which the verdict's thresholds were set:", "", *before]
+        a.out.write_text("\n".join([*head, *lines, *tail]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

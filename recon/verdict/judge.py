@@ -17,7 +17,7 @@ from recon.verdict.verdict import Finding, Region, Verdict
 
 Floats = npt.NDArray[np.float64]
 
-NEIGHBOURS = 8
+NEIGHBOURS = 12
 """Cases that are asked."""
 RELIABLE, LOST = 0.05, 0.5
 """Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""
