@@ -50,30 +50,30 @@ def surface_figure(surface: DiffuserSurface) -> Figure:
     axes = figure.add_subplot(grid[0, 0])
     shown = axes.imshow(surface.height_um, extent=(0, width, height, 0), cmap="viridis")
     axes.axhline(height / 2, color="white", ls="--", lw=0.8)
-    axes.set(xlabel="um", ylabel="um", title="height above the best plane, um")
-    figure.colorbar(shown, ax=axes)
+    axes.set(xlabel="x in the sample, µm", ylabel="y, µm", title="Height above the best plane")
+    figure.colorbar(shown, ax=axes, label="height, µm")
     axes = figure.add_subplot(grid[1, 0])
     row = surface.height_um[surface.height_um.shape[0] // 2]
     axes.plot((np.arange(len(row)) + 0.5) * surface.pitch_um, row, color=_COLOURS[0])
-    axes.set(xlabel="um", ylabel="height, um", title="along the dashed line")
+    axes.set(xlabel="x in the sample, µm", ylabel="height, µm", title="Along the dashed line")
     figures = surface.figures
     for place, values, colour, title in (
         (
             grid[0, 1],
             surface.slope_deg,
             _COLOURS[0],
-            f"slope: mean {figures['slope_mean_deg']:.2f}",
+            f"Slope: mean {figures['slope_mean_deg']:.2f}°",
         ),
         (
             grid[1, 1],
             surface.deflection_deg,
             _COLOURS[1],
-            f"deflection: half width {figures['deflection_hwhm_deg']:.2f}, largest "
-            f"{figures['deflection_largest_deg']:.2f}",
+            f"Deflection: half width {figures['deflection_hwhm_deg']:.2f}°, largest "
+            f"{figures['deflection_largest_deg']:.2f}°",
         ),
     ):
         axes = figure.add_subplot(place)
         axes.hist(values.ravel(), bins=80, color=colour, density=True)
-        axes.set(xlabel="degrees", ylabel="density", title=title)
+        axes.set(xlabel=f"{title.split(':')[0].lower()}, degrees", ylabel="density, 1/degree", title=title)
     figure.suptitle(f"Diffuser by differential phase contrast, {surface.bench}", fontsize=10)
     return figure
