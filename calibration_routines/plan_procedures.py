@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from calibration_routines.angular import RESPONSE_FILE, finish_angular, is_angular
+from calibration_routines.dpc import RESULT_FILE, finish_diffuser, is_dpc
 from calibration_routines.errors import RunEndedError
+from calibration_routines.optics_procedures import response_outcome, surface_outcome
 from calibration_routines.procedure import Listener, Outcome, Outlook, outlook_of, under_control
 from calibration_routines.sweep import FOLDER, finish_sweep, watch_resumed
 from calibration_routines.sweep_procedure import analysing, sweep_outcome
@@ -50,7 +53,7 @@ class PlanProcedure:
 
 @dataclass(frozen=True, slots=True)
 class ResumeProcedure:
-    """Go on with a run that did not end, and make the calibration of a sweep that is complete then."""
+    """Go on with a run that did not end, and make what a calibration's run was taken for."""
 
     run: Path
 
@@ -76,11 +79,12 @@ class ResumeProcedure:
         control: RunControl | None = None,
         listener: Listener | None = None,
     ) -> Outcome:
-        """Verify what is stored, take the rest, and finish a sweep."""
+        """Verify what is stored, take the rest, and make the calibration, response or surface."""
         heard = listener or Listener()
         with under_control(bench, control) as control:
             found = Run.open(self.run)
-            if found.plan is not None and found.missing():
+            whole = found.condition is RunCondition.COMPLETED and not found.missing()
+            if found.plan is not None and not whole:
                 _home_for(bench, found.plan, heard)
                 heard.step("verifying the frames")
                 runner, findings = prepare_resume(
@@ -92,9 +96,14 @@ class ResumeProcedure:
                 heard.step(found.label)
                 control.follow(runner)
                 found = runner.execute()
-            if is_sweep(self.run) and not (self.run / FOLDER).exists():
-                if found.condition is not RunCondition.COMPLETED:
-                    raise RunEndedError("The sweep", found, "It can be resumed.")
+            lacks = lacks_result(self.run)
+            if lacks and found.condition is not RunCondition.COMPLETED:
+                raise RunEndedError("The run", found, "It can be resumed.")
+            if lacks:
+                heard.step("analysing")
+            if (outcome := finish_simple(found)) is not None:
+                return outcome
+            if lacks:
                 done = finish_sweep(
                     self.run,
                     bench,
@@ -104,6 +113,30 @@ class ResumeProcedure:
                 )
                 return sweep_outcome(done)
         return run_outcome(found)
+
+
+def lacks_result(run: Path) -> bool:
+    """Whether a run's frames are those of a calibration, and its result is not there yet."""
+    return (
+        (is_sweep(run) and not (run / FOLDER).exists())
+        or (is_angular(run) and not (run / RESPONSE_FILE).exists())
+        or (is_dpc(run) and not (run / RESULT_FILE).exists())
+    )
+
+
+def finish_simple(run: Run) -> Outcome | None:
+    """Make the result of a complete run of an angular response or a surface that has none yet.
+
+    Returns
+    -------
+    Outcome or None
+        None for every other run.
+    """
+    if is_angular(run.path) and not (run.path / RESPONSE_FILE).exists():
+        return response_outcome(*finish_angular(run))
+    if is_dpc(run.path) and not (run.path / RESULT_FILE).exists():
+        return surface_outcome(*finish_diffuser(run))
+    return None
 
 
 def run_outcome(run: Run) -> Outcome:

@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from calibration_routines.plan_procedures import ResumeProcedure
+from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
 from calibration_routines.sweep import FOLDER
 from calibration_routines.sweep_record import is_sweep
@@ -130,8 +130,9 @@ class RunsPanel(Panel):
         middle = len(stored) // 2  # the first ones are dark
         self.slider.setValue(middle)
         self.about.setPlainText("\n".join(_about(run)))
-        goes_on = run.plan is not None and run.condition not in (RunCondition.RUNNING,)
-        self._can_resume = goes_on and (bool(run.missing()) or _lacks_calibration(run.path))
+        whole = run.condition is RunCondition.COMPLETED and not run.missing()
+        goes_on = run.plan is not None and run.condition is not RunCondition.RUNNING
+        self._can_resume = goes_on and (not whole or lacks_result(run.path))
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
         self.use_button.setEnabled((path / FOLDER).is_dir())
@@ -351,10 +352,6 @@ class RunsPanel(Panel):
         if self.opened is not None:
             self._wanted = self.opened.path
         self.read_folder()
-
-
-def _lacks_calibration(run: Path) -> bool:
-    return is_sweep(run) and not (run / FOLDER).exists()
 
 
 def _about(run: Run) -> list[str]:

@@ -9,9 +9,7 @@ import typer
 from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
-from calibration_routines.angular import RESPONSE_FILE, finish_angular, is_angular
-from calibration_routines.dpc import RESULT_FILE, finish_diffuser, is_dpc
-from calibration_routines.optics_procedures import response_outcome, surface_outcome
+from calibration_routines.plan_procedures import finish_simple
 from calibration_routines.sweep import FOLDER
 from calibration_routines.sweep_words import event_lines
 from instrument.bench import Bench
@@ -75,13 +73,9 @@ def _finish(run: Path, bench: Bench | None) -> None:
 
 def _finish_others(run: Run) -> None:
     """Make the result of a complete run of calibrate angular or dpc that has none yet."""
-    if is_angular(run.path) and not (run.path / RESPONSE_FILE).exists():
-        with one_task("Analysing"):
-            outcome = response_outcome(*finish_angular(run))
-    elif is_dpc(run.path) and not (run.path / RESULT_FILE).exists():
-        with one_task("Analysing"):
-            outcome = surface_outcome(*finish_diffuser(run))
-    else:
+    with one_task("Analysing"):
+        outcome = finish_simple(run)
+    if outcome is None:
         return
     print_lines(Console(), [*outcome.verdict, *(f"Wrote        {file}" for file in outcome.files)])
 
