@@ -64,7 +64,7 @@ WarmOption = Annotated[
         "--warm",
         min=1,
         metavar="N",
-        help="Of a video: iterations of frames that go on from the one before. Default: 6.",
+        help="Of a video: iterations of frames that go on from the one before. Default: 4.",
         show_default=False,
     ),
 ]

@@ -31,12 +31,12 @@ Floats = npt.NDArray[np.float32]
 PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
 """The priors of :data:`recon.picture.PRIORS` that the exact-data ADMM solves."""
 
-COLD_ITERATIONS, WARM_ITERATIONS = 40, 6
-"""Iterations of a block's first frame and of the others: equal in PSNR on scenes that move by up to a third
-of a pixel a frame (docs/benchmarks/video.md)."""
+COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
+"""Iterations of a block's first frame and of the others: as good as independent frames at their best where
+the scene stands, and near it where it moves by less than a pixel a frame (docs/benchmarks/video.md)."""
 
 BLOCK = 32
-"""Frames a block: its cold start is then a sixth of the work."""
+"""Frames a block: its cold start is then a seventh of the work."""
 
 SETTLED = 2e-4
 """Change an iteration below which a frame is done before its iterations are."""

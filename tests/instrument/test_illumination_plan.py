@@ -1,0 +1,25 @@
+"""A plan of active illumination takes one dark frame and one a group."""
+
+from __future__ import annotations
+
+import pytest
+
+from instrument.errors import BenchError
+from instrument.plan import Plan
+from instrument.plan.illumination import illumination_plan
+
+
+def test_each_group_is_lit_once_after_the_dark() -> None:
+    plan = illumination_plan([[0, 1], [5], [7, 8, 9]], exposure_ms=20, level=100)
+    steps = list(plan.steps())
+    assert [step.label for step in steps] == ["dark", "pattern", "pattern", "pattern"]
+    assert [tuple(led[0] for led in step.light.leds) for step in steps] == [(), (0, 1), (5,), (7, 8, 9)]
+    assert {led[1:] for step in steps for led in step.light.leds} == {(100, 100, 100)}
+    assert {step.exposure_ms for step in steps} == {20}
+    assert Plan.from_json(plan.to_json()) == plan
+
+
+@pytest.mark.parametrize(("groups", "level"), [([], 9), ([[1], []], 9), ([[1]], 0), ([[1]], 256)])
+def test_impossible_groups_are_refused(groups: list[list[int]], level: int) -> None:
+    with pytest.raises(BenchError):
+        illumination_plan(groups, exposure_ms=1, level=level)

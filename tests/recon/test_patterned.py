@@ -1,0 +1,95 @@
+"""Active illumination: a linear map, the ordinary camera for a pattern of ones, better pictures with many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon import InputError, reconstruct
+from recon.metrics import psnr
+from recon.operators import PadCropConvolution
+from recon.operators.base import estimate_norm
+from recon.patterned import PatternedCamera, reconstruct_patterned
+
+SHAPE = (24, 30)
+
+
+def psf() -> np.ndarray:
+    return (np.random.default_rng(0).random(SHAPE) ** 10).astype(np.float32)
+
+
+def patterns(count: int) -> np.ndarray:
+    """Bright bands that add up to one."""
+    x = np.arange(SHAPE[1]) / SHAPE[1] * count - np.arange(count)[:, None] - 0.5
+    bands = np.exp(-(x**2) / 0.3)
+    bands /= bands.sum(axis=0)
+    return np.repeat(bands[:, None], SHAPE[0], axis=1)
+
+
+def cast(light: np.ndarray) -> np.ndarray:
+    """What a scene of the sensor's field casts, by plain shifts and sums."""
+    response, image = psf(), np.zeros(SHAPE)
+    for row, column in np.argwhere(light > 0):
+        dy, dx = row - SHAPE[0] // 2, column - SHAPE[1] // 2
+        there = np.s_[max(dy, 0) : SHAPE[0] + min(dy, 0), max(dx, 0) : SHAPE[1] + min(dx, 0)]
+        here = np.s_[max(-dy, 0) : SHAPE[0] + min(-dy, 0), max(-dx, 0) : SHAPE[1] + min(-dx, 0)]
+        image[there] += light[row, column] * response[here]
+    return image
+
+
+def scene() -> np.ndarray:
+    light = np.random.default_rng(1).random(SHAPE) * 0.2 + 0.2
+    light[6:12, 5:9], light[14:18, 15:26] = 1.0, 0.7
+    return light
+
+
+def test_adjoint_norm_and_the_plain_sum() -> None:
+    rng = np.random.default_rng(2)
+    camera = PatternedCamera(psf().astype(float), patterns(3), np.float64)
+    x, y = rng.standard_normal(camera.domain_shape), rng.standard_normal(camera.range_shape)
+    assert np.vdot(camera.forward(x), y) == pytest.approx(np.vdot(x, camera.adjoint(y)), rel=1e-10)
+    assert estimate_norm(camera) <= camera.norm_bound * (1 + 1e-9)
+    inside = np.zeros(camera.domain_shape)
+    inside[0][camera.window] = scene()
+    expected = [cast(scene() * pattern) for pattern in patterns(3)]
+    np.testing.assert_allclose(camera.forward(inside), expected, rtol=1e-5)
+
+
+def test_one_pattern_of_ones_is_the_ordinary_camera() -> None:
+    ones = np.ones((1, *SHAPE))
+    x = np.random.default_rng(3).random(PadCropConvolution(psf()[None], SHAPE).domain_shape, np.float32)
+    plain = PadCropConvolution(psf()[None], SHAPE).forward(x)
+    np.testing.assert_allclose(PatternedCamera(psf(), ones).forward(x), plain, rtol=1e-4)
+    measured = cast(scene())
+    settings = {"iterations": 150, "tau": 1e-3, "noise": 1.0, "prior": "tv-haar"}
+    together = reconstruct_patterned(measured[None], ones, psf(), **settings)
+    alone = reconstruct(measured, psf(), method="fista", tolerance=0, **settings)
+    assert psnr(together.image, alone.image) > 30
+
+
+def test_more_patterns_of_the_same_light_give_a_better_picture() -> None:
+    rng = np.random.default_rng(4)
+    found = []
+    for count in (1, 6):
+        lit = patterns(count)
+        clean = np.stack([cast(scene() * pattern) for pattern in lit])
+        counts = rng.poisson(clean * 2000 / clean.sum(axis=0).max()) / 2000 * clean.sum(axis=0).max()
+        picture = reconstruct_patterned(counts, lit, psf(), iterations=200).image
+        gain = float(np.vdot(picture, scene()) / np.vdot(picture, picture))
+        found.append(float(psnr(gain * picture, scene())))
+    assert found[1] > found[0] + 1
+
+
+@pytest.mark.parametrize(
+    ("frames", "lit", "says"),
+    [
+        (np.ones(SHAPE), np.ones(SHAPE), "One pattern a frame"),
+        (np.ones((2, *SHAPE)), np.ones((3, *SHAPE)), "One pattern a frame"),
+        (np.ones((1, 5, 5)), np.ones((1, 5, 5)), "grey PSF"),
+        (np.ones((1, *SHAPE)), -np.ones((1, *SHAPE)), "negative"),
+        (np.full((1, *SHAPE), np.nan), np.ones((1, *SHAPE)), "finite"),
+    ],
+)
+def test_what_does_not_fit_is_refused(frames: np.ndarray, lit: np.ndarray, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        reconstruct_patterned(frames, lit, psf())
