@@ -35,15 +35,6 @@ class RunSummary:
     is_simulated: bool = False
     problem: str = ""
 
-    @property
-    def can_go_on(self) -> bool:
-        """Whether ``resume`` could take frames that are missing."""
-        return (
-            not self.is_recording
-            and self.condition not in (None, RunCondition.RUNNING)
-            and self.stored < self.frames
-        )
-
 
 def run_paths(folder: Path) -> list[Path]:
     """Return the folders of the runs in a folder, the oldest first; empty where there is no such folder."""
