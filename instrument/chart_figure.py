@@ -69,24 +69,22 @@ def chart_figure(data: ChartData) -> Figure:
         lw=1,
         label="Pareto front",
     )
-    named: set[str] = set()
-    for p in reversed(front):
-        if p.setting not in named:
-            named.add(p.setting)
-            by_time.annotate(
-                f"{p.setting} ({p.iterations})",
-                (max(p.seconds, 1e-4), _value(p, truth=truth)),
-                fontsize=6,
-                xytext=(4, -7),
-                textcoords="offset points",
-            )
+    best_of = {p.setting: p for p in front}  # each setting's best point on the front
+    lines = []
+    for number, p in enumerate(sorted(best_of.values(), key=lambda p: p.seconds), start=1):
+        place = (max(p.seconds, 1e-4), _value(p, truth=truth))
+        by_time.annotate(str(number), place, fontsize=7, xytext=(-3, 5), textcoords="offset points")
+        lines.append(f"{number}  {p.setting}, {p.iterations or 1} it.")
+    by_time.text(
+        0.99, 0.02, "\n".join(lines), fontsize=6, ha="right", va="bottom", transform=by_time.transAxes
+    )
     by_time.set(xscale="log", xlabel="time of the solver (s)", ylabel=_label(truth=truth))
     if any(p.peak_mib == p.peak_mib for p in data.points):
         by_memory.set_xscale("log")
     by_memory.set(xlabel="memory beyond the input's, at the peak (MiB)")
     if not truth:
         by_time.set_yscale("log")
-    by_time.legend(fontsize=7)
+    by_time.legend(fontsize=7, loc="upper left")
     kind = "SIMULATED " if data.about.get("simulated") else ""
     figure.suptitle(f"{kind}speed against accuracy: {_title(data)}", fontsize=10)
     figure.tight_layout()

@@ -325,11 +325,17 @@ def _background(dark: CoarsePass, lit: CoarsePass, kind: str, wishes: Wishes, *,
     ratio = dark.misfit / max(lit.misfit, 1e-6)
     numbers = {"misfit_without": dark.misfit, "misfit_with": lit.misfit, "needed": BACKGROUND_GAIN[kind]}
     asked = wishes.background is not None
-    on = bool(wishes.background) if asked else ratio >= BACKGROUND_GAIN[kind] and not given
+    picture = kind == "tv" and len(dark.light) == 1
+    on = bool(wishes.background) if asked else ratio >= BACKGROUND_GAIN[kind] and not given and not picture
     why = (
         f"a coarse pass misses the data by {dark.misfit:.2f} of the noise without a smooth background and by "
         f"{lit.misfit:.2f} with one ({BACKGROUND_GAIN[kind]:g} times less is asked of it)"
     )
+    if picture and not asked:
+        why = (
+            "total variation cannot tell a smooth background from a smooth picture (a quick pass misses the "
+            f"data by {dark.misfit:.2f} of the noise without one and by {lit.misfit:.2f} with one)"
+        )
     if given and not asked:
         why = "a background was given"
     gain = 20 * float(np.log10(ratio))
