@@ -36,8 +36,9 @@ from instrument.config_file import parse_config
 from instrument.images import write_image
 from instrument.sample_images import load_sample
 
-SIZE = "1280x800"
+SIZE = "1600x980"
 WAIT_S = 900.0
+LIT_COUNTS = 500
 SETTLE_MS = 1500
 """For the live view's first frames, histograms and what else comes by timers."""
 CAMERA = """\
@@ -158,9 +159,14 @@ def _open(folder: Path, width: int, height: int) -> MainWindow:
     session.open()
     _wait(lambda: bool(opened), "the bench to open")
     if folder.name == "camera":
-        _wait(lambda: session.live.newest() is not None, "the first frame")
+        _wait(lambda: _is_lit(session), "the first frame with light")
     QTest.qWait(SETTLE_MS)
     return window
+
+
+def _is_lit(session: BenchSession) -> bool:
+    frame = session.live.newest()
+    return frame is not None and int(frame.image.max()) > LIT_COUNTS
 
 
 def _close(window: MainWindow) -> None:
@@ -209,15 +215,16 @@ def _type(panel: Any, numbers: dict[str, str]) -> None:
 
 
 def _first_run(window: MainWindow) -> None:
-    """Open the newest run."""
+    """Open a run and look at a frame in its middle."""
     from gui.panels.runs import RunsPanel
 
     panel = window.panel("runs")
     assert isinstance(panel, RunsPanel)
     _wait(lambda: panel.table.rowCount() > 0, "the list of runs")
-    panel.table.selectRow(0)
-    first = panel.table.visualItemRect(panel.table.item(0, 0)).center()
-    QTest.mouseClick(panel.table.viewport(), Qt.MouseButton.LeftButton, pos=first)
+    last = panel.table.visualItemRect(panel.table.item(panel.table.rowCount() - 1, 0)).center()
+    QTest.mouseClick(panel.table.viewport(), Qt.MouseButton.LeftButton, pos=last)
+    _wait(lambda: panel.slider.maximum() > 0, "the run's frames")
+    panel.slider.setValue(panel.slider.maximum() // 2)
 
 
 def _reconstructions(window: MainWindow, out: Path) -> None:

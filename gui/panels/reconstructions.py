@@ -39,6 +39,7 @@ from instrument.reconstruction_request import VolumeRequest
 from instrument.result_export import export_result
 from instrument.result_list import find_results, free_name
 from instrument.stored_result import StoredResult, open_result
+from recon.auto import Choice
 
 
 class ReconstructionsPanel(Panel):
@@ -70,6 +71,7 @@ class ReconstructionsPanel(Panel):
         self.export_button.setEnabled(False)
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
+        self.form.questioned.connect(self.explain)
         self.form.stopped.connect(self._stop)
         self.form.refused.connect(self.refused)
         self.picture = PictureView()
@@ -303,6 +305,35 @@ class ReconstructionsPanel(Panel):
         job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
         job.ended.connect(lambda: self.form.set_running(False))
         return job
+
+    def explain(self) -> Job | None:
+        """Say what the model ``auto`` would choose for the form, and why; nothing is reconstructed."""
+        try:
+            request = self.form.request()
+        except BenchError as error:
+            self.refused(None, str(error))
+            return None
+        self.accepted()
+        job = self.tells(
+            self.jobs.compute(
+                f"Explaining {request.image.name}", lambda _: request.explain(request.prepare())
+            )
+        )
+        self.form.set_running(True)
+        self.form.show_progress(0.0, "Looking at PSFs and photograph …")
+        job.succeeded.connect(self._explained)
+        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
+        job.ended.connect(lambda: self.form.set_running(False))
+        return job
+
+    def _explained(self, choice: Choice) -> None:
+        facts: list[tuple[str, str]] = []
+        for decision in choice.decisions:
+            facts.append((decision.name.capitalize(), f"{decision.value}: {decision.why}"))
+            steps = (("up", decision.up), ("down", decision.down))
+            facts += [("", f"one step {way}: {option}") for way, option in steps if option is not None]
+        self.facts.show_facts(facts)
+        self.form.show_progress(0.0, f"Chosen in {choice.seconds:.1f} s; the reasons are below the picture.")
 
     def _stop(self) -> None:
         if self.job is not None:

@@ -7,7 +7,6 @@ from typing import Any
 
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtWidgets import (
-    QCheckBox,
     QComboBox,
     QFormLayout,
     QHBoxLayout,
@@ -41,6 +40,7 @@ from recon.volume.model import MODELS
 CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _AUTOMATIC = "automatic"
+BACKGROUNDS = {_AUTOMATIC: None, "estimated": True, "none": False}
 
 
 class ReconstructForm(QWidget):
@@ -50,6 +50,8 @@ class ReconstructForm(QWidget):
     -------
     asked
         Reconstruct now: the fields are understood.
+    questioned
+        Only say what would be chosen, and why.
     stopped
         End the work and keep what there is.
     refused : object, str
@@ -57,6 +59,7 @@ class ReconstructForm(QWidget):
     """
 
     asked = Signal()
+    questioned = Signal()
     stopped = Signal()
     refused = Signal(object, str)
 
@@ -111,15 +114,22 @@ class ReconstructForm(QWidget):
             "saturated",
             tip="Pixels left out: none, saturated, a share (0.5), or a mask's file",
         )
-        self.background = QCheckBox("estimate a smooth background")
-        self.background.setChecked(True)
-        self.background.setToolTip("Stray light that the model cannot explain otherwise ends up as haze")
+        self.background = QComboBox()
+        self.background.addItems(list(BACKGROUNDS))
+        self.background.setToolTip(
+            "Estimate a smooth background as well: stray light that no model explains ends up as haze"
+        )
         self.out = Entry(self._understand_out, tip="Where the result is written; .png and .json go beside it")
         self.start = QPushButton("Reconstruct")
         self.start.setObjectName("primary")
         self.start.setToolTip("Reconstruct with these settings (Ctrl+Return)")
         self.start.setShortcut("Ctrl+Return")
-        self.start.clicked.connect(self._start)
+        self.start.clicked.connect(lambda: self._ask(self.asked))
+        self.explain = QPushButton("Explain")
+        self.explain.setToolTip(
+            "Say what model auto would choose, why, and what one step up or down would cost"
+        )
+        self.explain.clicked.connect(lambda: self._ask(self.questioned))
         self.stop = QPushButton("Stop and keep")
         self.stop.setToolTip("End after the iteration in progress; what there is then is kept")
         self.stop.setEnabled(False)
@@ -141,7 +151,7 @@ class ReconstructForm(QWidget):
         self._rows = QFormLayout()
         self._rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         self._rows.setContentsMargins(2, 6, 8, 2)
-        for box in (self.kind, self.method, self.model, self.prior):
+        for box in (self.kind, self.method, self.model, self.prior, self.background):
             narrow(box)
         self._rows.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
         self._rows.setVerticalSpacing(4)
@@ -175,6 +185,7 @@ class ReconstructForm(QWidget):
         scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         buttons = QHBoxLayout()
         buttons.addWidget(self.start, 1)
+        buttons.addWidget(self.explain)
         buttons.addWidget(self.stop)
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
@@ -209,7 +220,10 @@ class ReconstructForm(QWidget):
         kind = self.kind.currentText()
         if kind == VOLUME:
             return VolumeRequest(
-                image=image, psfs=psfs, estimate_background=self.background.isChecked(), settings=settings
+                image=image,
+                psfs=psfs,
+                estimate_background=BACKGROUNDS[self.background.currentText()],
+                settings=settings,
             )
         z_mm = self.z_mm.value()
         return PictureRequest(
@@ -274,6 +288,7 @@ class ReconstructForm(QWidget):
     def set_running(self, running: bool) -> None:
         """Let it be started, or stopped."""
         self.start.setEnabled(not running)
+        self.explain.setEnabled(not running)
         self.stop.setEnabled(running)
         if not running:
             self.progress.setValue(0)
@@ -336,13 +351,13 @@ class ReconstructForm(QWidget):
         for entry in (self.iterations, self.time_s):
             entry.setEnabled(not self._is_one_shot)
 
-    def _start(self) -> None:
+    def _ask(self, signal: Any) -> None:
         """Refuse the first field that is not understood, else ask for the work."""
         for entry in self._entries():
             if self._applies(entry) and not entry.check():
                 entry.setFocus()
                 return
-        self.asked.emit()
+        signal.emit()
 
     def _applies(self, entry: Any) -> bool:
         return bool(entry.isEnabled()) and not (entry is self.z_mm and self.kind.currentText() == VOLUME)

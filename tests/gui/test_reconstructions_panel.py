@@ -120,6 +120,17 @@ def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: Reconstructi
     assert "one PSF a depth" in panel.facts.toPlainText()
 
 
+def test_explain_says_what_would_be_chosen_and_reconstructs_nothing(
+    qtbot: QtBot, panel: ReconstructionsPanel, files
+) -> None:
+    fill(panel, VOLUME, files, "psfs")
+    qtbot.mouseClick(panel.form.explain, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "Model" in panel.facts.toPlainText(), timeout=WAIT_MS)
+    assert panel.job is None
+    assert "Chosen in" in panel.form.note.text()
+    assert not (panel.session.runs_folder / "reconstructions").exists()
+
+
 def test_stopping_keeps_what_there_is(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
     fill(panel, PSF, files, "psf.tif")
     panel.form.iterations.setText("1000000")
