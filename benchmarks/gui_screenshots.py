@@ -126,6 +126,8 @@ def _prepare_camera(folder: Path) -> None:
         bench.write_text(fast.replace('scene = "beads"', f'scene = "{scene}"'))
         if not (folder / f"{scene}.tif").exists():
             _do("snap", "--bench", bench, "--exposure-ms", exposure_ms, "--out", folder / f"{scene}.tif")
+    if not (folder / "chart" / "chart.json").exists():
+        _do("chart", "--scene", "sparse-picture", "--size", 32, "--budget", 30, "--out", folder / "chart")
     bench.write_text(CAMERA)
 
 
@@ -187,6 +189,19 @@ def _show(window: MainWindow, name: str, out: Path) -> None:
     if name == "runs":
         _first_run(window)
     _grab(window, out / f"{name}.png")
+    if name == "charts":
+        _chart(window)
+        _grab(window, out / "chart.png")
+
+
+def _chart(window: MainWindow) -> None:
+    """Open the chart of speed against accuracy."""
+    from gui.panels.charts import ChartsPanel
+
+    panel = window.panel("charts")
+    assert isinstance(panel, ChartsPanel)
+    panel.open(panel.session.runs_folder.parent / "chart" / "chart.json")
+    _wait(lambda: bool(panel.chart.front), "the chart")
 
 
 def _sweep(window: MainWindow) -> None:

@@ -53,7 +53,9 @@ class ChartView(QWidget):
         self.table.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
         self.table.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
         self.table.verticalHeader().hide()
-        self.table.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        header = self.table.horizontalHeader()
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
         self.table.setToolTip("Settings by their best score; one that is chosen is drawn bold")
         self.table.itemSelectionChanged.connect(self._draw_curves)
         self.place = QLabel("The bold line is the front: no setting is both quicker and better.")
@@ -145,6 +147,8 @@ class ChartView(QWidget):
                 symbolPen=None,
                 symbolBrush=colour,
             )
+        if known:
+            self.plot.getAxis("bottom").setTicks([_ticks([p["seconds"] for p in known])])
         if self.front:
             x, y = np.array([(p["seconds"], p[self.key]) for p in self.front], float).T
             pen = pg.mkPen(colours().text, width=2.5)
@@ -160,6 +164,13 @@ class ChartView(QWidget):
                 nearest, distance = point, away
         if nearest is not None:
             self.place.setText(describe(nearest))
+
+
+def _ticks(seconds: Sequence[float]) -> list[tuple[float, str]]:
+    """Return places of 1, 2 and 5 times powers of ten on a logarithmic axis, with their words."""
+    first, last = math.floor(math.log10(min(seconds))), math.ceil(math.log10(max(seconds)))
+    values = [step * 10.0**power for power in range(first, last + 1) for step in (1, 2, 5)]
+    return [(math.log10(value), f"{value:g}") for value in values]
 
 
 def describe(point: ScoredPoint) -> str:
