@@ -125,6 +125,8 @@ def write_stability(folder: Path, maps: Mapping[str, Any], command: str) -> Path
 
 def read_stability(path: Path) -> dict[str, Any]:
     """Read ``stability.json``; errors name the file."""
+    if not path.is_file():
+        raise FileError(path, "does not exist.", "Make it with diffuserbench stability.")
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

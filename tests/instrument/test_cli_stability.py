@@ -89,6 +89,8 @@ def test_mistakes_are_sentences(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(FileError, match="folder is expected"):
         fails("easy", "-o", str(tmp_path / "file"))
+    with pytest.raises(FileError, match="does not exist"):
+        fails("--redraw", "-o", str(tmp_path))
     (tmp_path / "stability.json").write_text(json.dumps({"format": "else"}))
     with pytest.raises(FileError, match="holds no stability maps"):
         fails("--redraw", "-o", str(tmp_path))
