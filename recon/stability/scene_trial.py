@@ -27,6 +27,7 @@ from recon.stability.failure import (
     trivial_error,
 )
 from recon.stability.map import Size, Trial
+from recon.volume.model import ModelName
 from recon.volume.reconstruct import reconstruct_volume
 from recon.volume.result import VolumeReconstruction
 
@@ -60,7 +61,9 @@ class Options:
 
     Attributes
     ----------
-    model : str
+    model : str, optional
+        Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
+        map shows what one model does, so it leaves no choice to ``"auto"``.
     leave_out_saturated : bool
     subtract_background : bool
         Give the true background, as a user who photographed it would.
@@ -68,7 +71,7 @@ class Options:
         Of a volume.
     """
 
-    model: str = "auto"
+    model: ModelName | None = None
     leave_out_saturated: bool = False
     subtract_background: bool = True
     estimate_background: bool = False
@@ -101,12 +104,15 @@ def solve(
         erasures = clipped if erasures is None else erasures | clipped
     background = scene.background if options.subtract_background and scene.background.any() else None
     given: dict[str, Any] = dict(METHODS[method])
+    # The local model of a picture has a solver of its own: ADMM.
+    able = method.startswith(("volume", "admm ")) and len(scene.calibration.psfs) > len(scene.z_um)
+    model: ModelName = options.model or ("local" if able else "convolution")
     if not method.startswith("volume"):
         limit: dict[str, Any] = {} if given["method"] == "wiener" else {"iterations": iterations}
         return reconstruct(
             scene.measurement,
             scene.calibration,
-            model=options.model,  # type: ignore[arg-type]
+            model=model,
             erasures=erasures,
             background=background,
             **given,
@@ -115,7 +121,7 @@ def solve(
     return reconstruct_volume(
         scene.measurement,
         scene.calibration,
-        model=options.model,  # type: ignore[arg-type]
+        model=model,
         erasures=erasures,
         background=background,
         estimate_background=options.estimate_background,
