@@ -49,6 +49,8 @@ def checkpoint_for(
         "psf positions": digest(job.calibration.source_positions_um),
         "valid pixels": digest(job.valid),
         **{name: value for name, value in given.items() if name not in apart},
+        # As it will be used: the photograph's metadata may have told it.
+        "noise": str(job.binned_noise(request.settings.noise)),
     }
     return CheckpointFolder(folder, problem)
 
