@@ -131,6 +131,9 @@ def whole_volume(
         background=background,
         reason=next(d.why for d in choice.decisions if d.name == "model"),
         choice=choice,
+        empty_planes=tuple(
+            replace(e, planes=tuple(choice.planes[z] for z in e.planes)) for e in small.empty_planes
+        ),
         warnings=_together(reduced.warnings, small.warnings),
         provenance={**small.provenance, "auto": choice.to_json()},
     )

@@ -345,7 +345,13 @@ def test_empty_planes_are_told():
     assert empty.planes
     assert not result.volume[list(empty.planes)].any()
     whole = reconstruct_volume(
-        measurement(), calibration(), prior="l1", tau=0.1, tolerance=1e-4, drop_empty=False
+        measurement(),
+        calibration(),
+        prior="l1",
+        model="convolution",
+        tau=0.1,
+        tolerance=1e-4,
+        drop_empty=False,
     )
     assert not whole.empty_planes[0].planes
     np.testing.assert_allclose(result.volume, whole.volume, atol=0.02 * whole.volume.max())

@@ -194,7 +194,7 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
             recon.reconstruct_volume(measurement, calibration, prior=prior, device="gpu")
-    options = {"prior": prior, "iterations": 40, "tolerance": 0}
+    options = {"prior": prior, "iterations": 40, "tolerance": 0, "model": "convolution"}
     host = recon.reconstruct_volume(measurement, calibration, drop_empty=False, **options)
     # Another module than numpy, with its functions: what a GPU's is to the code.
     twin = types.ModuleType("twin")
