@@ -194,8 +194,7 @@ def choose(
         Decision(
             "precision",
             "float32",
-            "no scene was found where float64 changes a picture by more than a thousandth in 500 iterations",
-            up=Option("float64", 2.0, 0.0),
+            "it drifts from float64 by about 1e-4 in 500 iterations of the exact-data solver",
         ),
     )
     return Choice(
