@@ -161,7 +161,8 @@ class LiveReconstructor:
         Raises
         ------
         InputError
-            When the image does not fit the PSF or the frames before.
+            When the image does not fit the PSF or the frames before, or is not finite; such a frame is left
+            out, and the next goes on as if it had not been.
         """
         began_s = time.perf_counter()
         frame = self._on_calibration_pixels(image)
@@ -280,6 +281,8 @@ class LiveReconstructor:
     def _on_calibration_pixels(self, image: Array) -> Floats:
         """Return a frame (n_channels, height, width) less background on the PSF's pixels."""
         image = np.asarray(image)
+        if image.dtype.kind == "f":
+            require_finite(image, "frame")
         if image.shape != self._shape:
             self._refuse_other_shape(image)
         factor = image.shape[0] // self._psfs.shape[1]
@@ -321,8 +324,6 @@ class LiveReconstructor:
         for name, channels in (("PSF", self._psfs), ("background", self._background)):
             if channels is not None and len(channels) not in (1, n_channels):
                 raise InputError(f"The frame has {n_channels} channels and the {name} {len(channels)}.")
-        if image.dtype.kind == "f":
-            require_finite(image, "frame")
         self._shape = image.shape
 
     def _told(

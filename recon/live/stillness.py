@@ -77,6 +77,11 @@ class SceneWatch:
             return SceneState.NEW
         change = frame - self._gain(frame) * self.mean
         variance = float(np.vdot(change, change)) / change.size
+        if not np.isfinite(variance):  # the mean is spoilt, or the frame: neither may reach those to come
+            self._begin(frame)
+            if not np.isfinite(frame).all():
+                self.forget()
+            return SceneState.NEW
         if self._is_white(change, variance):
             self.count = min(self.count + 1, self.average)
             self.mean += (frame - self.mean) / np.float32(self.count)

@@ -171,6 +171,29 @@ def test_unusable_frames_are_refused(frame: np.ndarray, says: str) -> None:
         live().feed(frame)
 
 
+def test_a_frame_that_is_not_finite_spoils_none_of_those_after_it() -> None:
+    reconstructor = live()
+    frame = photograph(0, 0).astype(np.float32)
+    reconstructor.feed(frame)
+    spoilt = frame.copy()
+    spoilt[3, 4] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        reconstructor.feed(spoilt)
+    assert np.isfinite(reconstructor.feed(photograph(0, 1).astype(np.float32)).image).all()
+
+
+def test_the_watch_begins_anew_after_what_is_not_finite() -> None:
+    watch = SceneWatch()
+    frames = np.random.default_rng(0).normal(100, 3, (4, 1, *SHAPE)).astype(np.float32)
+    watch.see(frames[0])
+    spoilt = frames[1].copy()
+    spoilt[0, 3, 4] = np.nan
+    assert watch.see(spoilt) is SceneState.NEW
+    assert watch.see(frames[2]) is SceneState.NEW
+    assert watch.see(frames[3]) is SceneState.STILL
+    assert np.isfinite(watch.mean).all()
+
+
 @pytest.mark.parametrize("settings", [{"budget_ms": 0}, {"finest": 3, "coarsest": 2}, {"average": 0}])
 def test_unusable_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(InputError, match=next(iter(settings))):
