@@ -20,7 +20,7 @@ from recon.solvers.base import Keeper, Outcome, Solver
 from recon.solvers.stopping import IterationRecord, StoppingRules
 from recon.types import Calibration
 from recon.varying_picture import model_of, reconstruct_varying
-from recon.verdict.collect import evidence_of, unsettled_by
+from recon.verdict.collect import evidence_of, not_judged, unsettled_by
 from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS as VOLUME_PRIORS
@@ -224,6 +224,13 @@ def reconstruct(
         )
     )
     picture = problem.picture(outcome.solution, field)
+    verdict: Verdict | None = None
+    failed: list[str] = []
+    if judged:
+        try:
+            verdict = _verdict(measurement, problem, picture, outcome, rules, method, name)
+        except Exception as error:  # noqa: BLE001 - the picture is worth more than what is said of it
+            failed = [not_judged(error)]
     return Reconstruction(
         image=picture,
         grid=problem.grid(field, z_um),
@@ -234,14 +241,14 @@ def reconstruct(
         history=outcome.history,
         stop_reason=outcome.stop_reason,
         seconds=outcome.seconds,
-        warnings=problem.warnings if varying is None else (*problem.warnings, *varying[2]),
+        warnings=(*problem.warnings, *(() if varying is None else varying[2]), *failed),
         state=outcome.solution * problem.image_scale,
         provenance={
             "noise_deviation": [float(v) for v in problem.noise],
             "psf_z_um": problem.psf_z_um,
             "valid_share": float(problem.noise_norm**2 / problem.data.size),
         },
-        verdict=_verdict(measurement, problem, picture, outcome, rules, method, name) if judged else None,
+        verdict=verdict,
     )
 
 

@@ -68,6 +68,12 @@ def evidence_of(
     return averaged(channels)
 
 
+def not_judged(error: Exception) -> str:
+    """Say that there is no verdict, and why: a result is never lost for want of one."""
+    why = f"{type(error).__name__}: {error}"
+    return f"No verdict: judging the result failed ({why}). The result itself is whole."
+
+
 def unsettled_by(history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float) -> float:
     """Return the last change over ten times the tolerance, where a limit ended the run; else 0."""
     if reason is StopReason.NOT_FINITE:

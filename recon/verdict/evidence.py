@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -175,14 +176,23 @@ def _detail(volume: Array, psfs: Array, noise: float, count: int) -> float:
 def _similarity(psfs: Array) -> float:
     if len(psfs) < 2:
         return 0.0
-    flat = psfs.reshape(len(psfs), -1).astype(np.float64)
-    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-    return float(np.max(np.sum(flat[1:] * flat[:-1], axis=1)))
+    products = np.array([_inner(a, b) for a, b in pairwise(psfs)])
+    norms = np.maximum(_norms(psfs), 1e-30)
+    return float(np.max(products / norms[1:] / norms[:-1]))
 
 
 def _dimming(psfs: Array) -> float:
-    norms = np.linalg.norm(psfs.reshape(len(psfs), -1).astype(np.float64), axis=1)
+    norms = _norms(psfs)
     return float(norms.min() / norms.max()) if norms.max() > 0 else 1.0
+
+
+def _norms(psfs: Array) -> npt.NDArray[np.float64]:
+    return np.sqrt([_inner(psf, psf) for psf in psfs])
+
+
+def _inner(one: Array, other: Array) -> float:
+    """Return the inner product of two planes; only they are ever in memory as float64, never the stack."""
+    return float(np.vdot(one.astype(np.float64), other.astype(np.float64)))
 
 
 def _ambiguity(psf: Array) -> float:

@@ -21,7 +21,7 @@ from recon.solvers import Outcome, Solver, StoppingRules
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
-from recon.verdict.collect import evidence_of, unsettled_by
+from recon.verdict.collect import evidence_of, not_judged, unsettled_by
 from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
@@ -243,7 +243,13 @@ def reconstruct_volume(
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
-    verdict = _verdict(measurement, as_measured, volume, outcomes, tolerance, prior) if judged else None
+    verdict: Verdict | None = None
+    failed: list[str] = []
+    if judged:
+        try:
+            verdict = _verdict(measurement, as_measured, volume, outcomes, tolerance, prior)
+        except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
+            failed = [not_judged(error)]
     return VolumeReconstruction(
         volume=np.ascontiguousarray(volume),
         grid=grid,
@@ -257,7 +263,7 @@ def reconstruct_volume(
         stop_reasons=tuple(o.stop_reason for o in outcomes),
         seconds=sum(o.seconds for o in outcomes),
         empty_planes=tuple(empty),
-        warnings=(*scaled.warnings, *_uncertified(empty)),
+        warnings=(*scaled.warnings, *_uncertified(empty), *failed),
         provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": planned},
         verdict=verdict,
     )
@@ -290,9 +296,14 @@ def _noise_norm(scaled: Scaled, channel: int = 0) -> float:
 
 def plane_gains(scaled: Scaled) -> npt.NDArray[np.float32]:
     """Return the energy of every depth's central PSF, relative to their root mean square, (n_z,)."""
-    energy = np.sqrt(np.sum(scaled.depths.central.astype(np.float64) ** 2, axis=(1, 2, 3)))
+    energy = np.sqrt(np.sum(_energies(scaled.depths.central), axis=1))
     relative = energy * np.sqrt(len(energy)) / max(float(np.linalg.norm(energy)), 1e-30)
     return np.where(relative > 0, relative, 1.0).astype(np.float32)
+
+
+def _energies(psfs: Array) -> npt.NDArray[np.float64]:
+    """Return the sum of squares of every PSF, (n_z, n_channels): plane by plane, for memory's sake."""
+    return np.array([np.sum(psf.astype(np.float64) ** 2, axis=(1, 2)) for psf in psfs])
 
 
 def _chosen(
@@ -414,7 +425,7 @@ def prepare_volume(
         data=np.where(valid, data / deviation[:, None, None], 0).astype(np.float32),
         valid=valid,
         noise=deviation,
-        energy=float(np.sqrt(np.mean(np.sum(psfs.astype(np.float64) ** 2, axis=(2, 3))))),
+        energy=float(np.sqrt(np.mean(_energies(psfs)))),
         depths=depths,
         warnings=tuple(warnings),
         flat=np.ndim(measurement) == 2,

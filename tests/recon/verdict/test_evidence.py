@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,11 @@ from recon import InputError, reconstruct, reconstruct_volume
 from recon.scenes import SceneSpec, make_scene
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
-from recon.verdict.evidence import measure
+from recon.verdict.evidence import _dimming, _similarity, measure
 from recon.verdict.judge import REPEATS
+from recon.volume.channel import Scaled
+from recon.volume.model import Depths
+from recon.volume.reconstruct import plane_gains
 
 RNG = np.random.default_rng(1)
 
@@ -107,3 +112,45 @@ def test_colour_and_misfits_are_judged_by_the_worst_channel() -> None:
     assert np.isfinite(list(result.verdict.evidence.values())).all()
     with pytest.raises(InputError):
         reconstruct(scene.measurement, scene.calibration, method="nothing")
+
+
+def test_judging_takes_planes_and_never_the_stack_anew() -> None:
+    """A stack may be as large as the memory; float64 copies of it would be twice that, for one number."""
+    psfs = RNG.random((64, 1, 64, 64)).astype(np.float32)
+    scaled = Scaled(
+        data=np.zeros((1, 64, 64), np.float32),
+        valid=np.ones((1, 64, 64), bool),
+        noise=np.ones(1, np.float32),
+        energy=1.0,
+        depths=Depths(np.arange(64.0), psfs, []),
+        warnings=(),
+        flat=True,
+    )
+    tracemalloc.start()
+    try:
+        similar, dim, gains = _similarity(psfs[:, 0]), _dimming(psfs[:, 0]), plane_gains(scaled)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < psfs.nbytes / 4
+    flat = psfs.reshape(64, -1).astype(np.float64)
+    norms = np.linalg.norm(flat, axis=1)
+    assert similar == pytest.approx(np.max(np.sum(flat[1:] * flat[:-1], axis=1) / norms[1:] / norms[:-1]))
+    assert dim == pytest.approx(norms.min() / norms.max())
+    np.testing.assert_allclose(gains, norms / np.sqrt(np.mean(norms**2)), rtol=1e-6)
+
+
+def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr("recon.volume.reconstruct.evidence_of", fail)
+    monkeypatch.setattr("recon.picture.evidence_of", fail)
+    volume = make_scene(SceneSpec("beads", size=32, depths=2))
+    picture = make_scene(SceneSpec("sparse-picture", size=32))
+    for result in (
+        reconstruct_volume(volume.measurement, volume.calibration, model="convolution", iterations=3),
+        reconstruct(picture.measurement, picture.calibration, iterations=3),
+    ):
+        assert result.verdict is None
+        assert any("No verdict" in text and "no room" in text for text in result.warnings)
