@@ -46,6 +46,8 @@ only not speak against it.
 """
 EMPTY = 0.03
 """Share of the coarse pass's light below which a plane is empty, unless a neighbour is not."""
+LEAST_COMMON, LEAST_COMMON_SHARE = 64, 0.05
+"""Pixels, and share of all, that must tell all colours for channels to be compared and merged."""
 VARYING_COST = 3.0
 """Operator applications an iteration of conjugate gradients, relative to a convolution."""
 LEAST_SIDE = 20
@@ -251,10 +253,17 @@ def merged_input(
 def _channels(
     data: Array, deviation: Array, valid: Array, psfs: Array, wishes: Wishes
 ) -> tuple[Decision, Colours | None]:
-    tint = colours(data, deviation, valid, psfs)
     n = len(data)
-    if tint is None:
+    if n == 1:
         return Decision("channels", "one", "the photograph has one channel"), None
+    common = int(np.count_nonzero(valid.all(axis=0)))
+    if common < max(LEAST_COMMON, LEAST_COMMON_SHARE * valid[0].size):
+        why = f"only {common} of {valid[0].size} pixels tell all colours, as with a colour mosaic"
+        if wishes.channels == "merged":
+            raise InputError(f"Channels cannot be merged: {why}. Leave channels=merged out.")
+        return Decision("channels", f"all {n}", why, overruled=wishes.channels is not None), None
+    tint = colours(data, deviation, valid, psfs)
+    assert tint is not None
     numbers = {"misfit": tint.misfit, "psf_misfit": tint.psf_misfit}
     alike = tint.misfit <= CHANNEL_NOISE and tint.psf_misfit <= CHANNEL_PSF
     asked = wishes.channels is not None

@@ -1,0 +1,56 @@
+"""Pictures and volumes as requests: what the command line, the window and scripts fill in."""
+
+import numpy as np
+import pytest
+import tifffile
+from scipy.signal import fftconvolve
+
+from instrument.reconstruction_request import PictureRequest, Settings
+from recon.auto import Wishes
+from recon.errors import InputError
+
+SIZE = 48
+
+
+@pytest.fixture
+def psf():
+    rng = np.random.default_rng(0)
+    image = np.zeros((SIZE, SIZE))
+    image[rng.integers(8, SIZE - 8, 12), rng.integers(8, SIZE - 8, 12)] = 1
+    return fftconvolve(image, np.ones((2, 2)) / 4, "same").clip(0)
+
+
+@pytest.fixture
+def photograph(psf):
+    scene = np.zeros((SIZE, SIZE))
+    scene[20:26, 18:30] = 1
+    light = 500 * np.clip(fftconvolve(scene, psf, "same"), 0, None) + 100
+    return np.random.default_rng(1).poisson(light).astype(np.uint16)
+
+
+@pytest.fixture
+def picture_files(tmp_path, psf, photograph):
+    tifffile.imwrite(tmp_path / "psf.tif", (3000 * psf / psf.max()).astype(np.uint16))
+    tifffile.imwrite(tmp_path / "raw.tif", photograph)
+    return {"psf": tmp_path / "psf.tif", "image": tmp_path / "raw.tif"}
+
+
+def decision(choice, name):
+    return next(d for d in choice.decisions if d.name == name)
+
+
+def test_a_raw_frame_of_a_mosaic_is_reconstructed_unmerged(picture_files):
+    settings = Settings(mosaic="RGGB", iterations=5)
+    request = PictureRequest(**picture_files, settings=settings)
+    result = request.solve(request.prepare())
+    assert result.image.shape == (SIZE, SIZE, 3)
+    assert np.isfinite(result.image).all()
+    channels = decision(result.choice, "channels")
+    assert channels.value == "all 3"
+    assert "only 0 of 2304 pixels tell all colours" in channels.why
+    assert not request.explain(request.prepare()).merged
+    merged = PictureRequest(
+        **picture_files, settings=Settings(mosaic="RGGB", wishes=Wishes(channels="merged"))
+    )
+    with pytest.raises(InputError, match="cannot be merged"):
+        merged.solve(merged.prepare())
