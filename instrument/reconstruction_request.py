@@ -222,6 +222,9 @@ class PictureRequest:
     def explain(self, job: Job) -> Choice:
         """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`."""
         given = self.settings
+        wishes = given.wishes or Wishes()
+        if wishes.tolerance is None:
+            wishes = replace(wishes, tolerance=given.tolerance)
         return choose_picture(
             job.measurement,
             job.calibration,
@@ -229,7 +232,7 @@ class PictureRequest:
             prior=given.prior or "tv",
             noise=job.binned_noise(given.noise),
             erasures=None if job.valid is None else ~job.valid,
-            wishes=given.wishes,
+            wishes=wishes,
         )
 
     def share(self, record: IterationRecord) -> float:
@@ -273,7 +276,7 @@ class VolumeRequest:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
         given = self.settings
         known_volume_prior(given.prior or "tv")
-        if self.positive_background and not self.estimate_background:
+        if self.positive_background and self.estimate_background is False:
             raise BenchError("--positive-background and --no-background exclude each other.")
         return volume_job(
             self.psfs,
@@ -323,7 +326,10 @@ class VolumeRequest:
         given = self.settings
         wishes = given.wishes or Wishes()
         if wishes.background is None:
-            wishes = replace(wishes, background=self.estimate_background)
+            asked = True if self.positive_background else self.estimate_background
+            wishes = replace(wishes, background=asked)
+        if wishes.tolerance is None:
+            wishes = replace(wishes, tolerance=given.tolerance)
         return choose(
             job.measurement,
             job.calibration,

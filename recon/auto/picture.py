@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.auto.choice import Choice
+from recon.auto.choice import Choice, Decision
 from recon.auto.decide import Wishes, choose
 from recon.auto.run import reduce
 from recon.checks import as_channels
 from recon.errors import InputError
+from recon.methods import method_named
 from recon.noise import NoiseModel
 from recon.picture import reconstruct
 from recon.preparation import Field
@@ -43,7 +44,7 @@ def choose_picture(
     if prior not in PRIORS:
         raise InputError(f"Models are chosen for the priors {', '.join(PRIORS)}, not {prior!r}.")
     depth, _ = _at_depth(calibration, z_um)
-    return choose(
+    choice = choose(
         measurement,
         depth,
         prior=prior,
@@ -51,6 +52,41 @@ def choose_picture(
         background=background,
         erasures=erasures,
         wishes=wishes,
+    )
+    return _by_plain_admm(choice, depth, wishes or Wishes()) if _is_plain(choice) else choice
+
+
+def _is_plain(choice: Choice) -> bool:
+    """Tell whether the picture's own solver does, which has one PSF and no background."""
+    return choice.model == "convolution" and not choice.background
+
+
+def _by_plain_admm(choice: Choice, depth: Calibration, wishes: Wishes) -> Choice:
+    """Return the choice with what the picture's own solver does: the whole field, and its own end."""
+    height, width = depth.psfs.shape[2:]
+    tolerance = method_named("admm").tolerance if wishes.tolerance is None else wishes.tolerance
+    replaced = {
+        "field": Decision(
+            "field",
+            f"{2 * height - 1} x {2 * width - 1} pixels",
+            "one convolution of a picture is quick on everything that can reach the sensor",
+            overruled=wishes.field is not None,
+            numbers={"share_of_largest": 1.0},
+        ),
+        "iterations": Decision(
+            "iterations",
+            f"until they change by less than {tolerance:g}",
+            "as asked" if wishes.tolerance is not None else "where this solver stops by default",
+            overruled=wishes.tolerance is not None,
+            numbers={"tolerance": tolerance},
+        ),
+    }
+    return replace(
+        choice,
+        psf_window=(height, width),
+        acceptance_px=None,
+        tolerance=tolerance,
+        decisions=tuple(replaced.get(d.name, d) for d in choice.decisions),
     )
 
 
@@ -78,6 +114,8 @@ def reconstruct_chosen(
     wishes = wishes or Wishes()
     if field == "full":  # what can reach the sensor is asked for, on its pixels
         wishes = replace(wishes, field="all", binning=1)
+    if wishes.tolerance is None:
+        wishes = replace(wishes, tolerance=tolerance)
     depth, warnings = _at_depth(calibration, z_um)
     choice = choose_picture(
         measurement,
@@ -100,6 +138,7 @@ def reconstruct_chosen(
         "tau": tau,
         "iterations": iterations,
         "time_s": time_s,
+        "tolerance": choice.tolerance,
         "noise": small.noise,
         "erasures": small.erasures,
         "field": field,
@@ -108,12 +147,11 @@ def reconstruct_chosen(
         "judged": judged,
         "stop_at_noise": stop_at_noise,
     }
-    if choice.model == "convolution" and not choice.background:
+    if _is_plain(choice):
         result = reconstruct(
             small.measurement,
             _central(small.calibration),
             model="convolution",
-            tolerance=tolerance,
             **common,
         )
     else:
@@ -122,7 +160,6 @@ def reconstruct_chosen(
             small.calibration,
             model=choice.model,
             reason=next(d.why for d in choice.decisions if d.name == "model"),
-            tolerance=choice.tolerance if tolerance is None else tolerance,
             background=None,
             keeper=None,
             estimate_background=choice.background,

@@ -5,7 +5,8 @@ import pytest
 import tifffile
 from scipy.signal import fftconvolve
 
-from instrument.reconstruction_request import PictureRequest, Settings
+from instrument.errors import BenchError
+from instrument.reconstruction_request import PictureRequest, Settings, VolumeRequest
 from recon.auto import Wishes
 from recon.errors import InputError
 
@@ -35,6 +36,14 @@ def picture_files(tmp_path, psf, photograph):
     return {"psf": tmp_path / "psf.tif", "image": tmp_path / "raw.tif"}
 
 
+@pytest.fixture
+def volume_files(tmp_path, psf, photograph):
+    stack = np.stack([(3000 * np.roll(psf, z, 0)).astype(np.uint16) for z in range(2)])
+    tifffile.imwrite(tmp_path / "psfs.tif", stack)
+    tifffile.imwrite(tmp_path / "raw.tif", photograph)
+    return {"psfs": tmp_path / "psfs.tif", "image": tmp_path / "raw.tif"}
+
+
 def decision(choice, name):
     return next(d for d in choice.decisions if d.name == name)
 
@@ -54,3 +63,38 @@ def test_a_raw_frame_of_a_mosaic_is_reconstructed_unmerged(picture_files):
     )
     with pytest.raises(InputError, match="cannot be merged"):
         merged.solve(merged.prepare())
+
+
+def test_a_positive_background_needs_no_other_word(volume_files):
+    settings = Settings(iterations=2)
+    request = VolumeRequest(**volume_files, positive_background=True, settings=settings)
+    job = request.prepare()
+    solved = request.solve(job).choice
+    explained = request.explain(job)
+    assert solved.background
+    assert decision(explained, "background").value == decision(solved, "background").value == "estimated"
+    assert decision(explained, "background").overruled
+    with pytest.raises(BenchError, match="exclude each other"):
+        VolumeRequest(**volume_files, positive_background=True, estimate_background=False).prepare()
+
+
+def test_the_tolerance_that_was_asked_for_is_explained_and_kept(picture_files, volume_files):
+    settings = Settings(iterations=2, tolerance=3e-2)
+    for request in (
+        PictureRequest(**picture_files, settings=settings),
+        VolumeRequest(**volume_files, settings=settings),
+    ):
+        job = request.prepare()
+        for choice in (request.explain(job), request.solve(job).choice):
+            assert choice.tolerance == 3e-2
+            assert decision(choice, "iterations").overruled
+
+
+def test_a_picture_of_one_convolution_says_the_field_and_the_end_that_it_has(picture_files):
+    request = PictureRequest(**picture_files)
+    result = request.solve(request.prepare())
+    choice = result.choice
+    assert (choice.model, choice.background) == ("convolution", False)
+    assert decision(choice, "field").value == f"{2 * SIZE - 1} x {2 * SIZE - 1} pixels"
+    assert choice.psf_window == (SIZE, SIZE)
+    assert choice.acceptance_px is None

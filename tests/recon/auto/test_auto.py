@@ -78,6 +78,18 @@ def test_one_psf_that_does_not_vary_takes_a_convolution():
         np.testing.assert_array_equal(result.image, fixed.image)
 
 
+def test_pictures_of_one_convolution_stop_where_the_choice_says():
+    scene = make_scene("sparse-picture", size=40, grid=1)
+    usual = recon.reconstruct(scene.measurement, scene.calibration)
+    wished = recon.reconstruct(scene.measurement, scene.calibration, wishes=Wishes(tolerance=5e-2))
+    assert usual.choice is not None
+    assert wished.choice is not None
+    assert (usual.choice.model, usual.choice.background) == ("convolution", False)
+    assert usual.history[-1].change < usual.choice.tolerance
+    assert wished.choice.tolerance == 5e-2
+    assert len(wished.history) < len(usual.history)
+
+
 def test_soft_psfs_are_binned_and_sharp_ones_are_not():
     soft = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0)
     result = recon.reconstruct(soft.measurement, soft.calibration)
