@@ -88,6 +88,8 @@ class FrameStream:
     def close(self) -> None:
         """End the sequence and wait for the stream's threads; closing twice does nothing.
 
+        The ring is let go of; frames that somebody holds stay as they are.
+
         Raises
         ------
         Exception
@@ -100,6 +102,8 @@ class FrameStream:
                 self._thread.join()
         subscriptions, self._subscriptions = self._subscriptions, []
         errors = [error for error in (s.join() for s in subscriptions) if error is not None]
+        with self.changed:
+            self.ring.clear()
         if errors:
             raise errors[0]
 
@@ -257,6 +261,8 @@ class FrameStream:
             self.error = DeviceError(self.camera.name, f"its stream failed: {error!r}.", "Report this.")
             self.error.__cause__ = error
         finally:
+            # Hundreds of megabytes: not to be kept by who keeps the stream, or an error with its traceback.
+            del self._pool
             self._end()
 
     def _buffer(self) -> Pixels | None:

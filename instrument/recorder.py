@@ -123,7 +123,8 @@ class Recorder:
 
     def newest(self) -> Frame | None:
         """Return the newest frame, at once; None before the first. Callable from any thread."""
-        return None if self._stream is None else self._stream.newest()
+        stream = self._stream  # which the recording's own thread lets go of
+        return None if stream is None else stream.newest()
 
     def execute(self) -> Run:
         """Record; returns the finished run, whose ``reason`` says how it ended.

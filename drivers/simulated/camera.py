@@ -169,10 +169,12 @@ class SimulatedCamera(SimulatedCameraSettings):
         finally:
             with self._arrived:
                 if self._producer is threading.current_thread():
-                    # Not stopped from outside: whoever waits for a frame must hear that none comes.
+                    # Not stopped from outside: whoever waits for a frame must hear that none comes. An end
+                    # that was asked for is no failure, also where this thread is quicker than who asked.
                     self._producer = None
-                    ended = DeviceError(self.name, "its sequence ended by an error.", "See the log.")
-                    self._failure = self._failure or ended
+                    if not self._abort.is_set():
+                        ended = DeviceError(self.name, "its sequence ended by an error.", "See the log.")
+                        self._failure = self._failure or ended
                 self._arrived.notify_all()
 
     def _await_trigger(self) -> bool:

@@ -69,6 +69,8 @@ class RecordBar(QWidget):
         if self.job is not None:
             if self._recorder is not None:
                 self._recorder.stop()
+            else:  # it waits for the camera, or has just begun
+                self.job.cancel()
             return
         if not self._session.is_open("camera"):
             self._panel.refused(self.button, "The camera is not connected.")

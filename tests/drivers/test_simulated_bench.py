@@ -221,6 +221,18 @@ def test_a_sequence_that_dies_says_so_to_who_waits(monkeypatch: pytest.MonkeyPat
     assert reported.get(timeout=10.0).exc_type is ZeroDivisionError
 
 
+def test_an_end_that_was_asked_for_is_no_failure_however_quickly_it_comes() -> None:
+    camera = Bench().camera
+    camera.start_sequence(n_buffers=2)
+    producer = camera._producer
+    assert producer is not None
+    camera._abort.set()  # what stop_sequence does first: the sequence may have ended before it does the rest
+    producer.join(10.0)
+    with pytest.raises(StoppedError):
+        [camera.next_frame(10.0) for _ in range(3)]  # one more than it may have in its buffers
+    camera.stop_sequence()
+
+
 @pytest.mark.parametrize("kind", ["stage", "led_array"])
 def test_other_devices_say_so_too(kind: str) -> None:
     bench = Bench()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
@@ -119,6 +121,34 @@ def test_memory_is_that_of_the_ring_however_long_it_runs() -> None:
         while (frame := reader.next_frame(0.5)) is not None:
             addresses.add(frame.image.ctypes.data)
     assert len(addresses) <= 7
+
+
+def test_a_closed_stream_holds_no_buffers_whoever_keeps_it_or_its_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    buffers: list[weakref.ref[object]] = []
+
+    class Watched(BufferPool):
+        def __init__(self, n_buffers: int, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+            super().__init__(n_buffers, shape, dtype)
+            buffers.extend(weakref.ref(memory) for memory in self._memory)
+
+    monkeypatch.setattr("drivers.stream.BufferPool", Watched)
+    camera = FreeRunningCamera()
+    camera.fail_at = 12
+    stream = FrameStream(camera, 32)
+    reader = stream.reader()
+    with stream:
+        kept = reader.next_frame(5)
+        assert kept is not None
+        with pytest.raises(DeviceError, match="unplugged") as error:
+            list(iter(lambda: reader.next_frame(5), None))
+    assert number_of(kept) == 0
+    assert error.value is stream.error
+    assert len(buffers) == 34
+    # That of the frame kept, and the one that was being filled, which the traceback holds.
+    assert sum(buffer() is not None for buffer in buffers) <= 2
+    assert stream.newest() is None
 
 
 def test_frames_are_read_only() -> None:

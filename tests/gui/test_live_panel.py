@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,16 @@ def test_a_recording_by_its_key_shows_what_it_records(
     assert len(run.records) > 2
     qtbot.waitUntil(lambda: live.session.live.is_running, timeout=WAIT_MS)
     assert live.session.bench.scene_lit
+
+
+def test_a_recording_that_is_ended_before_it_began_does_not_begin(qtbot: QtBot, live: LivePanel) -> None:
+    release = threading.Event()
+    live.session.device_job("another", lambda _: release.wait(30), {"camera"})
+    live.record()
+    live.record()
+    release.set()
+    qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
+    assert not list(live.session.runs_folder.glob("*recording*"))
 
 
 def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
