@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import tempfile
@@ -18,7 +19,7 @@ from instrument.atomic import write_text
 from instrument.errors import BenchError, FileError
 from instrument.plain_json import plain
 from instrument.preparation import Crop
-from instrument.reconstruction_job import Job
+from instrument.reconstruction_job import Job, Reduction
 from instrument.reconstruction_request import PictureRequest, Settings
 from instrument.store import Run
 from instrument.video.block import BlockReport, CancelledError
@@ -27,7 +28,7 @@ from instrument.video.job import VideoJob, VideoPlan
 from instrument.video.mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
 from instrument.video.output import VideoPictures, create_output
 from instrument.volume_zarr import is_zarr_name
-from recon.video import PRIORS, video_camera
+from recon.video import PRIORS, VideoCamera, video_camera
 from recon.video.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
 from recon.video.solver import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS
 
@@ -167,7 +168,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         over_time=request.over_time,
         rotate_deg=request.rotate_deg,
         picture_shape=picture.measurement.shape,
-        settings=_settings(request, picture, camera.weight),
+        settings=_settings(request, picture, camera, reduction),
     )
     job, resumed = _job(request, plan, force)
     if job is None:
@@ -281,7 +282,9 @@ def _binned_shape(run: Run, index: int, factor: int) -> tuple[int, int]:
     return height // factor, width // factor
 
 
-def _settings(request: VideoRequest, picture: Job, weight: float) -> dict[str, Any]:
+def _settings(
+    request: VideoRequest, picture: Job, camera: VideoCamera, reduction: Reduction
+) -> dict[str, Any]:
     """Return what the result depends on, JSON-compatible."""
     provenance = {key: value for key, value in picture.provenance.items() if key != "image"}
     chosen: dict[str, Any] = plain(
@@ -290,7 +293,9 @@ def _settings(request: VideoRequest, picture: Job, weight: float) -> dict[str, A
             "psf_file": None if request.psf is None else str(request.psf.resolve()),
             "z_um": request.z_um,
             "prior": request.settings.prior or "tv",
-            "weight": weight,
+            "weight": camera.weight,
+            "noise_deviation": camera.deviation,
+            "optics_sha256": _digest(camera, reduction),
             "simulated": picture.simulated,
             "software": {"diffuserbench": version("diffuserbench")},
         }
@@ -298,11 +303,21 @@ def _settings(request: VideoRequest, picture: Job, weight: float) -> dict[str, A
     return chosen
 
 
+def _digest(camera: VideoCamera, reduction: Reduction) -> str:
+    """Return a digest of PSFs, dark level and pixels used: files of the same name may have changed since."""
+    digest = hashlib.sha256()
+    for array in (camera.psfs, camera.image_scale, reduction.dark, camera.valid):
+        values = np.zeros(0) if array is None else np.asarray(array)
+        digest.update(f"{values.shape} {values.dtype}".encode())
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
 def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob | None, bool]:
-    """Return the job begun before for the same plan, if there is one; remove what ``force`` allows."""
+    """Return the job begun before for the same plan; none with ``force``, which removes what there is."""
     folder = VideoJob.folder_of(request.out)
     begun = None
-    if (folder / "job.json").exists() and request.out.exists():
+    if not force and (folder / "job.json").exists() and request.out.exists():
         begun = VideoJob(folder)
         if VideoPlan.from_json(plan.to_json()) == begun.plan:
             return begun, True

@@ -190,6 +190,36 @@ def test_other_settings_do_not_go_on_and_finished_videos_stay(
         prepare_video(request(recording, video))
 
 
+def test_force_begins_anew_whatever_there_is(recording: Path, tmp_path: Path) -> None:
+    wanted = request(recording, tmp_path)
+    job = prepare_video(wanted).job
+    job.mark_done(0)
+    anew = prepare_video(wanted, force=True)
+    assert (anew.resumed, anew.left) == (False, [0, 1, 2])
+    (job.folder / "job.json").write_text("{")
+    with pytest.raises(FileError, match="--force"):
+        prepare_video(wanted)
+    assert not prepare_video(wanted, force=True).resumed
+
+
+def test_another_noise_or_a_changed_calibration_file_is_another_video(
+    recording: Path, tmp_path: Path
+) -> None:
+    psf = tmp_path / "psf.npy"
+    lens = np.load(recording.parent / "psf.npy")
+    np.save(psf, lens)
+    wanted = request(recording, tmp_path, psf=psf)
+    prepare_video(wanted)
+    noisier = replace(wanted, settings=replace(wanted.settings, noise=9.0))
+    with pytest.raises(FileError, match="noise_deviation"):
+        prepare_video(noisier)
+    assert prepare_video(noisier, force=True).job.plan.settings["noise_deviation"] == [9.0]
+    lens[20, 26] += 100
+    np.save(psf, lens)
+    with pytest.raises(FileError, match="optics_sha256"):
+        prepare_video(noisier)
+
+
 @pytest.mark.slow
 def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path, tmp_path: Path) -> None:
     wanted = request(recording, tmp_path)
