@@ -24,8 +24,8 @@ Floats = npt.NDArray[np.float32]
 WINDOW_S = 30.0
 """Of the sliding baseline, where the video's times are known; as many frames as at 10 a second otherwise."""
 
-COPIES = 6
-"""Arrays of the video's size that the work holds at once."""
+COPIES = 8
+"""Arrays of the video's size that the work holds at once: 7.1 measured."""
 
 RED_PERCENTILE = 99.9
 """Of dF/F that is shown fully red."""

@@ -65,11 +65,10 @@ def aligned(frames: Floats, found: Motion) -> Floats:
     """Return the frames moved back to their median place, cubic splines, float32."""
     from scipy import ndimage
 
-    moved = [
-        ndimage.shift(frame, -shift, order=3, mode="nearest")
-        for frame, shift in zip(frames, found.shifts, strict=True)
-    ]
-    return np.stack(moved).astype(np.float32)
+    moved = np.empty(frames.shape, np.float32)
+    for frame, shift, place in zip(frames, found.shifts, moved, strict=True):
+        ndimage.shift(frame, -shift, output=place, order=3, mode="nearest")
+    return moved
 
 
 def _shift(frame: Floats, window: Array, reference: Array) -> tuple[float, float]:

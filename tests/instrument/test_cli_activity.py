@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import tracemalloc
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from instrument.activity import ActivitySettings, find_activity
+from instrument.activity import COPIES, ActivitySettings, find_activity
 from instrument.cli import main
 from instrument.errors import BenchError
 from instrument.video.output import VideoPictures, create_output
@@ -96,3 +97,22 @@ def test_alignment_is_offered_where_frames_move(tmp_path: Path, capsys: pytest.C
         pictures.write(index, (0.2 + spot).astype(np.float32))
     assert main(["activity", str(path), "--out", str(tmp_path / "found")]) == 0
     assert "--align" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("align", [False, True])
+def test_memory_is_not_more_than_is_said_before(film: Path, tmp_path: Path, align: bool) -> None:
+    settings = ActivitySettings(align=align)
+    find_activity(VideoPictures(film), settings)  # what is imported and compiled is not the video's
+    path, shape, count = tmp_path / "larger.ome.zarr", (80, 96), 60
+    create_output(path, count, shape, period_s=None, pitch_um=None, attributes={})
+    video = VideoPictures(path, write=True)
+    rng = np.random.default_rng(0)
+    for index in range(count):
+        video.write(index, (100 + rng.standard_normal(shape)).astype(np.float32))
+    tracemalloc.start()
+    try:
+        find_activity(video, settings)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < COPIES * count * shape[0] * shape[1] * 4
