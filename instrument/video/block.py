@@ -69,21 +69,24 @@ def solve_block(
     began_s = time.perf_counter()
     if threads is not None:
         set_threads(threads)
-    job, solver = _solver_for(Path(job_folder))
+    job = VideoJob(Path(job_folder))
     plan = job.plan
     if job.is_done(number):
         return BlockReport(number, 0, 0, time.perf_counter() - began_s)
     pictures = VideoPictures(Path(output), write=True)
     frames = FrameArray(Path(plan.run) / FRAMES)
-    reduction = job.reduction
     block = job.blocks[number]
+    together_in = None if len(block) == 1 else plan.over_time
     written = 0
-    if plan.over_time is None or len(block) == 1:
+    if together_in is None:
+        job, solver = _solver_for(job)
+        reduction = job.reduction
         solved = _one_by_one(solver, (reduction.apply(frames.read(index)) for index in block))
     else:
+        reduction = job.reduction
         stack = np.stack([reduction.apply(frames.read(index)) for index in block])
         together = solve_together(
-            solver.camera, stack, plan.over_time, iterations=plan.cold_iterations, ended=ended
+            job.camera, stack, together_in, iterations=plan.cold_iterations, ended=ended
         )
         solved = iter([] if together is None else together)
     for index in block:
@@ -103,10 +106,9 @@ def _one_by_one(solver: VideoSolver, frames: Iterable[Floats]) -> Iterator[Float
         yield solver.next(frame)
 
 
-def _solver_for(folder: Path) -> tuple[VideoJob, VideoSolver]:
-    job = VideoJob(folder)
+def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
     kept: tuple[Path, object, VideoJob, VideoSolver] | None = getattr(_kept, "value", None)
-    if kept is not None and kept[0] == folder and kept[1] == job.plan:
+    if kept is not None and kept[0] == job.folder and kept[1] == job.plan:
         return kept[2], kept[3]
     _kept.value = None  # its memory is needed
     solver = VideoSolver(
@@ -114,5 +116,5 @@ def _solver_for(folder: Path) -> tuple[VideoJob, VideoSolver]:
         cold_iterations=job.plan.cold_iterations,
         warm_iterations=job.plan.warm_iterations,
     )
-    _kept.value = (folder, job.plan, job, solver)
+    _kept.value = (job.folder, job.plan, job, solver)
     return job, solver

@@ -16,6 +16,7 @@ from typing import Any
 
 from instrument.errors import BenchError
 from instrument.video.block import BlockReport, CancelledError, solve_block
+from instrument.video.job import VideoJob
 from recon.threads import get_threads, set_threads
 
 Told = Callable[[BlockReport], object]
@@ -32,6 +33,8 @@ _RETRIES = 3
 def in_process(job: Path, output: Path, blocks: Sequence[int], told: Told, cancel: threading.Event) -> None:
     """Solve blocks in this process, on all cores: one block a thread, or all threads to the only block.
 
+    With a prior over time, whose blocks take much memory, one after the other with all threads.
+
     Raises
     ------
     CancelledError
@@ -40,7 +43,8 @@ def in_process(job: Path, output: Path, blocks: Sequence[int], told: Told, cance
         What went wrong in a block; the others are ended.
     """
     cores = get_threads()
-    workers = max(1, min(cores, len(blocks)))
+    together = VideoJob(job).plan.over_time is not None
+    workers = 1 if together else max(1, min(cores, len(blocks)))
     failed = threading.Event()
 
     def ended() -> bool:

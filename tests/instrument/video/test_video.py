@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -218,6 +219,36 @@ def test_another_noise_or_a_changed_calibration_file_is_another_video(
     np.save(psf, lens)
     with pytest.raises(FileError, match="optics_sha256"):
         prepare_video(noisier)
+
+
+def test_blocks_solved_together_are_in_memory_one_after_the_other(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once: list[int] = []
+    present: set[int] = set()
+    threads: list[int] = []
+
+    def solve(_folder: str, _out: str, number: int, **_: object) -> BlockReport:
+        present.add(number)
+        time.sleep(0.05)
+        at_once.append(len(present))
+        present.remove(number)
+        return BlockReport(number, 0, 0, 0.0)
+
+    monkeypatch.setattr("instrument.video.crew.get_threads", lambda: 4)
+    monkeypatch.setattr("instrument.video.crew.set_threads", threads.append)
+    monkeypatch.setattr("instrument.video.crew.solve_block", solve)
+    prepared = prepare_video(request(recording, tmp_path, over_time="tv"))
+    assert solve_video(prepared, lambda _: None, threading.Event())
+    assert (at_once, threads) == ([1, 1, 1], [4, 4])
+
+
+def test_blocks_solved_together_hold_no_other_solver(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block_module, "VideoSolver", None)
+    wanted = request(recording, tmp_path, over_time="tv", settings=Settings(dark=20.0, iterations=2))
+    assert solved(wanted)
 
 
 @pytest.mark.slow
