@@ -1,10 +1,21 @@
-"""For all tests: property tests are not judged by the clock of a machine that does other things, too."""
+"""For all tests: property tests are not judged by the clock of a machine that does other things, too.
+
+With ``CI`` in the environment they try the same examples every time: what continuous integration says of a
+change is about that change. Everywhere else they look for new ones.
+"""
 
 from __future__ import annotations
 
+import os
+
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("diffuserbench", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "diffuserbench",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=bool(os.environ.get("CI")),
+)
 settings.load_profile("diffuserbench")
 
 try:
