@@ -321,9 +321,9 @@ class Bench:
 
     @property
     def source_lit(self) -> bool:
-        """Whether any LED is lit, by the last pattern that the LED array confirmed."""
+        """Whether the LEDs of [source] alone are lit, by the last pattern that the array confirmed."""
         leds = self.led_array
-        return leds is not None and leds.is_open and not leds.pattern.is_dark
+        return leds is not None and leds.is_open and self._lights.is_source(leds.pattern)
 
     @property
     def ask(self) -> Ask | None:

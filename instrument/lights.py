@@ -65,6 +65,11 @@ class Lights:
             return self._asked.get("the scene", False)
         return self.scene_switch is not None and self.scene_switch.scene_lit
 
+    def is_source(self, pattern: LedPattern) -> bool:
+        """Whether a pattern is the point source as it is configured: these LEDs so bright, and no others."""
+        lit = {led: rgb for led, rgb in pattern.levels if any(rgb)}
+        return bool(lit) and lit == dict.fromkeys(self._source.leds, self._source.rgb)
+
     def switch_source(self, *, lit: bool) -> None:
         """Light or darken the point source; confirmed when this returns."""
         if self._led_array is None:

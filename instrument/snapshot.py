@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from drivers.led_array import LedPattern
 from instrument.atomic import check_writable
 from instrument.bench import Bench
 from instrument.errors import FileError
@@ -39,12 +40,46 @@ def switch_light(bench: Bench, light: Light) -> None:
 
 
 def light_of(bench: Bench) -> Light:
-    """Return what is lit now, as far as the program knows; ``AS_IS`` where scene and source both are."""
-    if bench.scene_lit and bench.source_lit:
-        return Light.AS_IS
-    if bench.scene_lit:
-        return Light.SCENE
-    return Light.SOURCE if bench.source_lit else Light.DARK
+    """Return what is lit now, as far as the program knows.
+
+    ``AS_IS`` where no other word is true: another LED pattern than the point source, or LEDs and the scene.
+    """
+    pattern = led_pattern(bench)
+    if pattern is None or pattern.is_dark:
+        return Light.SCENE if bench.scene_lit else Light.DARK
+    return Light.SOURCE if bench.source_lit and not bench.scene_lit else Light.AS_IS
+
+
+def led_pattern(bench: Bench) -> LedPattern | None:
+    """Return the pattern that the LED array confirmed last; None where no array is open."""
+    leds = bench.led_array
+    return leds.pattern if leds is not None and leds.is_open else None
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """What is lit, to the last LED, so that it can be lit again after a run has made the bench safe."""
+
+    pattern: LedPattern | None
+    scene: bool
+
+    @classmethod
+    def now(cls, bench: Bench) -> Lit:
+        """Return what is lit, as far as the program knows."""
+        return cls(led_pattern(bench), bench.scene_lit)
+
+    def put_back(self, bench: Bench) -> None:
+        """Light it again.
+
+        Raises
+        ------
+        DeviceError, BenchError
+            When a light cannot be switched.
+        """
+        if bench.led_array is not None and self.pattern is not None:
+            bench.led_array.set_pattern(self.pattern)
+        if bench.scene_lit != self.scene:
+            bench.scene_on() if self.scene else bench.scene_off()
 
 
 def photograph_name() -> str:

@@ -31,7 +31,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import curve_pen, plot_widget
 from instrument.frame_view import histogram, line_profile, percentiles, sensor_roi
-from instrument.snapshot import Light, check_target, light_of, photograph_name, write_snapshot
+from instrument.snapshot import Light, check_target, led_pattern, light_of, photograph_name, write_snapshot
 
 FRAME_MS = 32
 """Between two looks at the newest frame: thirty a second on the screen."""
@@ -210,6 +210,7 @@ class LivePanel(Panel):
             "from pathlib import Path",
             "",
             "from drivers.camera import Roi",
+            "from drivers.led_array import LedPattern",
             "from instrument.bench import open_bench",
             "from instrument.snapshot import Light, photograph_name, switch_light, write_snapshot",
             "",
@@ -224,9 +225,13 @@ class LivePanel(Panel):
                 f"    bench.camera.set_gain({state.gain!r})",
                 f"    bench.camera.set_exposure_ms({state.exposure_ms!r})",
             ]
-        light = self.light
+        light, pattern = self.light, led_pattern(self.session.bench)
+        if light is Light.AS_IS:
+            lines += [f"    bench.led_array.set_pattern({pattern!r})"]
+            lines += ["    bench.scene_on()"] if self.session.bench.scene_lit else []
+        else:
+            lines += [f"    switch_light(bench, Light.{light.name})"]
         lines += [
-            f"    switch_light(bench, Light.{light.name})",
             f"    taken = bench.snap({int(self.average.value or 1)})",
             f"    write_snapshot(bench, Path(photograph_name()), taken, Light.{light.name})",
         ]
@@ -347,13 +352,14 @@ class LivePanel(Panel):
 
     def snap(self) -> None:
         """Take a photograph into the runs' folder."""
-        bench, average, light = self.session.bench, int(self.average.value or 1), self.light
+        bench, average = self.session.bench, int(self.average.value or 1)
         target = self.session.runs_folder / "photographs" / photograph_name()
 
         def work(context: JobContext) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
             check_target(target, average)
             with self.session.live.paused():
+                light = light_of(bench)
                 taken = bench.snap(average, on_frame=lambda n: context.report(n))
             write_snapshot(bench, target, taken, light)
 

@@ -14,7 +14,7 @@ from instrument.acquire import free_bytes
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.recorder import Recorder, RecordingStatus
 from instrument.recording import prepare_recording
-from instrument.snapshot import light_of, switch_light
+from instrument.snapshot import Lit
 from instrument.store import Run
 
 _DISK_MS = 5000
@@ -77,9 +77,9 @@ class RecordBar(QWidget):
             return
         session = self._session
         seconds, label = self.seconds.value, self.label.text().strip() or "recording"
-        light = light_of(session.bench)
 
         def work(context: JobContext) -> Run:
+            lit = Lit.now(session.bench)
             recorder = prepare_recording(
                 session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
             )
@@ -87,7 +87,7 @@ class RecordBar(QWidget):
             with session.live.watching(recorder.newest):
                 run = recorder.execute()
             context.check()
-            switch_light(session.bench, light)
+            lit.put_back(session.bench)
             return run
 
         try:
@@ -97,7 +97,6 @@ class RecordBar(QWidget):
             return
         self.job = job
         self.button.setText("■ End")
-        self.button.setProperty("recording", True)
         job.progressed.connect(self._show)
         job.succeeded.connect(self._done)
         job.failed.connect(lambda why: self._panel.refused(self.button, why))

@@ -15,6 +15,7 @@ from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from gui.widgets.image_view import ImageView
 from instrument.images import read_image
+from instrument.snapshot import Light
 from instrument.store import Run
 
 WAIT_MS = 20_000
@@ -142,6 +143,44 @@ def test_a_recording_that_is_ended_before_it_began_does_not_begin(qtbot: QtBot, 
     release.set()
     qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
     assert not list(live.session.runs_folder.glob("*recording*"))
+
+
+@pytest.mark.parametrize("scene", [False, True])
+def test_a_recording_ends_under_the_light_that_it_began_with(
+    qtbot: QtBot, live: LivePanel, scene: bool
+) -> None:
+    bench = live.session.bench
+    assert bench.led_array is not None
+    bench.scene_on() if scene else bench.scene_off()
+    pattern = bench.led_array.set_pattern(bench.led_array.bright_field(0.25, (9, 9, 9)))
+    live.record_bar.seconds.set_value(0.1)
+    live.record()
+    qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
+    assert bench.led_array.pattern == pattern
+    assert bench.scene_lit is scene
+
+
+def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: LivePanel) -> None:
+    bench = live.session.bench
+    assert bench.led_array is not None
+    bench.source_on()
+    bench.scene_off()
+    assert live.light is Light.SOURCE
+    bench.led_array.set_pattern(bench.led_array.bright_field(0.25))
+    assert not bench.source_lit
+    assert live.light is Light.AS_IS
+    live._show_light()
+    assert not any(button.isChecked() for button in live.light_buttons.buttons())
+    live.snap()
+    qtbot.waitUntil(lambda: live.photograph is not None, timeout=WAIT_MS)
+    assert live.photograph is not None
+    taken = read_image(live.photograph).metadata
+    assert taken["light"] == "as-is"
+    assert "bright field" in taken["led_pattern"]
+    code = live.as_python()
+    pattern = bench.led_array.pattern
+    assert f"bench.led_array.set_pattern({pattern!r})" in code
+    compile(code, "copied", "exec")
 
 
 def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
