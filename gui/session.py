@@ -27,7 +27,6 @@ from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
 from instrument.live_camera import LiveCamera
-from instrument.safety import StepsFailedError
 from instrument.snapshot import Light, switch_light
 
 DeviceCondition = Literal["closed", "opening", "open", "failed"]
@@ -35,7 +34,7 @@ Level = Literal["debug", "info", "warning", "error"]
 
 _STOP_REPEAT_S = 0.05
 _STOP_WAIT_S = 10.0
-"""How long STOP goes on stopping while a job has not ended: it may have been about to start a move."""
+"""A job that has not ended by then is told of; STOP goes on, for the job may be about to start a move."""
 _WATCH_MS = 500
 
 
@@ -102,8 +101,9 @@ class BenchSession(QObject):
         self.jobs.job_ended.connect(self._job_ended)
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
         self._threads: list[threading.Thread] = []
-        self._stopping = False
+        self._stopping = self._stop_again = False
         self._closing = False
+        self._all_closed = threading.Event()
         self.is_closed = False
         self._live_wanted = True
         self._live_job: Job | None = None
@@ -312,31 +312,42 @@ class BenchSession(QObject):
             if request.withdrawn is not None:
                 request.withdrawn()
         if self._stopping:
+            self._stop_again = True
             return
         self._stopping = True
         self.log("warning", "STOP")
-        running = self.jobs.device_jobs
-        self._in_thread("STOP", self._stop_all, running)
+        self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
 
     def _stop_all(self, running: tuple[Job, ...]) -> None:
+        """Make the bench safe until a round began after the last job had ended: none can light anything."""
         deadline_s = time.monotonic() + _STOP_WAIT_S
-        failure: BaseException | None = None
+        told = False
         while True:
+            late = tuple(job.title for job in running if not job.is_over)
+            failure: Exception | None = None
             try:
                 self.bench.stop()
-                failure = None
-            except StepsFailedError as error:
+            except Exception as error:  # noqa: BLE001 - whatever it is, STOP goes on and tells it
                 failure = error
-            if all(job.is_over for job in running) or time.monotonic() > deadline_s:
+            if not late or self._all_closed.wait(_STOP_REPEAT_S):
                 break
-            time.sleep(_STOP_REPEAT_S)
-        late = tuple(job.title for job in running if not job.is_over)
+            if not told and time.monotonic() > deadline_s:
+                told = True
+                self._from_thread.emit("stop_late", (failure, late))
         self._from_thread.emit("stopped", (failure, late))
 
-    def _stop_ended(self, failure: BaseException | None, late: tuple[str, ...]) -> None:
-        self._stopping = False
+    def _stop_late(self, failure: Exception | None, late: tuple[str, ...]) -> None:
+        safe = "Light off, nothing moving;" if failure is None else f"{words_for(failure)}\nAnd"
+        self.log("error", f"{safe} {', '.join(late)} has not ended yet. STOP is repeated until it has.")
+
+    def _stop_ended(self, failure: Exception | None, late: tuple[str, ...]) -> None:
+        if self._stop_again and not self._closing:  # pressed once more: something may have begun meanwhile
+            self._stop_again = False
+            self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
+            return
+        self._stopping = self._stop_again = False
         if failure is not None:
-            self.log("error", str(failure))
+            self.log("error", words_for(failure))
         elif late:
             self.log("error", f"Light off, nothing moving; but {', '.join(late)} has not ended yet.")
         else:
@@ -378,19 +389,18 @@ class BenchSession(QObject):
         thread.start()
 
     def _close_all(self, jobs: tuple[Job, ...]) -> None:
-        deadline_s = time.monotonic() + _STOP_WAIT_S
-        while not all(job.is_over for job in jobs) and time.monotonic() < deadline_s:
-            time.sleep(_STOP_REPEAT_S)
-        problem = ""
+        """Close everything; whatever a device does or does not, this ends and says so."""
+        problems: list[str] = []
         try:
-            self.live.stop()
-        except DeviceError as error:
-            problem = words_for(error)
-        try:
-            self.bench.close()
-        except StepsFailedError as error:
-            problem = str(error)
-        self._from_thread.emit("closed", problem)
+            problems += _within(_STOP_WAIT_S, "making the bench safe", self.bench.safe_state)
+            deadline_s = time.monotonic() + _STOP_WAIT_S
+            while not all(job.is_over for job in jobs) and time.monotonic() < deadline_s:
+                time.sleep(_STOP_REPEAT_S)
+            problems += _within(_STOP_WAIT_S, "ending the live view", self.live.stop)
+            problems += _within(_STOP_WAIT_S, "closing the bench", self.bench.close)
+        finally:
+            self._all_closed.set()
+            self._from_thread.emit("closed", "\n".join(problems))
 
     def _ended(self, problem: str) -> None:
         if problem:
@@ -429,6 +439,8 @@ class BenchSession(QObject):
             self.log("error", text)
         elif what == "stopped":
             self._stop_ended(*value)
+        elif what == "stop_late":
+            self._stop_late(*value)
         elif what == "closed":
             self._ended(value)
         elif what == "ask":
@@ -437,6 +449,24 @@ class BenchSession(QObject):
             self.asked.emit(value)
         else:
             self.log(*value)
+
+
+def _within(seconds: float, title: str, work: Callable[[], object]) -> list[str]:
+    """Do something in a thread of its own; return what went wrong, or that it did not end in time."""
+    problems: list[str] = []
+
+    def attempt() -> None:
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001 - whatever it is, the next step is tried
+            problems.append(words_for(error))
+
+    thread = threading.Thread(target=attempt, name=title, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        return [f"{title.capitalize()}: a device does not answer. See by eye that light and motion are off."]
+    return problems
 
 
 def _is_gone(device: Device, error: DeviceError) -> bool:

@@ -1,0 +1,92 @@
+"""STOP and the end: safe whatever a job or a device does meanwhile."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from pytestqt.qtbot import QtBot
+
+from gui.jobs import JobContext, JobState
+from gui.session import BenchSession
+
+WAIT_MS = 20_000
+
+
+def test_what_a_job_lights_in_the_middle_of_stop_is_turned_off(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = session.bench
+    light_is_off, job_is_over = threading.Event(), threading.Event()
+    stop = bench.stop
+
+    def slowly() -> None:
+        stop()  # the light first; a stage and a camera take their time
+        light_is_off.set()
+        assert job_is_over.wait(WAIT_MS / 1000)
+
+    def work(_: JobContext) -> None:
+        assert light_is_off.wait(WAIT_MS / 1000)
+        bench.source_on()
+
+    monkeypatch.setattr(bench, "stop", slowly)
+    job = session.device_job("between two commands", work, {"stage"})
+    job.ended.connect(job_is_over.set)
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.stop()
+    assert not bench.source_lit
+
+
+def test_stop_goes_on_until_a_late_job_has_ended(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.session._STOP_WAIT_S", 0.1)
+    lines: list[str] = []
+    session.logged.connect(lambda _, text: lines.append(text))
+    go_on = threading.Event()
+
+    def work(_: JobContext) -> None:
+        assert go_on.wait(WAIT_MS / 1000)
+        session.bench.source_on()
+
+    job = session.device_job("Slow device", work, {"stage"})
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.stop()
+        qtbot.waitUntil(lambda: any("Slow device has not ended" in line for line in lines), timeout=WAIT_MS)
+        go_on.set()
+    assert job.is_over
+    assert not session.bench.source_lit
+
+
+def test_a_device_that_never_answers_does_not_keep_the_bench_open(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gui.session._STOP_WAIT_S", 0.2)
+    answers = threading.Event()
+    lines: list[str] = []
+    session.logged.connect(lambda _, text: lines.append(text))
+    job = session.camera_job("Region", lambda _: answers.wait(WAIT_MS / 1000), idle=True)
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    session.bench.source_on()
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        session.close()
+    assert not any(device.is_open for device in session.bench.devices.values())
+    assert any("does not answer" in line for line in lines)
+    answers.set()
+
+
+def test_an_unforeseen_error_does_not_keep_the_bench_open(
+    qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> None:
+        raise OSError("the driver's own error")
+
+    lines: list[str] = []
+    session.logged.connect(lambda _, text: lines.append(text))
+    monkeypatch.setattr(session.live, "stop", broken)
+    with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
+        session.close()
+    assert not any(device.is_open for device in session.bench.devices.values())
+    assert any("the driver's own error" in line for line in lines)
