@@ -17,7 +17,7 @@ from recon.auto.probe import (
     COARSE_PX,
     CoarsePass,
     acceptance_px,
-    coarse_pass,
+    coarse_passes,
     colours,
     operator_seconds,
     psf_window,
@@ -30,7 +30,15 @@ from recon.operators.low_rank import principal_psfs
 from recon.preparation import channel_noise, data_of, require_same_pixels
 from recon.types import Calibration
 from recon.volume.channel import VolumePrior
-from recon.volume.model import LOW_RANK_ERROR, MODELS, TOLERATED, Depths, ModelName, choose_model
+from recon.volume.model import (
+    LOW_RANK_ERROR,
+    MODELS,
+    TOLERATED,
+    Depths,
+    ModelName,
+    choose_model,
+    sort_by_depth,
+)
 from recon.volume.reconstruct import plane_gains, prepare_volume
 
 Array = npt.NDArray[Any]
@@ -44,8 +52,10 @@ Total variation cannot tell a smooth object from a background, and loses the hol
 6 dB on the scenes it was tuned on. l1 gained 0.3 to 3 dB, with and without stray light, so that the data need
 only not speak against it.
 """
-EMPTY = 0.03
-"""Share of the coarse pass's light below which a plane is empty, unless a neighbour is not."""
+LEFT_OUT = 0.02
+"""Share of the coarse pass's light, of any channel, that all planes together that are left out may hold."""
+LEFT_OUT_SCALE = 0.1
+"""Share of the light left out that costs 3 dB: a round figure."""
 LEAST_COMMON, LEAST_COMMON_SHARE = 64, 0.05
 """Pixels, and share of all, that must tell all colours for channels to be compared and merged."""
 VARYING_COST = 3.0
@@ -158,35 +168,36 @@ def choose(
     merge, tint = _channels(data, deviation, valid, calibration.psfs, wishes)
     if tint is not None and merge.value == "merged":
         data, valid, calibration = _merged(data, valid, calibration, tint)
-    whole = bool(valid[0].all())
+    whole = bool(valid.all())
     # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
     factor = max(1, max(data.shape[1:]) // COARSE_PX) if whole else 1
-    coarse = prepare_volume(
-        binned(data[0], factor),
-        reduced_calibration(_first_channel(calibration), factor, None),
-        None,
-        None if whole else ~np.asarray(valid[0], bool),
-        None,
-    )
-    fine = prepare_volume(
-        data[0], _first_channel(calibration), None, ~np.asarray(valid[0], bool), float(deviation[0])
-    )
+    depths = sort_by_depth(calibration)
+    coarse = [
+        prepare_volume(
+            binned(data[c], factor),
+            reduced_calibration(_one_channel(calibration, c), factor, None),
+            None,
+            None if whole else ~np.asarray(valid[c], bool),
+            None,
+        )
+        for c in range(len(data))
+    ]
     kind = "tv" if prior.startswith("tv") else "l1"
-    model, why, variation = _model(fine.depths, wishes)
+    model, why, variation = _model(depths, wishes)
     # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
-    even = replace(coarse, depths=coarse.depths.divided(plane_gains(coarse)))
-    sparse = coarse_pass(even, "convolution", "l1", background=True)
+    even = [replace(c, depths=c.depths.divided(plane_gains(c))) for c in coarse]
+    sparse = coarse_passes(even, "l1", background=True)
     if kind == "l1":
-        dark, lit = coarse_pass(even, "convolution", "l1", background=False), sparse
+        dark, lit = coarse_passes(even, "l1", background=False), sparse
     else:
-        dark, lit = (coarse_pass(coarse, "convolution", prior, background=b) for b in (False, True))
+        dark, lit = (coarse_passes(coarse, prior, background=b) for b in (False, True))
     smooth = _background(dark, lit, kind, wishes, given=background is not None)
-    planes, dropped = _planes(sparse, fine.depths, wishes)
-    times = {m: operator_seconds(coarse, m) for m in _candidates(fine.depths)}
-    binning = _binning(fine.depths, wishes, whole=whole)
-    window, reach, field = _field(fine.depths, wishes)
+    planes, dropped = _planes(sparse, depths, wishes)
+    times = {m: operator_seconds(coarse[0], m) for m in _candidates(depths)}
+    binning = _binning(depths, wishes, whole=whole)
+    window, reach, field = _field(depths, wishes)
     decisions = (
-        _with_options(model, why, variation, fine.depths, times, wishes),
+        _with_options(model, why, variation, depths, times, wishes),
         dropped,
         field,
         binning,
@@ -202,7 +213,7 @@ def choose(
     return Choice(
         model=model,
         planes=planes,
-        n_planes=len(fine.depths.z_um),
+        n_planes=len(depths.z_um),
         binning=int(binning.numbers["binning"]),
         merged=merge.value == "merged",
         background=smooth.value == "estimated",
@@ -217,8 +228,9 @@ def choose(
 
 
 # Pieces ------------------------------------------------------------------------------------------------
-def _first_channel(calibration: Calibration) -> Calibration:
-    return replace(calibration, psfs=calibration.psfs[:, :1], background=None)
+def _one_channel(calibration: Calibration, channel: int) -> Calibration:
+    own = channel if calibration.psfs.shape[1] > 1 else 0
+    return replace(calibration, psfs=calibration.psfs[:, own : own + 1], background=None)
 
 
 def _merged(
@@ -333,7 +345,7 @@ def _background(dark: CoarsePass, lit: CoarsePass, kind: str, wishes: Wishes, *,
     ratio = dark.misfit / max(lit.misfit, 1e-6)
     numbers = {"misfit_without": dark.misfit, "misfit_with": lit.misfit, "needed": BACKGROUND_GAIN[kind]}
     asked = wishes.background is not None
-    picture = kind == "tv" and len(dark.light) == 1
+    picture = kind == "tv" and dark.light.shape[1] == 1
     on = bool(wishes.background) if asked else ratio >= BACKGROUND_GAIN[kind] and not given and not picture
     why = (
         f"a coarse pass misses the data by {dark.misfit:.2f} of the noise without a smooth background and by "
@@ -361,9 +373,7 @@ def _planes(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple[i
     everything = tuple(range(n))
     if n == 1:
         return everything, Decision("planes", "1", "one depth was calibrated")
-    lit = passed.light >= EMPTY
-    if not lit.any():
-        lit[:] = True
+    lit = np.any([_most_of(light) for light in passed.light], axis=0)
     # The coarse pass may take a plane for its neighbour: those of lit planes stay.
     order = np.argsort(depths.z_um) if np.isfinite(depths.z_um).all() else np.arange(n)
     near = lit[order].copy()
@@ -373,24 +383,45 @@ def _planes(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple[i
     kept[order] = near
     asked = wishes.planes == "all"
     planes = everything if asked else tuple(int(z) for z in np.flatnonzero(kept))
-    lost = float(passed.light[~kept].sum())
+    lost = _share(passed.light, ~kept)
+    channel = " of any colour" if len(passed.light) > 1 else ""
     why = (
-        f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light into {n - int(kept.sum())} "
-        f"that lie apart from any with {EMPTY:.1%} or more"
+        f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light{channel} into "
+        f"{n - int(kept.sum())} ({LEFT_OUT:.0%} may be left out, and neighbours of those that are not stay)"
     )
+    loss = 0.0 if asked else _left_out_db(lost)
     numbers = {"planes": float(len(planes)), "of": float(n), "light_left_out": lost}
-    up = None if len(planes) == n else Option(f"all {n}", n / len(planes), 0.0)
+    up = None if len(planes) == n else Option(f"all {n}", n / len(planes), -loss)
     fewest = tuple(int(z) for z in np.flatnonzero(lit))
     down = None
     if len(fewest) < len(planes):
-        missing = float(passed.light[[z for z in planes if z not in fewest]].sum())
         down = Option(
             f"{len(fewest)} without their neighbours",
             len(fewest) / len(planes),
-            -10 * float(np.log10(1 + missing / max(1 - missing, 1e-6) * 10)),
+            _left_out_db(_share(passed.light, ~lit)) - loss,
         )
     value = f"all {n}" if len(planes) == n else f"{len(planes)} of {n} ({_ranges(planes)})"
-    return planes, Decision("planes", value, why, 0.0, up, down, asked, numbers)
+    return planes, Decision("planes", value, why, loss, up, down, asked, numbers)
+
+
+def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return the fewest planes that hold all but ``LEFT_OUT`` of the light; all where there is none."""
+    if not light.any():
+        return np.ones(len(light), bool)
+    order = np.argsort(-light, kind="stable")
+    left = light.sum() - np.cumsum(light[order])
+    chosen = np.zeros(len(light), bool)
+    chosen[order[: int(np.argmax(left <= LEFT_OUT * light.sum())) + 1]] = True
+    return chosen
+
+
+def _share(light: npt.NDArray[np.float64], planes: npt.NDArray[np.bool_]) -> float:
+    """Largest share of any channel's light in some planes."""
+    return float(light[:, planes].sum(axis=1).max())
+
+
+def _left_out_db(share: float) -> float:
+    return -10 * float(np.log10(1 + share / LEFT_OUT_SCALE)) if share > 0 else 0.0
 
 
 def _ranges(planes: tuple[int, ...]) -> str:
@@ -405,7 +436,7 @@ def _ranges(planes: tuple[int, ...]) -> str:
 
 
 def _binning(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
-    sharpest = min(resolution_px(p) for p in depths.central[:, 0])
+    sharpest = min(resolution_px(p) for psfs in depths.central for p in psfs)
     side = max(depths.central.shape[2:])
     if not np.isfinite(sharpest):
         sharpest = float(side)

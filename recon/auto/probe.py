@@ -38,8 +38,8 @@ class CoarsePass:
     ----------
     misfit : float
         Root mean square of the residual in units of the noise.
-    light : ndarray, (n_z,)
-        Share of every plane in the light.
+    light : ndarray, (n_channels, n_z)
+        Share of every plane in the channel's light.
     seconds : float
         Processor time of an iteration.
     """
@@ -47,6 +47,16 @@ class CoarsePass:
     misfit: float
     light: npt.NDArray[np.float64]
     seconds: float
+
+
+def coarse_passes(channels: list[Scaled], prior: VolumePrior, *, background: bool) -> CoarsePass:
+    """Reconstruct every channel in few iterations; the misfit is their root mean square."""
+    passes = [coarse_pass(c, "convolution", prior, background=background) for c in channels]
+    return CoarsePass(
+        float(np.sqrt(np.mean([p.misfit**2 for p in passes]))),
+        np.concatenate([p.light for p in passes]),
+        sum(p.seconds for p in passes),
+    )
 
 
 def coarse_pass(scaled: Scaled, model: ModelName, prior: VolumePrior, *, background: bool) -> CoarsePass:
@@ -75,7 +85,8 @@ def coarse_pass(scaled: Scaled, model: ModelName, prior: VolumePrior, *, backgro
     per_plane = volume.sum(axis=(1, 2)) * scaled.depths.central[:, 0].sum(axis=(1, 2), dtype=np.float64)
     valid = scaled.valid[0]
     misfit = float(np.sqrt(np.mean(residual[0][valid].astype(np.float64) ** 2)))
-    return CoarsePass(misfit, per_plane / max(float(per_plane.sum()), 1e-30), seconds)
+    share = per_plane / max(float(per_plane.sum()), 1e-30)
+    return CoarsePass(misfit, share[None], seconds)
 
 
 def operator_seconds(scaled: Scaled, model: ModelName) -> float:

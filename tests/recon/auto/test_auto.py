@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,6 +38,44 @@ def test_empty_planes_are_left_out_and_come_back_empty(beads, chosen_beads):
     np.testing.assert_allclose(chosen_beads.grid.z_um, beads.calibration.source_positions_um[::9, 2])
     assert chosen_beads.provenance["auto"]["planes"] == list(choice.planes)
     json.dumps(chosen_beads.provenance["auto"], allow_nan=False)
+
+
+def test_what_is_left_out_is_said(chosen_beads):
+    planes = decision(chosen_beads.choice, "planes")
+    assert 0 < planes.numbers["light_left_out"] <= 0.02
+    assert -1 < planes.error_db < 0
+    assert planes.up is not None
+    assert planes.up.error_db == -planes.error_db
+
+
+def test_light_in_many_depths_keeps_them():
+    scene = make_scene("beads", size=48, depths=48, density=2.0, seed=1)
+    choice = choose(scene.measurement, scene.calibration, prior="l1")
+    light = scene.truth.sum(axis=(1, 2))
+    assert light[list(choice.planes)].sum() > 0.9 * light.sum()
+
+
+def test_planes_of_every_colour_stay():
+    near, far = (
+        make_scene("beads", size=40, depths=8, layers=layers, density=0.5, seed=31)
+        for layers in ((0.0, 0.1), (0.9, 1.0))
+    )
+    np.testing.assert_array_equal(near.calibration.psfs, far.calibration.psfs)
+    colours = np.stack([far.measurement, near.measurement, near.measurement], axis=-1)
+    choice = choose(colours, near.calibration, prior="l1")
+    assert not choice.merged
+    for scene in (near, far):
+        light = scene.truth.sum(axis=(1, 2))
+        assert light[list(choice.planes)].sum() > 0.9 * light.sum()
+
+
+def test_the_sharpest_colour_and_the_widest_decide():
+    scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0, channels=3, grid=1)
+    assert choose_picture(scene.measurement, scene.calibration).binning > 1
+    psfs = np.repeat(scene.calibration.psfs[:, :1], 3, axis=1)
+    psfs[:, 2] = make_scene("sparse-picture", size=64, grid=1).calibration.psfs[:, 0]
+    apart = replace(scene.calibration, psfs=psfs)
+    assert choose_picture(scene.measurement, apart, wishes=Wishes(channels="all")).binning == 1
 
 
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
