@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,8 @@ class DisplayBench:
     estimate_background : bool
         For a laser that nobody can switch off: the background is not measured but estimated, the mean of the
         first photograph's darkest 10 x 10 pixels.
+    check : callable, optional
+        Called before anything is shown or photographed; what it raises ends that, e.g. ``RunControl.check``.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class DisplayBench:
         correction: SlmCorrection | None = None,
         *,
         estimate_background: bool = False,
+        check: Callable[[], object] | None = None,
     ) -> None:
         if bench.slm is None:
             raise BenchError(f"{bench.label} has no [slm].")
@@ -49,15 +52,18 @@ class DisplayBench:
         self.binning = binning
         self.correction = correction or SlmCorrection.ideal()
         self.estimates_background = estimate_background
+        self._check = check or (lambda: None)
         self.frames = 0
         self._dark: tuple[tuple[float, ...], Array | float] | None = None
 
     def show(self, field: Array) -> None:
         """Show the phase of an SLM field, complex (height, width) in binned pixels."""
+        self._check()
         self.slm.display(self.correction.apply(phase_levels(np.angle(field), self.binning)))
 
     def show_levels(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels as they are, uncorrected, (height, width) of the whole SLM."""
+        self._check()
         self.slm.display(levels)
 
     def photograph(self, exposure_ms: float) -> Array:
@@ -66,6 +72,7 @@ class DisplayBench:
         The dark level is measured once with the laser off (or estimated with it on), at the first exposure
         asked for; its part that grows with time is small against it.
         """
+        self._check()
         camera = self.bench.camera
         low, high = camera.exposure_limits_ms
         exposure = camera.set_exposure_ms(float(np.clip(exposure_ms, low, high)))
@@ -79,6 +86,7 @@ class DisplayBench:
         if self._dark is None or self._dark[0] != key:
             self.bench.scene_off()
             self._dark = key, self._snap()
+            self._check()
         self.bench.scene_on()
         return (self._snap() - self._dark[1]) / exposure
 

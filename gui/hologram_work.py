@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,9 @@ from calibration_routines.hologram_photograph import (
     photograph_hologram,
     write_capture,
 )
+from calibration_routines.procedure import under_control
+from drivers.camera import Camera
+from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
 from gui.python_lines import expression
 from instrument.alignment_file import load_alignment
@@ -26,6 +31,8 @@ from instrument.display_setup import bench_display
 from instrument.hologram_file import HologramFiles
 from instrument.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
 from instrument.images import read_image
+from instrument.run_control import EndedEarlyError, RunControl
+from instrument.safety import StepsFailedError
 from instrument.slm_correction import load_slm_correction
 from recon.holography import Display, HologramRecord, Target
 
@@ -154,25 +161,58 @@ def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, conte
 def photograph(
     bench: Bench, computed: Computed, correction: Path | None, average: int, context: JobContext
 ) -> tuple[Photographed, Path]:
-    """Show a hologram, photograph it, compare it with its target, and write what was seen."""
-    if computed.order.alignment is not None:
-        bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
-    context.check()
-    found = photograph_hologram(
-        _display_bench(bench, correction),
-        list(computed.result.hologram.slm),
-        computed.display,
-        computed.target,
-        average=average,
-    )
+    """Show a hologram, photograph it, compare it with its target, and write what was seen.
+
+    Ends at once when it is cancelled; the bench is safe afterwards, however it ends, and the
+    camera's exposure as it was.
+    """
+    control = RunControl()
+
+    def stop() -> None:
+        with contextlib.suppress(StepsFailedError):  # told by STOP, and by the procedure's own end
+            control.stop()
+
+    def cancel() -> None:
+        control.abort()  # from now on no further frame; a move or an exposure is ended by the thread
+        threading.Thread(target=stop, name="STOP", daemon=True).start()
+
+    context.on_cancel(cancel)
+    try:
+        with _exposure_kept(bench.camera), under_control(bench, control):
+            if computed.order.alignment is not None:
+                bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
+            found = photograph_hologram(
+                _display_bench(bench, correction, control.check),
+                list(computed.result.hologram.slm),
+                computed.display,
+                computed.target,
+                average=average,
+            )
+            bench.safe_state()
+    except EndedEarlyError as error:
+        raise JobCancelledError from error
     out = computed.order.out.with_name(f"{computed.order.out.stem}-seen.png")
     write_capture(out, found)
     return found, out
 
 
-def _display_bench(bench: Bench, correction: Path | None) -> DisplayBench:
+@contextlib.contextmanager
+def _exposure_kept(camera: Camera) -> Iterator[None]:
+    before_ms = camera.exposure_ms
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(DeviceError):  # the error that ended it is the one to be told
+            camera.set_exposure_ms(before_ms)
+        raise
+    camera.set_exposure_ms(before_ms)
+
+
+def _display_bench(
+    bench: Bench, correction: Path | None, check: Callable[[], object] | None = None
+) -> DisplayBench:
     loaded = None if correction is None else load_slm_correction(correction)
-    return DisplayBench(bench, bench.config.display.slm_binning, loaded)
+    return DisplayBench(bench, bench.config.display.slm_binning, loaded, check=check)
 
 
 def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 import instrument
+from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
 from gui.views.view_grid import best_columns
@@ -220,3 +222,50 @@ def test_the_target_is_shown_as_it_fills_the_field(panel: HologramsPanel, tmp_pa
     np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
     panel.fit.setCurrentText("stretch")
     np.testing.assert_allclose(panel.target.image, picture)
+
+
+@pytest.mark.parametrize("how", ["the panel's Stop", "STOP"])
+def test_a_photograph_is_stopped_before_its_next_frame(
+    qtbot: QtBot, panel: HologramsPanel, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    computed(qtbot, panel, panel.compute_button)
+    bench = panel.session.bench
+    before_ms = bench.camera.exposure_ms
+    frames: list[bool] = []
+    first, go_on = threading.Event(), threading.Event()
+    snap = bench.snap
+
+    def slowly(*arguments, **names):
+        frames.append(bench.scene_lit)
+        first.set()
+        assert go_on.wait(WAIT_MS / 1000)
+        return snap(*arguments, **names)
+
+    monkeypatch.setattr(bench, "snap", slowly)
+    click(qtbot, panel.capture_button)
+    job = panel.job
+    qtbot.waitUntil(first.is_set, timeout=WAIT_MS)
+    if how == "STOP":
+        panel.session.stop()
+    else:
+        click(qtbot, panel.stop_button)
+    go_on.set()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    assert job.state is JobState.CANCELLED
+    assert len(frames) == 1
+    assert not bench.scene_lit
+    assert bench.camera.exposure_ms == before_ms
+
+
+def test_a_photograph_leaves_the_light_off_and_the_exposure_as_it_was(
+    qtbot: QtBot, panel: HologramsPanel
+) -> None:
+    computed(qtbot, panel, panel.compute_button)
+    bench = panel.session.bench
+    before_ms = bench.camera.exposure_ms
+    click(qtbot, panel.capture_button)
+    with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+        pass
+    assert panel.job.error is None
+    assert not bench.scene_lit
+    assert bench.camera.exposure_ms == before_ms
