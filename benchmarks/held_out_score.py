@@ -45,7 +45,7 @@ def points_of(family: str, size: int, seed: int) -> list[Point]:
         point
         for setting in settings_for(problem)
         if setting.model != "local" and setting.binning == 1
-        for point in run_setting(problem, setting, counts=COUNTS)
+        for point in run_setting(problem, setting, counts=COUNTS).points
     ]
 
 

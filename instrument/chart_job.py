@@ -19,8 +19,9 @@ import numpy as np
 from instrument.atomic import write_text
 from instrument.errors import BenchError, FileError
 from instrument.reconstruction_job import Job
-from recon.chart import ChartProblem, Measure, Point, Setting, pareto, run_setting, settings_for
+from recon.chart import ChartProblem, Curve, Measure, Point, Setting, pareto, run_setting, settings_for
 from recon.errors import InputError
+from recon.noise import NoiseModel
 from recon.scenes import make_scene
 from recon.scenes.scene import Family
 from recon.volume.model import one_depth
@@ -42,7 +43,7 @@ class ChartData:
     failed : mapping of str to str
         Settings that could not be run, and why.
     missing : tuple of str
-        Settings for which there was no time.
+        Settings for which there was no time, or not enough: their points, if any, end before the last count.
     """
 
     about: Mapping[str, Any]
@@ -123,9 +124,19 @@ def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[Chart
             calibration,
             volume,
             None if valid is None or valid.all() else np.logical_not(np.asarray(valid, bool)),
+            _noise_of_mean(job),
         ),
         {"inputs": dict(job.provenance), "simulated": job.simulated},
     )
+
+
+def _noise_of_mean(job: Job) -> NoiseModel | float | None:
+    """Return what the photograph's metadata say of its noise, of the mean of its colours."""
+    noise = job.binned_noise(None)
+    if job.measurement.ndim == 2 or not isinstance(noise, NoiseModel):
+        return noise
+    colours = job.measurement.shape[2]
+    return NoiseModel(noise.read_noise / colours**0.5, noise.counts_per_electron / colours)
 
 
 def make_chart(
@@ -141,13 +152,16 @@ def make_chart(
         When ``path`` is the chart of another problem.
     """
     key = _fingerprint(problem)
-    points, failed = _kept(path, key)
+    points, failed, cut_off = _kept(path, key)
     about = {**about, "fingerprint": key, "pixels": list(problem.measurement.shape)}
     settings = settings_for(problem)
-    done = {p.setting for p in points} | set(failed)
-    waiting = [s for s in settings if s.name not in done]
+    begun = {p.setting for p in points}
+    waiting = [s for s in settings if s.name not in begun | set(failed)]
+    # Those that the last budget cut off come after those that have had nothing yet, each from its start.
+    waiting += [s for s in settings if s.name in begun & cut_off]
     began = time.monotonic()
-    data = ChartData(about, tuple(points), failed, tuple(s.name for s in waiting))
+    missing = [s.name for s in waiting]
+    data = ChartData(about, tuple(points), failed, tuple(missing))
     for place, setting in enumerate(waiting):
         left = budget_s - (time.monotonic() - began)
         if left <= 0:
@@ -156,9 +170,14 @@ def make_chart(
         found = _in_own_process(problem, setting, left)
         if isinstance(found, str):
             failed[setting.name] = found
+            missing.remove(setting.name)
         else:
-            points += found
-        data = ChartData(about, tuple(points), dict(failed), tuple(s.name for s in waiting[place + 1 :]))
+            before = [p for p in points if p.setting == setting.name]
+            if found.finished or len(found.points) >= len(before):
+                points = [p for p in points if p.setting != setting.name] + list(found.points)
+            if found.finished:
+                missing.remove(setting.name)
+        data = ChartData(about, tuple(points), dict(failed), tuple(missing))
         write_text(path, json.dumps(data.to_json(), indent=1, allow_nan=False) + "\n")
     return data
 
@@ -167,25 +186,31 @@ def _fingerprint(problem: ChartProblem) -> str:
     digest = hashlib.sha256()
     for array in (problem.measurement, problem.calibration.psfs, problem.calibration.source_positions_um):
         digest.update(np.ascontiguousarray(array).data)
-    digest.update(str(problem.volume).encode())
+    for part in (problem.erasures, problem.truth):
+        digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
+    digest.update(f"{problem.volume} {problem.noise}".encode())
     return digest.hexdigest()[:16]
 
 
-def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str]]:
+def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
+    """Return points, failures and the settings that are not finished, as a chart has them."""
     if not path.exists():
-        return [], {}
+        return [], {}, set()
     try:
         record = json.loads(path.read_text())
         same = record["about"]["fingerprint"] == key
         points = [_point(p) for p in record["points"]]
         failed = dict(record["failed"])
+        cut_off = set(record["missing"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FileError(path, f"is no chart of this program ({error}).", "Name another folder.") from error
     if not same:
         raise FileError(
-            path, "is a chart of another photograph or calibration.", "Name another folder with --out."
+            path,
+            "is a chart of another photograph or calibration, or of another noise or version of the program.",
+            "Name another folder with --out.",
         )
-    return points, failed
+    return points, failed, cut_off
 
 
 def _point(record: dict[str, Any]) -> Point:
@@ -193,7 +218,7 @@ def _point(record: dict[str, Any]) -> Point:
     return Point(**values)
 
 
-def _in_own_process(problem: ChartProblem, setting: Setting, limit_s: float) -> list[Point] | str:
+def _in_own_process(problem: ChartProblem, setting: Setting, limit_s: float) -> Curve | str:
     """Run one setting by itself, so that its memory is its own; the reason where it cannot be run."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -201,7 +226,7 @@ def _in_own_process(problem: ChartProblem, setting: Setting, limit_s: float) -> 
     process.start()
     theirs.close()
     try:
-        found: list[Point] | str = ours.recv()
+        found: Curve | str = ours.recv()
     except EOFError:
         process.join()
         return f"the process ended with status {process.exitcode} (out of memory?)"
@@ -220,9 +245,9 @@ def _work(pipe: Connection, problem: ChartProblem, setting: Setting, limit_s: fl
         # memory is left lying about that the run would take without its showing.
         run_setting(_small(problem), replace(setting, binning=1), counts=(1,))
         before = _reset_peak_mib()
-        points = run_setting(problem, setting, limit_s=limit_s)
+        curve = run_setting(problem, setting, limit_s=limit_s)
         peak = _peak_mib() - before
-        pipe.send([replace(p, peak_mib=peak) for p in points])
+        pipe.send(replace(curve, points=tuple(replace(p, peak_mib=peak) for p in curve.points)))
     except InputError as error:
         pipe.send(str(error))
     finally:

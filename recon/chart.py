@@ -3,7 +3,8 @@
 A run is scored at several counts of iterations on the way, with the time the solver had spent by then
 without the scoring. With a ground truth the score is PSNR, SSIM and NRMSE; always also the residual relative
 to the noise, and the error on pixels that were held out: 5 % of them are erased, reconstructed from the rest
-and predicted.
+and predicted. They are held out in blocks of the coarsest binning, and the error is that of their means:
+it is of the same light and in the same units whatever a setting's binning is.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from recon.auto.reduced import binned, enlarged, reduced_calibration
+from recon.auto.reduced import binned, blocks, enlarged, reduced_calibration
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
 from recon.picture import reconstruct
 from recon.preparation import channel_noise, data_of
 from recon.scenes.score import score
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.stopping import IterationRecord, StopReason
 from recon.types import Calibration
 from recon.volume.channel import ChannelProblem, VolumePrior
 from recon.volume.model import ModelName, members_of_depths
@@ -84,7 +85,8 @@ class Point:
     residual : float
         Norm of the residual over that of the noise, on the pixels that were used.
     held_out : float
-        Root mean square error of the predicted held-out pixels, in units of the noise.
+        Root mean square error of the predicted held-out blocks' means, in units of these means' noise;
+        the blocks are those of the coarsest binning.
     psnr_db, ssim, nrmse : float
         Against the truth; NaN without one.
     peak_mib : float
@@ -104,6 +106,21 @@ class Point:
     def to_json(self) -> dict[str, Any]:
         """Return it with None for what is not known."""
         return {k: None if v != v else v for k, v in asdict(self).items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One setting's scores.
+
+    Attributes
+    ----------
+    points : tuple of Point
+    finished : bool
+        False where the time limit cut the run off: given longer, it would go on.
+    """
+
+    points: tuple[Point, ...]
+    finished: bool
 
 
 @dataclass(frozen=True)
@@ -172,7 +189,7 @@ def run_setting(
     limit_s: float | None = None,
     counts: Sequence[int] = COUNTS,
     seed: int = 0,
-) -> list[Point]:
+) -> Curve:
     """Reconstruct once and score on the way.
 
     Parameters
@@ -200,7 +217,7 @@ def run_setting(
         "judged": False,
     }
     if setting.method == "volume":
-        reconstruct_volume(
+        volume = reconstruct_volume(
             judge.measurement,
             judge.calibration,
             prior=setting.prior,  # type: ignore[arg-type]
@@ -210,7 +227,7 @@ def run_setting(
             callback=note,
             **common,
         )
-        return points
+        return Curve(tuple(points), StopReason.TIME not in volume.stop_reasons)
     one_shot = setting.method == "wiener"
     if one_shot:
         common |= {"iterations": None, "time_s": None}
@@ -224,7 +241,9 @@ def run_setting(
         callback=None if one_shot else note,
         **common,
     )
-    return [judge.point(result.image, 0, result.seconds)] if one_shot else points
+    if one_shot:
+        points = [judge.point(result.image, 0, result.seconds)]
+    return Curve(tuple(points), result.stop_reason is not StopReason.TIME)
 
 
 class _Judge:
@@ -235,18 +254,25 @@ class _Judge:
         factor = setting.binning
         shape = problem.measurement.shape
         kept = np.ones(shape, bool) if problem.erasures is None else ~problem.erasures
-        # Blocks of the coarsest binning, so that every setting predicts the same light.
-        block = _binnings(problem)[-1]
-        coarse = tuple(-(-n // block) for n in shape)
-        held = np.random.default_rng(seed).random(coarse) < HELD_SHARE
-        held = np.repeat(np.repeat(held, block, 0), block, 1)[: shape[0], : shape[1]]
+        # Blocks of the coarsest binning, on its grid, so that every setting predicts the same light.
+        binnings = _binnings(problem)
+        block = binnings[-1]
+        self._together = block // factor
+        spans = [_common_blocks(n, binnings) for n in shape]
+        chosen = np.random.default_rng(seed).random([count for _, count in spans]) < HELD_SHARE
+        held = np.zeros(shape, bool)
+        held[tuple(slice(first, first + count * block) for first, count in spans)] = np.repeat(
+            np.repeat(chosen, block, 0), block, 1
+        )
         self.measurement = binned(problem.measurement, factor)
         self.calibration = reduced_calibration(problem.calibration, factor, None)
         self.held = binned((held & kept).astype(np.float32), factor) > 0.5
         self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
         self.erasures = self.held | ~self.kept
         data, valid, _ = data_of(problem.measurement, None, None if kept.all() else ~kept)
-        self.noise = channel_noise(data[0], valid[0], problem.noise) / factor
+        pixel_noise = channel_noise(data[0], valid[0], problem.noise)
+        self.noise = pixel_noise / factor
+        self._block_noise = pixel_noise / block
         self._camera: ChannelProblem | None = None
 
     @property
@@ -263,8 +289,10 @@ class _Judge:
         """Score a picture or volume of the full field."""
         planes = found[None] if found.ndim == 2 else found
         predicted = self._predict(planes)
-        error = (self.measurement - predicted) / self.noise
-        held, used = error[self.held & self.kept], error[~self.erasures]
+        error = self.measurement - predicted
+        used = error[~self.erasures] / self.noise
+        scored = binned((self.held & self.kept).astype(np.float32), self._together) > 0.5
+        held = binned(error, self._together)[scored] / self._block_noise
         point = Point(
             self.setting.name,
             iterations,
@@ -317,6 +345,16 @@ class _Judge:
                 weights=np.ones((len(scaled.depths.z_um), 3)),
             )
         return self._camera
+
+
+def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:
+    """First pixel and number of the coarsest binning's blocks that all binnings have when binned on."""
+    block = binnings[-1]
+    before, behind = n, n
+    for factor in binnings:
+        _, count = blocks(blocks(n, factor)[1], block // factor)
+        before, behind = min(before, count // 2), min(behind, count - count // 2)
+    return n // 2 - before * block, before + behind
 
 
 def pareto(points: Iterable[Point], measure: Measure) -> list[Point]:

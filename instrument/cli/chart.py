@@ -108,7 +108,7 @@ def chart(
         typer.echo(f"Warning: {name} could not be run: {why}", err=True)
     if data.missing:
         typer.echo(
-            f"No time for {len(data.missing)} settings ({', '.join(data.missing[:3])}, ...): run the same "
-            "command again to go on."
+            f"No time, or not enough, for {len(data.missing)} settings "
+            f"({', '.join(data.missing[:3])}, ...): run the same command again to go on."
         )
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")

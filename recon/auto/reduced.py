@@ -23,14 +23,14 @@ def binned(image: Array, factor: int) -> Floats:
     if factor == 1:
         return np.asarray(image, np.float32)
     for axis in (-2, -1):
-        first, count = _blocks(image.shape[axis], factor)
+        first, count = blocks(image.shape[axis], factor)
         image = np.take(image, np.arange(first, first + count * factor), axis=axis)
     height, width = image.shape[-2] // factor, image.shape[-1] // factor
     tiles = image.reshape(*image.shape[:-2], height, factor, width, factor)
     return np.asarray(tiles.mean(axis=(-3, -1)), np.float32)
 
 
-def _blocks(n: int, factor: int) -> tuple[int, int]:
+def blocks(n: int, factor: int) -> tuple[int, int]:
     """First pixel and number of the blocks: the axis' pixel begins block ``count // 2``."""
     count = n // factor
     first = n // 2 - (count // 2) * factor

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from instrument.cli import chart as module
+from instrument.reconstruction_job import Job
+from recon import Calibration, NoiseModel
 from recon import chart as recon_chart
 
 
@@ -57,6 +61,60 @@ def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
     assert len(quick) == 2
 
 
+def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_path):
+    import instrument.chart_job as job
+
+    whole = job._in_own_process
+
+    def cut(problem, setting, limit_s):
+        curve = whole(problem, setting, limit_s)
+        shorter = setting.method != "wiener"
+        return recon_chart.Curve(curve.points[:1], False) if shorter else curve
+
+    out = tmp_path / "chart"
+    problem, about = job.problem_of_scene("sparse-picture", 32, 0)
+    path = tmp_path / "chart.json"
+    arguments = {"budget_s": 100.0, "told": lambda *_: None}
+    monkeypatch.setattr(job, "_in_own_process", cut)
+    assert run("--scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
+    data = job.make_chart(problem, about, path, **arguments)
+    assert [p.iterations for p in data.points] == [0, 2]
+    assert data.missing == ("admm convolution tv",)
+    quick.clear()
+    monkeypatch.setattr(job, "_in_own_process", whole)
+    data = job.make_chart(problem, about, path, **arguments)
+    assert quick == ["admm convolution tv"]
+    assert [p.iterations for p in data.points] == [0, 2, 5]
+    assert data.missing == ()
+    quick.clear()
+    job.make_chart(problem, about, path, **arguments)
+    assert not quick
+
+
+def test_a_chart_tells_noise_erasures_and_truth_apart():
+    from instrument.chart_job import _fingerprint, problem_of_scene
+
+    problem, _ = problem_of_scene("sparse-picture", 32, 0)
+    others = [
+        replace(problem, noise=7.0),
+        replace(problem, erasures=np.eye(32, dtype=bool)),
+        replace(problem, truth=None),
+    ]
+    assert len({_fingerprint(p) for p in (problem, *others)}) == 4
+    assert _fingerprint(replace(problem)) == _fingerprint(problem)
+
+
+def test_the_noise_that_the_photograph_tells_is_used():
+    from instrument.chart_job import problem_of_job
+
+    calibration = Calibration(np.ones((1, 1, 8, 8), np.float32), np.array([[0, 0, 1e4]]))
+    grey = Job(np.ones((8, 8), np.float32), calibration, {}, known_noise=NoiseModel(3.0, 0.3))
+    assert problem_of_job(grey, None, volume=False)[0].noise == NoiseModel(3.0, 0.3)
+    colour = replace(grey, measurement=np.ones((8, 8, 3), np.float32))
+    noise = problem_of_job(colour, None, volume=False)[0].noise
+    assert (noise.read_noise, noise.counts_per_electron) == pytest.approx((3**0.5, 0.1))
+
+
 @pytest.mark.usefixtures("quick")
 def test_another_scene_does_not_mix_with_a_chart(tmp_path):
     assert run("--scene", "sparse-picture", "--size", 32, "--out", tmp_path).exit_code == 0
@@ -81,6 +139,7 @@ def test_a_setting_runs_in_a_process_of_its_own():
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     found = _in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
     assert not isinstance(found, str)
-    assert found[0].peak_mib < 500
+    assert found.points[0].peak_mib < 500
+    assert found.finished
     refused = _in_own_process(problem, recon_chart.Setting("admm", "convolution", "tv-haar"), 20.0)
     assert isinstance(refused, str)

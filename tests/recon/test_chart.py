@@ -5,6 +5,7 @@ import pytest
 
 from recon.chart import ChartProblem, Point, Setting, pareto, run_setting, settings_for
 from recon.scenes import make_scene
+from recon.types import Calibration
 
 
 def problem(family="sparse-picture", **changes):
@@ -20,7 +21,7 @@ def problem(family="sparse-picture", **changes):
 
 
 def test_scores_come_on_the_way_and_get_better():
-    points = run_setting(problem(), Setting("admm", "convolution", "tv"), counts=(2, 10, 40))
+    points = run_setting(problem(), Setting("admm", "convolution", "tv"), counts=(2, 10, 40)).points
     assert [p.iterations for p in points] == [2, 10, 40]
     assert points[0].seconds < points[1].seconds < points[2].seconds
     assert points[0].psnr_db < points[2].psnr_db
@@ -45,11 +46,43 @@ def test_held_out_pixels_were_not_looked_at():
             ChartProblem(m, whole.calibration, False, None, 5.0, whole.truth),
             Setting("admm", "convolution", "tv"),
             counts=(20,),
-        )[0]
+        ).points[0]
         for m in (whole.measurement, spoilt)
     ]
     assert points[0].psnr_db == pytest.approx(points[1].psnr_db, abs=1e-3)
     assert points[1].held_out > 100 * points[0].held_out
+
+
+@pytest.mark.parametrize("shape", [(102, 98), (100, 97), (96, 110), (99, 103)])
+def test_held_out_scores_are_of_the_same_light_at_every_binning(shape, monkeypatch):
+    from recon.auto.reduced import binned
+    from recon.chart import _Judge
+
+    rng = np.random.default_rng(0)
+    psf = np.zeros((1, 1, *shape), np.float32)
+    psf[0, 0, shape[0] // 2, shape[1] // 2] = 1
+    measurement = (100 + rng.normal(0, 3, shape)).astype(np.float32)
+    case = ChartProblem(measurement, Calibration(psf, np.array([[0, 0, 1e4]])), False, None, 3.0)
+    monkeypatch.setattr(_Judge, "_predict", lambda judge, _: np.float32(100))
+    one = _Judge(case, Setting("admm", "convolution", "tv"), 0)
+    scores = []
+    for factor in (1, 2, 4):
+        judge = _Judge(case, Setting("admm", "convolution", "tv", factor), 0)
+        share = binned(one.held.astype(np.float32), factor)
+        assert set(np.unique(share)) == {0.0, 1.0}  # whole pixels, none half held out
+        np.testing.assert_array_equal(judge.held, share > 0.5)
+        assert judge.held.sum() * factor**2 == one.held.sum()
+        scores.append(judge.point(np.zeros(judge.measurement.shape), 1, 1.0).held_out)
+    assert scores == pytest.approx([scores[0]] * 3, rel=1e-4)
+    assert scores[0] == pytest.approx(1, abs=0.4)  # noise alone, in its own units
+
+
+@pytest.mark.parametrize(
+    "setting", [Setting("fista", "convolution", "tv"), Setting("volume", "convolution", "l1", 1, True)]
+)
+def test_a_run_says_whether_time_cut_it_off(setting):
+    assert not run_setting(problem(), setting, limit_s=1e-6, counts=(1, 1000)).finished
+    assert run_setting(problem(), setting, limit_s=1000.0, counts=(1, 2)).finished
 
 
 def test_settings_fit_the_problem():
@@ -73,7 +106,7 @@ def test_settings_fit_the_problem():
     ],
 )
 def test_kinds_of_settings_run(setting):
-    points = run_setting(problem(grid=3), setting, counts=(3,))
+    points = run_setting(problem(grid=3), setting, counts=(3,)).points
     assert len(points) == 1
     assert np.isfinite([points[0].psnr_db, points[0].held_out, points[0].ssim]).all()
 
