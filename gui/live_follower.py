@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 from drivers.errors import DeviceError
 from drivers.stream import FrameStream
 from instrument.errors import BenchError, in_words
@@ -14,7 +16,8 @@ from recon.live import LiveReconstructor
 class LiveFollower:
     """Starts a :class:`LiveView` on each new stream of a camera: regions, runs, reconnections make new ones.
 
-    Nothing here blocks but for ``stop``, which waits for the picture in progress.
+    Nothing here blocks but for ``stop``, which waits for the picture in progress and may be called from any
+    thread; until it is done nothing else is begun: a reconstructor is used by one thread at a time.
 
     Parameters
     ----------
@@ -26,6 +29,8 @@ class LiveFollower:
         self._view: LiveView | None = None
         self._stream: FrameStream | None = None
         self._shape: tuple[int, ...] = ()
+        self._changing = threading.Lock()
+        """Held while a view is begun or ended."""
         self.reconstructor: LiveReconstructor | None = None
         self.problem = ""
         """Why there are no pictures, in words."""
@@ -37,8 +42,18 @@ class LiveFollower:
         self.problem = ""
 
     def follow(self) -> None:
-        """Begin on a new stream; to be called now and then."""
+        """Begin on a new stream or with another reconstructor; to be called now and then."""
+        if not self._changing.acquire(blocking=False):
+            return  # a view is being ended: next time
+        try:
+            self._follow()
+        finally:
+            self._changing.release()
+
+    def _follow(self) -> None:
         view = self._view
+        if view is not None and view.reconstructor is not self.reconstructor:
+            view.end()
         if view is not None and not view.is_running:
             self._view = None
             try:
@@ -61,15 +76,21 @@ class LiveFollower:
         return None if self._view is None else self._view.newest()
 
     @property
+    def is_following(self) -> bool:
+        """Whether a view was begun and not yet ended."""
+        return self._view is not None
+
+    @property
     def status(self) -> LiveStatus | None:
         """How it does; None while nothing runs."""
         return None if self._view is None else self._view.status
 
     def stop(self) -> None:
         """End the view and wait for the picture in progress."""
-        view, self._view, self._stream = self._view, None, None
-        if view is not None:
-            try:
-                view.close()
-            except (DeviceError, BenchError, InputError) as error:
-                self.problem = in_words(error) or str(error)
+        with self._changing:
+            view, self._view, self._stream = self._view, None, None
+            if view is not None:
+                try:
+                    view.close()
+                except (DeviceError, BenchError, InputError) as error:
+                    self.problem = in_words(error) or str(error)

@@ -115,6 +115,11 @@ class LiveView:
         self._thread.start()
         return self
 
+    def end(self) -> None:
+        """Ask the view to end after the picture in progress; returns at once."""
+        with self._changed:
+            self._ending = True
+
     def close(self) -> None:
         """End the view; the stream too, if the view started it. Closing twice does nothing.
 
@@ -123,8 +128,7 @@ class LiveView:
         DeviceError, InputError
             What ended the view before.
         """
-        with self._changed:
-            self._ending = True
+        self.end()
         if self._thread is not None:
             self._thread.join()
             self._thread = None

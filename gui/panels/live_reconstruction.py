@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QTimer
+from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import (
     QComboBox,
     QFileDialog,
@@ -66,7 +67,10 @@ class LiveReconstructionPanel(Panel):
         super().__init__(session, parent)
         self.follower = LiveFollower(session.live)
         self.loaded: _Loaded | None = None
+        self._reading: Job | None = None
+        """The newest job that loads a calibration; what older ones bring is dropped."""
         self._loading: Job | None = None
+        """The newest job that prepares a preview; what older ones bring is dropped."""
         self._refining: Job | None = None
         self._holds = False
         self._shown: LiveResult | None = None
@@ -144,7 +148,7 @@ class LiveReconstructionPanel(Panel):
         self._timer.stop()
         if self._refining is not None:
             self._refining.cancel()
-        self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
+        self._end_preview()
 
     @property
     def z_um(self) -> float | None:
@@ -163,10 +167,17 @@ class LiveReconstructionPanel(Panel):
 
         job = self.session.jobs.compute("Loading the calibration", work)
         job.quiet = True
-        job.succeeded.connect(self._got_calibration)
-        job.failed.connect(lambda why: self.refused(self.file, why))
+        self._reading = job
+        job.succeeded.connect(lambda value: self._got_calibration(job, value))
+        job.failed.connect(lambda why: self._refuse(job, why))
 
-    def _got_calibration(self, value: object) -> None:
+    def _refuse(self, job: Job, why: str) -> None:
+        if job in (self._reading, self._loading):
+            self.refused(self.file, why)
+
+    def _got_calibration(self, job: Job, value: object) -> None:
+        if job is not self._reading:
+            return
         path, calibration = cast(tuple[Path, Calibration], value)
         self.accepted(self.file)
         self.file.setText(str(path))
@@ -194,14 +205,17 @@ class LiveReconstructionPanel(Panel):
         job = self.session.jobs.compute("Preparing the preview", work)
         job.quiet = True
         self._loading = job
-        job.succeeded.connect(self._ready)
-        job.failed.connect(lambda why: self.refused(self.file, why))
-        job.ended.connect(self._not_loading)
+        job.succeeded.connect(lambda value: self._ready(job, value))
+        job.failed.connect(lambda why: self._refuse(job, why))
+        job.ended.connect(lambda: self._not_loading(job))
 
-    def _not_loading(self) -> None:
-        self._loading = None
+    def _not_loading(self, job: Job) -> None:
+        if job is self._loading:
+            self._loading = None
 
-    def _ready(self, value: object) -> None:
+    def _ready(self, job: Job, value: object) -> None:
+        if job is not self._loading:
+            return  # another depth was chosen meanwhile
         self.loaded = cast(_Loaded, value)
         self.follower.use(self.loaded.reconstructor)
         self.status.setText("Waiting for a frame …")
@@ -257,8 +271,17 @@ class LiveReconstructionPanel(Panel):
     def _toggle(self, on: bool) -> None:
         self._holds = False
         if not on:
-            self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
+            self._end_preview()
             self.status.setText("The preview is off.")
+
+    def _end_preview(self) -> None:
+        self.session.jobs.watch("Ending the preview", lambda _: self.follower.stop())
+
+    def hideEvent(self, event: QHideEvent) -> None:  # noqa: N802 - Qt's name
+        """End the preview that nobody sees; it goes on when the panel is shown again."""
+        super().hideEvent(event)
+        if self._timer.isActive() and self.follower.is_following and not event.spontaneous():
+            self._end_preview()
 
     # Refining ------------------------------------------------------------------------------------
     def refine(self) -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
+import gui.panels.live_reconstruction as live_reconstruction
 from gui.main_window import MainWindow
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 from gui.session import BenchSession
-from instrument.calibration_file import save_calibration
+from instrument.calibration_file import load_calibration, save_calibration
 from recon.types import Calibration
 
 WAIT_MS = 40_000
@@ -101,3 +105,93 @@ def test_a_folder_without_a_calibration_is_refused_at_the_field(
     panel.file.setText(str(tmp_path / "empty"))
     qtbot.keyClick(panel.file, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: "no calibration" in panel.file.toolTip(), timeout=WAIT_MS)
+
+
+def test_of_depths_chosen_in_quick_succession_the_last_is_shown(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = load_calibration(tmp_path / "calibration")
+    places = np.array([[0.0, 0.0, z_um] for z_um in (1e5, 2e5, 3e5)])
+    three = Calibration(np.repeat(one.psfs, 3, axis=0), places, one.background)
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    panel.file.setText(str(save_calibration(three, tmp_path / "three")))
+    panel.load()
+    qtbot.waitUntil(lambda: panel.z_um == 2e5 and panel._loading is None, timeout=WAIT_MS)
+    made: dict[Any, float] = {}
+    real = live_reconstruction.LiveReconstructor
+
+    def slow_at_first(calibration: Calibration, *, z_um: float, budget_ms: float) -> Any:
+        reconstructor = real(calibration, z_um=z_um, budget_ms=budget_ms)
+        time.sleep(0.6 if z_um == 1e5 else 0.0)
+        made[reconstructor] = z_um
+        return reconstructor
+
+    monkeypatch.setattr(live_reconstruction, "LiveReconstructor", slow_at_first)
+    for index in (0, 2):
+        panel.plane.setCurrentIndex(index)
+        panel.plane.activated.emit(index)
+    qtbot.waitUntil(lambda: len(made) == 2 and not _preparing(panel), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.follower._view is not None, timeout=WAIT_MS)
+    assert panel.loaded is not None
+    assert panel.follower._view is not None
+    assert made[panel.loaded.reconstructor] == 3e5
+    assert panel.follower._view.reconstructor is panel.loaded.reconstructor
+
+
+def _preparing(panel: LiveReconstructionPanel) -> bool:
+    return any(job.title == "Preparing the preview" for job in panel.session.jobs.jobs)
+
+
+def test_a_preview_with_another_reconstructor_replaces_the_one_that_runs(
+    qtbot: QtBot, panel: LiveReconstructionPanel
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    assert panel.loaded is not None
+    other = live_reconstruction.LiveReconstructor(panel.loaded.calibration, budget_ms=80.0)
+    panel.follower.use(other)
+    qtbot.waitUntil(
+        lambda: panel.follower._view is not None and panel.follower._view.reconstructor is other,
+        timeout=WAIT_MS,
+    )
+
+
+def test_a_preview_that_is_ended_and_begun_again_stays_one(
+    qtbot: QtBot, panel: LiveReconstructionPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    assert panel.loaded is not None
+    reconstructor, inside, most, fed = panel.loaded.reconstructor, [0], [0], [0]
+    feed, lock = reconstructor.feed, threading.Lock()
+
+    def slowly(image: Any) -> Any:
+        with lock:
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+        time.sleep(0.3)
+        with lock:
+            inside[0] -= 1
+            fed[0] += 1
+        return feed(image)
+
+    monkeypatch.setattr(reconstructor, "feed", slowly)
+    qtbot.waitUntil(lambda: inside[0] == 1, timeout=WAIT_MS)
+    for _ in range(4):
+        qtbot.mouseClick(panel.run_button, Qt.MouseButton.LeftButton)
+        qtbot.wait(30)
+    assert panel.run_button.isChecked()
+    before = fed[0]
+    qtbot.waitUntil(lambda: fed[0] > before + 2, timeout=WAIT_MS)
+    assert most == [1]
+
+
+def test_a_preview_that_is_not_seen_ends_and_goes_on_when_it_is_shown(
+    qtbot: QtBot, window: MainWindow, panel: LiveReconstructionPanel
+) -> None:
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    shown = panel._shown
+    window._docks["live_reconstruction"].hide()
+    qtbot.waitUntil(
+        lambda: not any(t.name == "live reconstruction" for t in threading.enumerate()), timeout=WAIT_MS
+    )
+    window.show_panel("live_reconstruction")
+    qtbot.waitUntil(lambda: panel._shown is not shown, timeout=WAIT_MS)
