@@ -111,7 +111,7 @@ class LivePanel(Panel):
         self.stretch.addItems(list(LEVELS))
         self.stretch.setCurrentIndex(1)
         self.stretch.setToolTip("Counts shown darkest and brightest: full range, percentiles, or dragged")
-        self.stretch.currentTextChanged.connect(lambda _: self.count())
+        self.stretch.currentTextChanged.connect(lambda _: self._stretch_chosen())
         self.light_buttons = QButtonGroup(self)
         self.light_buttons.setExclusive(False)  # what is lit is shown as it is, not as it was clicked
         light = QHBoxLayout()
@@ -268,10 +268,12 @@ class LivePanel(Panel):
         if first:
             self.count()
             self._light_the_scene()
-        full_scale = frame.full_scale
-        low, high = self._levels
-        self.view.show_image(frame.image, low, high, full_scale)
+        self._draw(frame)
         self._shown_at.append(time.monotonic())
+
+    def _draw(self, frame: Frame) -> None:
+        low, high = self._levels
+        self.view.show_image(frame.image, low, high, frame.full_scale)
 
     @property
     def screen_rate(self) -> float:
@@ -289,18 +291,26 @@ class LivePanel(Panel):
             return
         if frame is None:
             return
-        if frame is not self._counted or self.sender() is self.stretch:
-            self._counted = frame
-            counts = histogram(frame.image)
-            wanted = LEVELS[self.stretch.currentText()]
-            if wanted is not None:
-                self._levels = percentiles(counts, *wanted)
-            elif self.stretch.currentText() == "full range":
-                self._levels = (0.0, float(frame.full_scale))
-            self.histogram.show_counts(counts, frame.full_scale, *self._levels)
-            if (ends := self.profile_line.ends) is not None:
-                self._profile_curve.setData(*line_profile(frame.image, *ends))
+        if frame is not self._counted:
+            self._measure(frame)
         self.status.setText(self._figures(frame))
+
+    def _measure(self, frame: Frame) -> None:
+        self._counted = frame
+        counts = histogram(frame.image)
+        wanted = LEVELS[self.stretch.currentText()]
+        if wanted is not None:
+            self._levels = percentiles(counts, *wanted)
+        elif self.stretch.currentText() == "full range":
+            self._levels = (0.0, float(frame.full_scale))
+        self.histogram.show_counts(counts, frame.full_scale, *self._levels)
+        if (ends := self.profile_line.ends) is not None:
+            self._profile_curve.setData(*line_profile(frame.image, *ends))
+
+    def _stretch_chosen(self) -> None:
+        if self._shown is not None:  # at once, and where the frame is held as well
+            self._measure(self._shown)
+            self._draw(self._shown)
 
     def _waits(self) -> bool:
         """Tell where no frame comes although the camera runs, and for how long; return whether it is so."""
@@ -340,6 +350,8 @@ class LivePanel(Panel):
             self.stretch.blockSignals(True)
             self.stretch.setCurrentText("by hand")
             self.stretch.blockSignals(False)
+        if self._shown is not None:
+            self._draw(self._shown)
 
     # What the operator does ----------------------------------------------------------------------
     def toggle_live(self) -> None:

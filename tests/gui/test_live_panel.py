@@ -214,6 +214,27 @@ def test_levels_follow_percentiles_of_the_raw_data(qtbot: QtBot, live: LivePanel
     assert live._levels == (10.0, 200.0)
 
 
+def test_a_frame_that_is_held_is_stretched_as_well(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live.toggle_live()
+    qtbot.waitUntil(lambda: not live.session.live.is_running, timeout=WAIT_MS)
+    live.look()
+    live.count()
+    frame, drawn = live._shown, []
+    assert frame is not None
+    real = live.view.show_image
+    monkeypatch.setattr(live.view, "show_image", lambda *given: (drawn.append(given), real(*given)))
+    live.stretch.setCurrentText("full range")
+    assert live._levels == (0.0, frame.full_scale)
+    live.histogram.region.setRegion((10.0, 200.0))
+    assert live._shown is frame
+    levels = [given[1:3] for given in drawn]
+    assert levels[0] == (0.0, frame.full_scale)
+    assert levels[-1] == (10.0, 200.0)
+    assert all(given[0] is frame.image for given in drawn)
+
+
 @pytest.mark.parametrize("size", [(200, 300), (1500, 1700)])
 def test_saturated_pixels_keep_their_colour_however_small_they_are_shown(
     qtbot: QtBot, size: tuple[int, int]
