@@ -43,6 +43,15 @@ PICTURE_ITERATIONS = 300
 VOLUME_ITERATIONS = 150
 
 
+def _require_choice(asked: str, prevented_by: str | None) -> None:
+    """Refuse to explain or overrule what is not chosen; BenchError says which option prevents it."""
+    if prevented_by is not None:
+        raise BenchError(
+            f"{asked} is about everything that --model auto chooses, which it does not with {prevented_by}. "
+            "Leave one of the two out."
+        )
+
+
 def known_model(name: str) -> ModelName:
     """Return the camera model of that name; BenchError where there is none."""
     found = next((model for model in MODELS if model == name), None)
@@ -142,6 +151,17 @@ class PictureRequest:
     allow_mixed_depth: bool = False
     settings: Settings = field(default_factory=Settings)
 
+    @property
+    def nothing_chosen_by(self) -> str | None:
+        """The option that leaves auto nothing, or only the model, to choose; None where there is none."""
+        prior = self.settings.prior
+        options = {
+            f"--model {self.settings.model}": self.settings.model != "auto",
+            f"--method {self.method}": self.method != "admm",
+            f"--prior {prior}": prior is not None and prior not in VOLUME_PRIORS,
+        }
+        return next((option for option, prevents in options.items() if prevents), None)
+
     def prepare(self) -> Job:
         """Read the files and bring them together.
 
@@ -151,6 +171,8 @@ class PictureRequest:
             When a file cannot be used, or the files do not belong together.
         """
         given = self.settings
+        if given.wishes is not None:
+            _require_choice("--choose", self.nothing_chosen_by)
         rules = (given.iterations, given.time_s, given.tolerance, given.stop_at_noise or None)
         if self.method == "wiener" and rules != (None, None, None, None):
             raise BenchError(
@@ -220,7 +242,14 @@ class PictureRequest:
         )
 
     def explain(self, job: Job) -> Choice:
-        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`."""
+        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`.
+
+        Raises
+        ------
+        BenchError
+            Where it would not be asked for all of it.
+        """
+        _require_choice("--explain", self.nothing_chosen_by)
         given = self.settings
         wishes = given.wishes or Wishes()
         if wishes.tolerance is None:
@@ -272,10 +301,23 @@ class VolumeRequest:
     device: Device = "cpu"
     settings: Settings = field(default_factory=Settings)
 
+    @property
+    def nothing_chosen_by(self) -> str | None:
+        """The option that leaves auto nothing, or only the model, to choose; None where there is none."""
+        options = {
+            f"--model {self.settings.model}": self.settings.model != "auto",
+            "--memory": self.memory_gib is not None,
+            "--scratch": self.scratch is not None,
+            f"--device {self.device}": self.device != "cpu",
+        }
+        return next((option for option, prevents in options.items() if prevents), None)
+
     def prepare(self) -> Job:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
         given = self.settings
         known_volume_prior(given.prior or "tv")
+        if given.wishes is not None:
+            _require_choice("--choose", self.nothing_chosen_by)
         if self.positive_background and self.estimate_background is False:
             raise BenchError("--positive-background and --no-background exclude each other.")
         return volume_job(
@@ -322,7 +364,14 @@ class VolumeRequest:
         )
 
     def explain(self, job: Job) -> Choice:
-        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`."""
+        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`.
+
+        Raises
+        ------
+        BenchError
+            Where it would not be asked for all of it.
+        """
+        _require_choice("--explain", self.nothing_chosen_by)
         given = self.settings
         wishes = given.wishes or Wishes()
         if wishes.background is None:

@@ -88,8 +88,9 @@ def reconstruct(
         PSFs from several places of the field). The latter two have a solver of their own, take the priors of
         :func:`recon.reconstruct_volume` and start from zero. ``"auto"``: the smallest model, field, binning
         and colours that explain the data (:func:`recon.auto.choose_picture`), on the measurement's pixels
-        whatever was chosen; ``choice`` says what and why. With a bare PSF image, another method, prior or a
-        start it is one convolution of everything.
+        whatever was chosen; ``choice`` says what and why. With a bare PSF image, another method, a prior that
+        :func:`recon.reconstruct_volume` has not, or a start it is one convolution of everything; with a
+        keeper only the model is chosen. (``--psf FILE`` of the command line is a calibration of one PSF.)
     method : str
         A name from :func:`recon.methods.method_names`: ``"admm"``, ``"admm-sensor"``
         (for dense scenes on many pixels), ``"fista"``, ``"wiener"``.
@@ -116,7 +117,7 @@ def reconstruct(
     field : "sensor" or "full"
         Return the part opposite to the sensor, or everything that can reach it.
     wishes : recon.auto.Wishes, optional
-        With ``"auto"``: choices that are not to be left to the program.
+        With ``"auto"``: choices that are not to be left to the program. Refused where not all is chosen.
     callback : callable, optional
         ``callback(record, image)`` after each iteration; ``image()`` makes the present picture.
     cancel : threading.Event, optional
@@ -139,10 +140,11 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
-    chosen = isinstance(calibration, Calibration) and keeper is None and _is_able(method, prior, initial)
-    if model == "auto" and chosen:
+    prevented = _no_choice(calibration, model, method, prior, initial, keeper)
+    if prevented is None:
         from recon.auto.picture import reconstruct_chosen
 
+        assert isinstance(calibration, Calibration)
         return reconstruct_chosen(
             measurement,
             calibration,
@@ -162,6 +164,10 @@ def reconstruct(
             cancel=cancel,
             judged=judged,
         )
+    if wishes is not None:
+        from recon.auto.decide import require_choice
+
+        require_choice(wishes, prevented)
     varying = _varying_model(calibration, z_um, model, method, prior, initial)
     if varying is not None and varying[0] != "convolution":
         assert isinstance(calibration, Calibration)
@@ -283,6 +289,26 @@ def _verdict(
 def _is_able(method: str, prior: str | Prior, initial: Reconstruction | None) -> bool:
     """Tell whether PSFs may vary over the field: that solver has priors of its own, and starts from zero."""
     return method == "admm" and isinstance(prior, str) and prior in VOLUME_PRIORS and initial is None
+
+
+def _no_choice(
+    calibration: Calibration | npt.ArrayLike,
+    model: ModelName,
+    method: str,
+    prior: str | Prior,
+    initial: Reconstruction | None,
+    keeper: Keeper | None,
+) -> str | None:
+    """Return what prevents that everything is chosen; None where nothing does."""
+    preventing = {
+        f"model={model!r}": model != "auto",
+        "a bare PSF image": not isinstance(calibration, Calibration),
+        f"method={method!r}": method != "admm",
+        f"prior={prior!r}": not (isinstance(prior, str) and prior in VOLUME_PRIORS),
+        "a start (initial)": initial is not None,
+        "a checkpoint (keeper)": keeper is not None,
+    }
+    return next((what for what, prevents in preventing.items() if prevents), None)
 
 
 def _varying_model(

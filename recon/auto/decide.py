@@ -131,6 +131,21 @@ class Wishes:
         return cls(**values)
 
 
+def require_choice(wishes: Wishes | None, prevented_by: str) -> None:
+    """Refuse wishes where nothing, or only the model, is chosen: they would be ignored.
+
+    Raises
+    ------
+    InputError
+        What prevents the choice that they are about.
+    """
+    if wishes not in (None, Wishes()):
+        raise InputError(
+            f"Wishes are about everything that model='auto' chooses, which it does not with {prevented_by}. "
+            "Leave one of the two out."
+        )
+
+
 def choose(
     measurement: npt.ArrayLike,
     calibration: Calibration,

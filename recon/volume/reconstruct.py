@@ -88,7 +88,8 @@ def reconstruct_volume(
         ``"convolution"``, ``"local"`` or ``"lowrank"`` (Kuo 2020, Ch. 5); or ``"auto"``: the smallest model,
         depths, field, binning and colours that explain the data (:func:`recon.auto.choose`). The result is on
         the measurement's pixels and all calibrated depths whatever was chosen; ``choice`` says what and why.
-        With a start, another device, a memory limit or a scratch folder, only the model is chosen.
+        With a start, a keeper, an extent, another device, a memory limit or a scratch folder, only the model
+        is chosen.
     estimate_background : bool, optional
         Estimate a smooth background as well (Eq. 6.2). Default: with ``"auto"`` where the data show one, else
         unless ``background`` is given. Stray light that the model cannot explain otherwise ends up as haze in
@@ -119,7 +120,7 @@ def reconstruct_volume(
     extent : Extent, optional
         How much of the PSFs and of the field to model; default all.
     wishes : recon.auto.Wishes, optional
-        With ``"auto"``: choices that are not to be left to the program.
+        With ``"auto"``: choices that are not to be left to the program. Refused where not all is chosen.
     callback : callable, optional
         ``callback(record, volume)`` after each iteration; ``volume()`` makes the present one, and may be
         called until ``callback`` returns.
@@ -138,8 +139,17 @@ def reconstruct_volume(
     """
     if prior not in PRIORS:
         raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
-    free = initial is None and keeper is None and extent is None and scratch is None and memory_gib is None
-    if model == "auto" and device == "cpu" and free:
+    preventing = {
+        f"model={model!r}": model != "auto",
+        f"device={device!r}": device != "cpu",
+        "a start (initial)": initial is not None,
+        "a checkpoint (keeper)": keeper is not None,
+        "an extent": extent is not None,
+        "a memory limit (memory_gib)": memory_gib is not None,
+        "a scratch folder": scratch is not None,
+    }
+    prevented = next((what for what, prevents in preventing.items() if prevents), None)
+    if prevented is None:
         return _chosen(
             measurement,
             calibration,
@@ -162,6 +172,10 @@ def reconstruct_volume(
             callback=callback,
             cancel=cancel,
         )
+    if wishes is not None:
+        from recon.auto.decide import require_choice
+
+        require_choice(wishes, prevented)
     tolerance = 1e-3 if tolerance is None else tolerance
     scaled = prepare_volume(measurement, calibration, background, erasures, noise, extent)
     name, reason = choose_model(scaled.depths, model)

@@ -5,6 +5,7 @@ import pytest
 import tifffile
 from scipy.signal import fftconvolve
 
+from instrument.cli import main
 from instrument.errors import BenchError
 from instrument.reconstruction_request import PictureRequest, Settings, VolumeRequest
 from recon.auto import Wishes
@@ -98,3 +99,39 @@ def test_a_picture_of_one_convolution_says_the_field_and_the_end_that_it_has(pic
     assert decision(choice, "field").value == f"{2 * SIZE - 1} x {2 * SIZE - 1} pixels"
     assert choice.psf_window == (SIZE, SIZE)
     assert choice.acceptance_px is None
+
+
+@pytest.mark.parametrize(
+    ("other", "option"),
+    [({"method": "fista"}, "--method fista"), ({}, "--prior tv-haar"), ({}, "--model convolution")],
+)
+def test_a_picture_refuses_wishes_that_it_would_ignore(picture_files, other, option):
+    name, _, value = option.removeprefix("--").partition(" ")
+    settings = {} if name == "method" else {name: value}
+    wishing = PictureRequest(
+        **picture_files, **other, settings=Settings(**settings, wishes=Wishes(binning=2))
+    )
+    with pytest.raises(BenchError, match=f"--choose .* with {option}"):
+        wishing.prepare()
+    asking = PictureRequest(**picture_files, **other, settings=Settings(**settings))
+    with pytest.raises(BenchError, match=f"--explain .* with {option}"):
+        asking.explain(asking.prepare())
+
+
+@pytest.mark.parametrize(
+    ("other", "option"),
+    [({"memory_gib": 1.0}, "--memory"), ({"scratch": "."}, "--scratch"), ({"device": "gpu"}, "--device gpu")],
+)
+def test_a_volume_refuses_wishes_that_it_would_ignore(volume_files, other, option):
+    with pytest.raises(BenchError, match=f"--choose .* with {option}"):
+        VolumeRequest(**volume_files, **other, settings=Settings(wishes=Wishes(planes="all"))).prepare()
+    asking = VolumeRequest(**volume_files, **other)
+    with pytest.raises(BenchError, match=f"--explain .* with {option}"):
+        asking.explain(asking.prepare())
+
+
+@pytest.mark.parametrize("option", ["--explain", "--choose=binning=1"])
+def test_a_checkpoint_leaves_nothing_to_choose(picture_files, option, tmp_path, capsys):
+    files = ["--psf", str(picture_files["psf"]), "--image", str(picture_files["image"])]
+    assert main(["reconstruct", *files, option, "--checkpoint", str(tmp_path / "kept")]) != 0
+    assert "does not with --checkpoint" in " ".join(capsys.readouterr().err.split())

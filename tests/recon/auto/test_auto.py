@@ -212,3 +212,25 @@ def test_mistakes_are_named(beads):
         Wishes.parse({"background": "maybe"})
     with pytest.raises(InputError, match="priors"):
         choose_picture(beads.measurement, beads.calibration, prior="none")
+
+
+def test_wishes_that_would_be_ignored_are_refused(beads):
+    picture = make_scene("sparse-picture", size=32, grid=1)
+    wishes = Wishes(binning=1)
+    for options, what in (
+        ({"method": "fista"}, "method='fista'"),
+        ({"prior": "tv-haar", "method": "fista"}, "method='fista'"),
+        ({"prior": "none"}, "prior='none'"),
+        ({"model": "convolution"}, "model='convolution'"),
+    ):
+        with pytest.raises(InputError, match=what):
+            recon.reconstruct(picture.measurement, picture.calibration, wishes=wishes, **options)
+    with pytest.raises(InputError, match="bare PSF"):
+        recon.reconstruct(picture.measurement, picture.calibration.psfs[0, 0], wishes=wishes)
+    for options in ({"memory_gib": 1.0}, {"scratch": "."}, {"model": "convolution"}):
+        with pytest.raises(InputError, match=f"which it does not with .*{next(iter(options)).split('_')[0]}"):
+            recon.reconstruct_volume(beads.measurement, beads.calibration, wishes=wishes, **options)
+    # No wish is none that is ignored.
+    recon.reconstruct(
+        picture.measurement, picture.calibration, method="fista", iterations=2, wishes=Wishes(), judged=False
+    )
