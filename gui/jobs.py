@@ -150,6 +150,8 @@ class Job(QObject):
         self.exclusive = exclusive
         self.quiet = False
         """Whether it is too small to be told of: a value read back every few seconds."""
+        self.endless = False
+        """Whether it goes on until it is cancelled."""
         self.state = JobState.WAITING
         self.error: BaseException | None = None
         self._work: Work | None = work
@@ -191,20 +193,32 @@ class JobRunner(QObject):
         self._threads: list[threading.Thread] = []
 
     # Starting ------------------------------------------------------------------------------------
-    def device(self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False) -> Job:
+    def device(
+        self,
+        title: str,
+        work: Work,
+        lanes: Collection[str],
+        *,
+        quiet: bool = False,
+        endless: bool = False,
+    ) -> Job:
         """Run a short job on some devices, after those before it that use one of them.
+
+        One that is ``endless`` goes on until it is cancelled: nothing may wait behind it.
 
         Raises
         ------
         BusyError
-            When a job that holds the whole bench runs or waits, or too many jobs wait.
+            When a job that holds the whole bench runs or waits, an endless one holds a device, or too many
+            jobs wait.
         """
         if (holder := self.exclusive_job) is not None:
             raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
+        self._refuse_endless(lanes)
         if len(self._waiting) >= _MOST_WAITING:
             raise BusyError(f"{title}: {_MOST_WAITING} commands are waiting already. Wait a moment.")
         job = self._add(title, work, frozenset(lanes), exclusive=False)
-        job.quiet = quiet
+        job.quiet, job.endless = quiet, endless
         return job
 
     def exclusive(self, title: str, work: Work) -> Job:
@@ -213,10 +227,11 @@ class JobRunner(QObject):
         Raises
         ------
         BusyError
-            When another such job runs or waits.
+            When another such job runs or waits, or an endless one holds a device.
         """
         if (holder := self.exclusive_job) is not None:
             raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
+        self._refuse_endless(DEVICE_LANES)
         return self._add(title, work, DEVICE_LANES, exclusive=True)
 
     def compute(self, title: str, work: Work) -> Job:
@@ -249,6 +264,21 @@ class JobRunner(QObject):
         """Whether a job on a device runs or waits."""
         return any(lane in job.lanes for job in self._jobs.values())
 
+    def before(self, job: Job) -> tuple[Job, ...]:
+        """Return the jobs that one waits for; none where it runs."""
+        if job.state is not JobState.WAITING:
+            return ()
+        earlier = itertools.takewhile(lambda other: other is not job, self._jobs.values())
+        return tuple(other for other in earlier if other.lanes & job.lanes)
+
+    def withdraw(self, job: Job) -> bool:
+        """End a job that still waits, as cancelled; returns whether it did. For the window's thread."""
+        number = next((n for n in self._waiting if self._jobs[n] is job), None)
+        if number is None:
+            return False
+        self._finish(number, "cancelled", JobCancelledError())
+        return True
+
     def cancel_device_jobs(self) -> None:
         """Ask every device job to end; those that wait end at once. For the window's thread."""
         for number in list(self._waiting):
@@ -267,6 +297,11 @@ class JobRunner(QObject):
         return not any(thread.is_alive() for thread in self._threads)
 
     # Inside --------------------------------------------------------------------------------------
+    def _refuse_endless(self, lanes: Collection[str]) -> None:
+        for job in self._jobs.values():
+            if job.endless and not job.is_cancelling and not job.lanes.isdisjoint(lanes):
+                raise BusyError(f"{job.title} goes on until it is stopped. Stop it first, there or with Esc.")
+
     def _add(self, title: str, work: Work, lanes: frozenset[str], *, exclusive: bool) -> Job:
         number = next(self._numbers)
         job = Job(title, work, JobContext(number, self._post), lanes, exclusive=exclusive)

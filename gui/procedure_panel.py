@@ -116,6 +116,8 @@ class ProcedurePanel(Panel):
         self._started: set[str] = set()
         self._check_job: Job | None = None
         self._again = False
+        self._unchecked = False
+        """Whether the bench was busy when the form was to be checked."""
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
         self._rest.setInterval(_CHECK_MS)
@@ -132,6 +134,7 @@ class ProcedurePanel(Panel):
         self.run.failed.connect(self._failed)
         self.run.over.connect(self._over)
         session.device_changed.connect(lambda _: self._rest.start())
+        session.jobs.job_ended.connect(self._job_ended)
         self._chosen()
 
     # The form ------------------------------------------------------------------------------------
@@ -174,7 +177,7 @@ class ProcedurePanel(Panel):
         if self._check_job is not None:
             self._again = True
             return
-        self.outlook = None
+        self.outlook, self._unchecked = None, False
         missing = [kind for kind in ("camera", *self.form.needs) if not self.session.is_open(kind)]
         if missing:
             names = " and ".join(kind.replace("_", " ") for kind in missing)
@@ -196,6 +199,7 @@ class ProcedurePanel(Panel):
             self._check_job = self.session.device_job(f"Checking: {form.title}", work, {"stage"})
         except BusyError as error:
             self.run_bar.set_startable(str(error))
+            self._unchecked = True
             return
         self._check_job.succeeded.connect(self._checked)
         self._check_job.failed.connect(self._check_failed)
@@ -294,6 +298,10 @@ class ProcedurePanel(Panel):
         if self._again:
             self._again = False
             self.check()
+
+    def _job_ended(self, job: Job) -> None:
+        if self._unchecked and job.lanes:
+            self._rest.start()
 
     def _looked(self, now: Situation) -> None:
         self.run_bar.show_situation(now)

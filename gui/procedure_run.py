@@ -226,8 +226,10 @@ class ProcedureRun(QObject):
         self._control.resume()
 
     def abort(self) -> None:
-        """End before the next step."""
+        """End before the next step; at once where it still waits for other jobs."""
         self._control.abort()
+        if self._job is not None:
+            self._session.jobs.withdraw(self._job)
 
     def shutdown(self) -> None:
         """End the timer."""
@@ -241,7 +243,11 @@ class ProcedureRun(QObject):
             self.judged.emit(event)
         for look in looks:
             self.look.emit(look)
-        self.looked.emit(self._heard.situation)
+        before = () if self._job is None else self._session.jobs.before(self._job)
+        if before:
+            self.looked.emit(Situation(step=f"waiting for: {', '.join(job.title for job in before)}"))
+        else:
+            self.looked.emit(self._heard.situation)
 
     def _succeeded(self, result: Outcome | Ended) -> None:
         self._look()

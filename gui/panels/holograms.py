@@ -323,6 +323,7 @@ class HologramsPanel(Panel):
                 f"Showing {computed.order.out.stem}",
                 lambda context: show_on_slm(bench, computed, correction, context),
                 {"slm"},
+                endless=len(computed.result.hologram.slm) > 1,
             )
         )
 

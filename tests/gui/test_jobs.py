@@ -141,3 +141,32 @@ def test_a_held_key_cannot_fill_a_queue(qtbot: QtBot, jobs: JobRunner) -> None:
         jobs.device("jog", lambda _: None, {"stage"})
     gate.set()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+
+
+def test_nothing_waits_behind_what_has_no_end(qtbot: QtBot, jobs: JobRunner) -> None:
+    show = jobs.device("Showing a face", lambda c: c.cancel.wait(20), {"slm"}, endless=True)
+    with pytest.raises(BusyError, match="Showing a face"):
+        jobs.exclusive("A sweep", lambda _: None)
+    with pytest.raises(BusyError, match="Showing a face"):
+        jobs.device("blank", lambda _: None, {"slm"})
+    free = jobs.device("jog", lambda _: None, {"stage"})
+    with qtbot.waitSignal(free.ended, timeout=WAIT_MS):
+        pass
+    show.cancel()
+    sweep = jobs.exclusive("A sweep", lambda _: None)
+    with qtbot.waitSignal(sweep.succeeded, timeout=WAIT_MS):
+        pass
+
+
+def test_a_job_that_waits_can_be_withdrawn(qtbot: QtBot, jobs: JobRunner) -> None:
+    gate = threading.Event()
+    first = jobs.device("slow", lambda _: gate.wait(20), {"stage"})
+    run = jobs.exclusive("A sweep", lambda _: None)
+    qtbot.waitUntil(lambda: first.state is JobState.RUNNING, timeout=WAIT_MS)
+    assert jobs.before(run) == (first,)
+    assert jobs.withdraw(run)
+    assert run.state is JobState.CANCELLED
+    assert not jobs.withdraw(first)
+    gate.set()
+    qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+    assert first.state is JobState.SUCCEEDED

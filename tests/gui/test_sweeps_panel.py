@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -265,3 +266,32 @@ def test_every_routine_can_be_reached_by_the_keyboard(qtbot: QtBot, panel: Sweep
             assert widget.toolTip() or isinstance(widget, QWidget)
         wait_for_check(qtbot, panel)
         qtbot.keyClick(panel.choice, Qt.Key.Key_Down)
+
+
+def test_a_sweep_that_waits_says_for_what_and_can_be_aborted(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    wait_for_check(qtbot, panel)
+    gate = threading.Event()
+    job = window.session.device_job("Homing by hand", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
+    press(qtbot, panel.run_bar.start_button)
+    qtbot.waitUntil(lambda: "aiting for: Homing by hand" in panel.run_bar.words.text(), timeout=WAIT_MS)
+    press(qtbot, panel.run_bar.abort_button)
+    assert not panel.run.is_running
+    assert not job.is_over
+    gate.set()
+    wait_for_check(qtbot, panel)
+    assert panel.run_bar.start_button.isEnabled()
+
+
+def test_a_form_is_checked_again_after_somebody_elses_run(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    wait_for_check(qtbot, panel)
+    gate = threading.Event()
+    job = window.session.exclusive_job("Another's run", lambda _: gate.wait(WAIT_MS / 1000))
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4")
+    assert not panel.run_bar.start_button.isEnabled()
+    gate.set()
+    qtbot.waitUntil(lambda: job.is_over and panel.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
+    assert panel.outlook is not None
