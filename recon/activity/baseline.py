@@ -27,7 +27,7 @@ _ANCHORS_A_WINDOW = 4
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How far each frame lies off the first part of the video.
+    """How far each frame lies off the mean of all, less the median frame.
 
     Attributes
     ----------
@@ -47,7 +47,10 @@ class Motion:
 
 
 def motion(frames: Floats) -> Motion:
-    """Register each frame to the mean of all, by phase-only correlation refined to a fraction of a pixel.
+    """Register each frame to the mean of all, by cross-correlation refined to a fraction of a pixel.
+
+    Means are taken off and edges faded out (Hann window); spectra are not whitened, so that what is bright
+    counts most: a cell that is much brighter than all the rest tells the motion by itself.
 
     Parameters
     ----------
