@@ -63,7 +63,9 @@ class SceneSpec:
     grid_field : float
         Extent of the calibration grid relative to the field that is opposite to the sensor.
     calibration_photons : float
-        Photo-electrons at a PSF's brightest pixel (read noise as in the measurement), averages included.
+        Photo-electrons at the brightest pixel of the first PSF (read noise as in the measurement), averages
+        included. It is of the nearest depth and, with ``grid`` above 1, of the field's corner: where the
+        response falls off, PSFs nearer to the axis have more.
     drift_px, drift_scale, drift_deg : float
         How the diffuser moved after the calibration: shift along both axes, relative scale, rotation.
     depth_error : float
@@ -320,7 +322,12 @@ def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.fl
 
 
 def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator) -> tuple[Calibration, float]:
-    """Photograph a point source at every depth and place; also return the counts of a unit power."""
+    """Photograph a point source at every depth and place; also return the counts of a unit power.
+
+    One exposure serves all, set by the first PSF: of the nearest depth and, with ``grid`` above 1, of the
+    corner. Where the response falls off, the axis then gets more light than ``calibration_photons``. The
+    shipped maps were made so.
+    """
     height, width = spec.shape
     across = np.linspace(-0.5, 0.5, spec.grid) * spec.grid_field if spec.grid > 1 else np.zeros(1)
     true_z = _depth_um(spec, _plane_places(spec), camera.distance_um)
@@ -334,7 +341,7 @@ def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator)
                 light = np.stack(
                     [camera.light([[*source, 1.0]], c) for c, _ in _channels(spec, np.ones((1, 3)))]
                 )
-                # One exposure for all: the brightest PSF (the nearest) sets it.
+                # One exposure for all, set by the first PSF (see above).
                 unit = unit or spec.calibration_photons / float(light.max())
                 counts = rng.poisson(light * unit) + rng.normal(0, spec.read_noise_e, light.shape)
                 psfs.append(np.maximum(counts, 0).astype(np.float32))
