@@ -20,18 +20,20 @@ FORMAT = "diffuserbench-stability"
 VERSION = 1
 CELLS = "cells.jsonl"
 RESULT = "stability.json"
+_KEY = ("map", "size", "axes", "program", "scene")
+"""What tells cells apart, as a line has it."""
 
 
 class CellLog:
     """The cells that were made so far, one JSON line each, so that an interrupted map goes on.
 
-    A line belongs to a map, a size and the axes it was made with: where the axes have changed since, the
-    cells are made again.
+    A line belongs to a map, a size, and the axes, scene and version of the program that it was made with:
+    where one of these has changed since, the cells are made again.
     """
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CELLS
-        self._cells: dict[tuple[str, str, str], dict[tuple[str, int, int], Cell]] = {}
+        self._cells: dict[tuple[str, ...], dict[tuple[str, int, int], Cell]] = {}
         if self.path.exists():
             self._read()
 
@@ -41,18 +43,19 @@ class CellLog:
 
     def add(self, stress: StressMap, size: Size, cell: Cell) -> None:
         """Append a cell to the file."""
-        name, made_with, axes = _key(stress, size)
-        entry = {"map": name, "size": made_with, "axes": axes, **cell.as_json()}
+        key = _key(stress, size)
+        entry = {**dict(zip(_KEY, key, strict=True)), **cell.as_json()}
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry, allow_nan=False) + "\n")
-        self._keep((name, made_with, axes), cell)
+        self._keep(key, cell)
 
     def _read(self) -> None:
         lines = self.path.read_text(encoding="utf-8").splitlines()
         for number, line in enumerate(lines, 1):
             try:
                 entry = json.loads(line)
-                key = (str(entry["map"]), str(entry["size"]), str(entry["axes"]))
+                # Lines of old have neither program nor scene: they are of another, whatever it was.
+                key = (*(str(entry[name]) for name in _KEY[:3]), *(str(entry.get(n)) for n in _KEY[3:]))
                 self._keep(key, Cell.from_json(entry))
             except (ValueError, KeyError, TypeError) as error:
                 if number == len(lines):  # cut off in mid-line: that cell is made again
@@ -65,13 +68,15 @@ class CellLog:
     def _cut_last(self, lines: list[str]) -> None:
         write_text(self.path, "".join(f"{line}\n" for line in lines[:-1]))
 
-    def _keep(self, key: tuple[str, str, str], cell: Cell) -> None:
+    def _keep(self, key: tuple[str, ...], cell: Cell) -> None:
         self._cells.setdefault(key, {})[(cell.method, cell.ix, cell.iy)] = cell
 
 
-def _key(stress: StressMap, size: Size) -> tuple[str, str, str]:
+def _key(stress: StressMap, size: Size) -> tuple[str, ...]:
+    """Return what a map's cells depend on, in the order of ``_KEY``."""
     axes = ";".join(f"{a.key}:{','.join(f'{v:g}' for v in a.at(size))}" for a in (stress.x, stress.y))
-    return stress.name, size, axes
+    scene = f"{stress.draws} {stress.base}".strip()
+    return stress.name, size, axes, version("diffuserbench"), scene
 
 
 def map_record(stress: StressMap, size: Size, cells: Sequence[Cell]) -> dict[str, Any]:

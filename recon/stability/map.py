@@ -80,6 +80,8 @@ class StressMap:
         What the errors are.
     draws : int
         Scenes a cell in the full size; the median severity counts.
+    base : str
+        What the trials start from, in words that change when it does; empty where that is not known.
     """
 
     name: str
@@ -91,6 +93,7 @@ class StressMap:
     trial: TrialFunction
     error: str = "NRMSE"
     draws: int = 1
+    base: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,7 +59,7 @@ def scene_map(
         name, used = _handling(method, chosen)
         return run_scene(spec_at(base, size, seed, **{x.key: at_x, y.key: at_y}), name, used, size)
 
-    return StressMap(name, title, question, x, y, methods, trial, draws=draws)
+    return StressMap(name, title, question, x, y, methods, trial, draws=draws, base=f"{base} {chosen}")
 
 
 def _handling(method: str, options: Options) -> tuple[str, Options]:

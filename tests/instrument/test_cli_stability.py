@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from instrument.stability_file import CellLog, read_stability
 from recon.stability import catalogue
 from recon.stability.failure import Failure
 from recon.stability.map import Axis, StressMap, Trial
+from recon.stability.run import run_map
 
 CALLS: list[tuple[str, float, float]] = []
 
@@ -67,6 +69,24 @@ def test_an_interrupted_map_goes_on_where_it_was(tmp_path: Path) -> None:
     run("easy", "-o", str(tmp_path))
     assert len(CALLS) - before == 8 - done
     assert len((tmp_path / "cells.jsonl").read_text().splitlines()) == 8
+
+
+def test_cells_of_another_program_or_scene_are_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stress = replace(catalogue.MAPS["easy"], methods=("first",), base="ten points")
+    (cell, *_) = run_map(stress, "quick")
+    CellLog(tmp_path).add(stress, "quick", cell)
+    assert CellLog(tmp_path).of(stress, "quick") == [cell]
+    assert CellLog(tmp_path).of(replace(stress, base="twenty points"), "quick") == []
+    with monkeypatch.context() as patch:
+        patch.setattr("instrument.stability_file.version", lambda _: "99.0")
+        assert CellLog(tmp_path).of(stress, "quick") == []
+    # As it was written before these were told apart.
+    entry = json.loads((tmp_path / "cells.jsonl").read_text())
+    old = {name: value for name, value in entry.items() if name not in ("program", "scene")}
+    (tmp_path / "cells.jsonl").write_text(json.dumps(old) + "\n")
+    assert CellLog(tmp_path).of(stress, "quick") == []
 
 
 def test_redraw_needs_no_trial(tmp_path: Path) -> None:
