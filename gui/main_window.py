@@ -285,16 +285,16 @@ class MainWindow(QMainWindow):
     def _job_ended(self, job: Job) -> None:
         if job.quiet:
             return
-        running = self._long_jobs()
-        self.job_progress.setVisible(bool(running))
+        running = self._told_jobs()
+        self.job_progress.setVisible(any(j.exclusive or not j.lanes for j in running))
         if running:
             self.job_label.setText(f"{running[0].title} …")
         elif job.state.value == "succeeded":
             self.job_label.setText(f"{job.title}: done")
 
-    def _long_jobs(self) -> list[Job]:
-        """Return what runs and would be missed: runs, calibrations, computations."""
-        return [job for job in self.session.jobs.jobs if (job.exclusive or not job.lanes) and not job.quiet]
+    def _told_jobs(self) -> list[Job]:
+        """Return what runs and would be missed: runs, moves, photographs, computations."""
+        return [job for job in self.session.jobs.jobs if not job.quiet]
 
     def _show_problem(self, level: str, text: str) -> None:
         if level in ("warning", "error"):
@@ -322,7 +322,7 @@ class MainWindow(QMainWindow):
             event.accept()
             return
         event.ignore()
-        running = [job.title for job in self._long_jobs()]
+        running = [job.title for job in self._told_jobs()]
         if running and self.question is None:
             box = QMessageBox(
                 QMessageBox.Icon.Warning,

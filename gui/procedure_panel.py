@@ -196,7 +196,7 @@ class ProcedurePanel(Panel):
             return _check(form.name, bench, procedure, first)
 
         try:
-            self._check_job = self.session.device_job(f"Checking: {form.title}", work, {"stage"})
+            self._check_job = self.session.device_job(f"Checking: {form.title}", work, {"stage"}, quiet=True)
         except BusyError as error:
             self.run_bar.set_startable(str(error))
             self._unchecked = True

@@ -209,7 +209,7 @@ class BenchSession(QObject):
         if self.is_open("camera") and not self.jobs.is_busy("camera") and not self._closing:
             with contextlib.suppress(BusyError):  # a run goes on: the live view does after it
                 self._live_job = self.jobs.device(
-                    "Starting the live view", lambda _: self.live.start(), {"camera"}
+                    "Starting the live view", lambda _: self.live.start(), {"camera"}, quiet=True
                 )
 
     def stop_live(self) -> None:
@@ -217,7 +217,7 @@ class BenchSession(QObject):
         self._live_wanted = False
         if self.live.is_running:
             with contextlib.suppress(BusyError):  # a run has ended it already
-                self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"})
+                self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
 
     # Jobs ----------------------------------------------------------------------------------------
     def device_job(

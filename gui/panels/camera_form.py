@@ -166,7 +166,7 @@ class CameraForm(QWidget):
     def _show_all(self) -> None:
         if self.state is not None:
             lines = "\n".join(f"{name} = {value}" for name, value in sorted(self.state.settings.items()))
-            TextWindow("Settings of the camera, as read back", lines, self).open()
+            TextWindow("Settings of the camera, as read back", lines, self).show()
 
 
 def _choose(box: QComboBox, items: list[tuple[str, object]], now: object) -> None:

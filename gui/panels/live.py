@@ -426,7 +426,9 @@ class LivePanel(Panel):
         if "led_array" in self.session.kinds:
             self.switch_light(Light.SCENE)
         else:  # nobody is asked to darken a point source that may not be there
-            job = self.session.device_job("Light: scene", lambda _: self.session.bench.scene_on(), {"light"})
+            job = self.session.device_job(
+                "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True
+            )
             self.tells(job).ended.connect(self._show_light)
 
     def _show_light(self) -> None:

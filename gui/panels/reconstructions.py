@@ -51,6 +51,7 @@ class ReconstructionsPanel(Panel):
         super().__init__(session, parent)
         self.result: StoredResult | None = None
         self.job: Job | None = None
+        self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
         self._suggested: Path | None = None
@@ -145,7 +146,7 @@ class ReconstructionsPanel(Panel):
         """List the results in the data folder."""
         folder = self.session.runs_folder
         job = self.tells(
-            self.jobs.compute("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
+            self.jobs.watch("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
         )
         job.succeeded.connect(self._list)
 
@@ -314,15 +315,22 @@ class ReconstructionsPanel(Panel):
             self.refused(None, str(error))
             return None
         self.accepted()
-        job = self.tells(
-            self.jobs.compute(
-                f"Explaining {request.image.name}", lambda _: request.explain(request.prepare())
-            )
-        )
+
+        def work(context: JobContext) -> Choice:
+            prepared = request.prepare()
+            context.check()
+            choice = request.explain(prepared)
+            context.check()
+            return choice
+
+        job = self.tells(self.jobs.compute(f"Explaining {request.image.name}", work))
+        self._explaining = job
         self.form.set_running(True)
         self.form.show_progress(0.0, "Looking at PSFs and photograph …")
         job.succeeded.connect(self._explained)
         job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
+        job.cancelled.connect(lambda _: self.form.show_progress(0.0, "Stopped."))
+        job.ended.connect(lambda: setattr(self, "_explaining", None))
         job.ended.connect(lambda: self.form.set_running(False))
         return job
 
@@ -336,7 +344,10 @@ class ReconstructionsPanel(Panel):
         self.form.show_progress(0.0, f"Chosen in {choice.seconds:.1f} s; the reasons are below the picture.")
 
     def _stop(self) -> None:
-        if self.job is not None:
+        if self._explaining is not None:
+            self._explaining.cancel()
+            self.form.note.setText("Stopping …")
+        elif self.job is not None:
             self.job.cancel()
             self.form.note.setText("Stopping after this iteration …")
 

@@ -112,7 +112,7 @@ class RunsPanel(Panel):
                 found.append(summary(path))
             return found
 
-        self._listing = self.jobs.compute("Reading the list of runs", work)
+        self._listing = self.jobs.watch("Reading the list of runs", work)
         self._listing.succeeded.connect(self._show_list)
         self._listing.ended.connect(self._listed)
 

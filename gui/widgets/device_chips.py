@@ -54,4 +54,4 @@ class DeviceChips(QWidget):
     def _tell(self, kind: str) -> None:
         text = self._session.state(kind).text or self._session.state(kind).condition
         window = TextWindow(f"{kind.replace('_', ' ')}", text, self)
-        window.open()
+        window.show()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QFontDatabase, QGuiApplication
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QLabel, QPlainTextEdit, QVBoxLayout, QWidget
 
@@ -17,7 +18,9 @@ def elided(label: QLabel, text: str) -> None:
 
 
 class TextWindow(QDialog):
-    """A long text in a window of its own, which can be selected and copied; does not block the others.
+    """A long text in a window of its own, which can be selected and copied; gone when it is closed.
+
+    To be shown by ``show``: ``open`` and ``exec`` would keep clicks from STOP.
 
     Parameters
     ----------
@@ -27,6 +30,7 @@ class TextWindow(QDialog):
 
     def __init__(self, title: str, text: str, parent: QWidget | None = None) -> None:
         super().__init__(parent)
+        self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowTitle(title)
         self.resize(760, 420)
         self.view = QPlainTextEdit(text)

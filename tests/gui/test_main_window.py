@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -14,6 +15,7 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES
+from gui.widgets.message import TextWindow
 
 WAIT_MS = 20_000
 
@@ -198,3 +200,41 @@ def test_what_a_device_refuses_is_no_failure_of_it(qtbot: QtBot, window: MainWin
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
     assert job.state is JobState.FAILED
     assert session.is_open("camera")
+
+
+def test_stop_takes_clicks_while_a_text_is_open_and_the_text_goes_when_closed(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    qtbot.mouseClick(window.chips.chips["stage"], Qt.MouseButton.LeftButton)
+    (text,) = window.findChildren(TextWindow)
+    assert text.isVisible()
+    assert not text.isModal()
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
+    with qtbot.waitSignal(text.destroyed, timeout=WAIT_MS):
+        text.reject()
+
+
+def test_closing_asks_before_a_short_job_is_broken_off_and_not_before_a_listing(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    session = window.session
+    gate = threading.Event()
+    session.jobs.watch("Listing", lambda _: gate.wait(WAIT_MS / 1000))
+    job = session.device_job("Homing the stage", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    window.close()
+    assert window.question is not None
+    assert "Homing the stage is running" in window.question.text()
+    assert window.job_label.text() == "Homing the stage …"
+    window.question.reject()
+    gate.set()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+
+
+def test_lists_are_read_without_a_word(window: MainWindow) -> None:
+    window.panel("runs").read_folder()  # type: ignore[attr-defined]
+    window.panel("reconstructions").refresh()  # type: ignore[attr-defined]
+    listings = [job for job in window.session.jobs.jobs if not job.lanes]
+    assert listings
+    assert all(job.quiet for job in listings)

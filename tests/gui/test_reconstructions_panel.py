@@ -13,6 +13,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+from gui.jobs import JobState
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
@@ -317,3 +318,22 @@ def test_the_red_theme_shows_nothing_but_red(
         assert middle.red() >= middle.green() == middle.blue() == 0
     finally:
         apply_theme(qapp, "dark")
+
+
+def test_stop_during_explain_stops_that_and_not_what_was_done_before(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    run(qtbot, panel)
+    before = panel.job
+    gate = threading.Event()
+    monkeypatch.setattr(type(panel.form.request()), "prepare", lambda _: gate.wait(WAIT_MS / 1000))
+    qtbot.waitUntil(panel.form.explain.isEnabled, timeout=WAIT_MS)
+    job = panel.explain()
+    qtbot.mouseClick(panel.form.stop, Qt.MouseButton.LeftButton)
+    gate.set()
+    qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+    assert job.state is JobState.CANCELLED
+    assert panel.job is before
+    assert not before.is_cancelling
+    assert panel.form.note.text() == "Stopped."
