@@ -87,6 +87,8 @@ def reduce(
     factor = choice.binning
     shape = (data.shape[1], data.shape[2])
     planes = None if len(choice.planes) == choice.n_planes else choice.planes
+    rest = tuple(z for z in range(choice.n_planes) if z not in choice.planes)
+    left_out = reduced_calibration(calibration, factor, rest) if rest else None
     calibration = reduced_calibration(calibration, factor, planes)
     window = tuple(max(n // factor, 1) for n in choice.psf_window)
     small = tuple(min(w, n) for w, n in zip(window, calibration.psfs.shape[2:], strict=True))
@@ -101,7 +103,9 @@ def reduce(
         calibration=calibration,
         noise=_averaged(noise, factor),
         extent=Extent(
-            (small[0], small[1]), None if choice.acceptance_px is None else choice.acceptance_px / factor
+            (small[0], small[1]),
+            None if choice.acceptance_px is None else choice.acceptance_px / factor,
+            left_out,
         ),
         choice=choice,
         tint=tint,

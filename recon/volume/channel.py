@@ -206,6 +206,11 @@ class ChannelProblem:
         rest: Array = self._removal.background(self.data - self.camera.forward(solution))
         return np.asarray(rest[0])
 
+    def residual(self, solution: Array, background: Array | None) -> Array:
+        """Return what a solution and its background leave of the data (height, width), in its noise."""
+        rest: Array = (self._measured - self.camera.forward(solution))[0]
+        return np.where(self.valid, rest if background is None else rest - background, 0)
+
     def positive_background(self, solution: Array) -> Array:
         """Return the smooth background >= 0 nearest to what a solution leaves of the data."""
         removal = self._removal or self._removed

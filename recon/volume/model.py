@@ -41,10 +41,13 @@ class Extent:
         Height and width of the central part of the PSFs; None: all of them.
     acceptance_px : float or None
         Only object pixels this near to the axis are modelled, where PSFs vary over the field; None: all.
+    left_out : Calibration or None
+        PSFs of depths that are not modelled: what is left of the data is searched for light from there.
     """
 
     psf_window: tuple[int, int] | None = None
     acceptance_px: float | None = None
+    left_out: Calibration | None = None
 
 
 @dataclass(frozen=True)

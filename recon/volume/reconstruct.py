@@ -27,6 +27,7 @@ from recon.verdict.verdict import Verdict
 from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
+from recon.volume.left_out import limit_of, signs_in_words, signs_of_light
 from recon.volume.model import Depths, Extent, ModelName, choose_model, members_of_depths, sort_by_depth
 from recon.volume.positive_background import in_turns, is_negative, may_go_on
 from recon.volume.result import VolumeGrid, VolumeReconstruction
@@ -199,6 +200,7 @@ def reconstruct_volume(
     grid = _grid(calibration, scaled.depths, window, centre)
     weights = grid.axis_weights() if axis_weights is None else np.asarray(axis_weights, float)
     volumes, outcomes, backgrounds, taus, empty = [], [], [], [], []
+    signs: list[float] = []
     for channel in range(len(scaled.data)):
         run = ChannelProblem(
             scaled,
@@ -248,6 +250,9 @@ def reconstruct_volume(
                     tell if callback is not None else None,
                     cancel,
                 )
+        if extent is not None and extent.left_out is not None:
+            rest = run.residual(outcome.solution, smooth_part)
+            signs.append(signs_of_light(rest, extent.left_out, channel, extent.psf_window) / limit_of(run))
         volumes.append(outcome.solution[0][:, window[0], window[1]] * (np.float32(scale) / per_plane))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
@@ -277,8 +282,12 @@ def reconstruct_volume(
         stop_reasons=tuple(o.stop_reason for o in outcomes),
         seconds=sum(o.seconds for o in outcomes),
         empty_planes=tuple(empty),
-        warnings=(*scaled.warnings, *_uncertified(empty), *failed),
-        provenance={"noise_deviation": [float(v) for v in scaled.noise], "memory": planned},
+        warnings=(*scaled.warnings, *_uncertified(empty), *signs_in_words(signs), *failed),
+        provenance={
+            "noise_deviation": [float(v) for v in scaled.noise],
+            "memory": planned,
+            **({"light_in_planes_left_out": max(signs)} if signs else {}),
+        },
         verdict=verdict,
     )
 

@@ -78,6 +78,16 @@ def test_the_sharpest_colour_and_the_widest_decide():
     assert choose_picture(scene.measurement, apart, wishes=Wishes(channels="all")).binning == 1
 
 
+def test_light_in_planes_that_were_left_out_is_noticed(beads, chosen_beads, monkeypatch):
+    assert 0 < chosen_beads.provenance["light_in_planes_left_out"] < 1
+    assert not any("left out" in w for w in chosen_beads.warnings)
+    wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
+    monkeypatch.setattr("recon.auto.decide.choose", lambda *_, **__: wrong)
+    result = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", judged=False)
+    assert result.provenance["light_in_planes_left_out"] > 1
+    assert any("light in the depth planes that were left out" in w for w in result.warnings)
+
+
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
     whole = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", model="local")
     auto_db = score(chosen_beads.volume, beads.truth).psnr_db
