@@ -17,6 +17,7 @@ from calibration_routines.sweep_watch import PointTaken
 from gui.forms.routines import ROUTINES
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
+from gui.psf_pictures import PsfPictures
 from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
 from gui.widgets.path_plot import PathPlot
@@ -68,7 +69,7 @@ class SweepsPanel(ProcedurePanel):
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(split)
         self._shown: Snapshot | None = None
-        self._images: dict[int, Image] = {}
+        self._pictures = PsfPictures()
         self.run.judged.connect(self._heard)
         self.psfs.chosen.connect(self._show_psf)
         self.views["plan"].changed.connect(self._read_plan)
@@ -88,7 +89,7 @@ class SweepsPanel(ProcedurePanel):
         """Clear the last sweep."""
         self.psfs.clear()
         self.picture.clear()
-        self._images = {}
+        self._pictures = PsfPictures()
         self.tabs.setCurrentWidget(self.psfs)
 
     def looked(self, now: Situation) -> None:
@@ -117,17 +118,19 @@ class SweepsPanel(ProcedurePanel):
 
     def _heard(self, event: object) -> None:
         if isinstance(event, PointTaken):
-            self._images[event.number - 1] = event.image
+            self._pictures.keep(event.number - 1, event.image)
             self.psfs.arrived(event)
 
     def _show_psf(self, row: int) -> None:
         quality = self.psfs.qualities[row] if 0 <= row < len(self.psfs.qualities) else None
-        if quality is None or row not in self._images:
+        picture = self._pictures.get(row)
+        if quality is None or picture is None:
             return
-        self._show_image(self._images[row])
+        self._show_image(picture.image)
         x_mm, y_mm, z_mm = (value / 1e3 for value in quality.source_um)
         self.frame_words.setText(
             f"PSF {row + 1} at ({x_mm:.4g}, {y_mm:.4g}, {z_mm:.4g}) mm, dark frame taken off"
+            + (f"; reduced {picture.reduced}x, whole in the run" if picture.reduced > 1 else "")
         )
 
     def _show_frame(self, newest: Snapshot) -> None:
