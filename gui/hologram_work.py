@@ -25,12 +25,14 @@ from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
 from gui.python_lines import expression
 from instrument.alignment_file import load_alignment
+from instrument.atomic import check_writable
 from instrument.bench import Bench
 from instrument.config import BenchConfig
 from instrument.display_setup import bench_display
 from instrument.hologram_file import HologramFiles
 from instrument.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
 from instrument.images import read_image
+from instrument.result_list import free_name
 from instrument.run_control import EndedEarlyError, RunControl
 from instrument.safety import StepsFailedError
 from instrument.slm_correction import load_slm_correction
@@ -159,13 +161,24 @@ def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, conte
 
 
 def photograph(
-    bench: Bench, computed: Computed, correction: Path | None, average: int, context: JobContext
+    bench: Bench,
+    computed: Computed,
+    correction: Path | None,
+    average: int,
+    context: JobContext,
+    *,
+    make_folder: bool = False,
 ) -> tuple[Photographed, Path]:
     """Show a hologram, photograph it, compare it with its target, and write what was seen.
 
     Ends at once when it is cancelled; the bench is safe afterwards, however it ends, and the
     camera's exposure as it was.
     """
+    pattern = computed.order.out
+    if make_folder:
+        pattern.parent.mkdir(parents=True, exist_ok=True)
+    out = free_name(pattern.parent, f"{pattern.stem}-seen", ".png")
+    check_writable(out)  # before the bench is touched
     control = RunControl()
 
     def stop() -> None:
@@ -191,7 +204,6 @@ def photograph(
             bench.safe_state()
     except EndedEarlyError as error:
         raise JobCancelledError from error
-    out = computed.order.out.with_name(f"{computed.order.out.stem}-seen.png")
     write_capture(out, found)
     return found, out
 

@@ -278,10 +278,8 @@ class HologramsPanel(Panel):
     # Doing it ------------------------------------------------------------------------------------
     def compute(self, *, preview: bool = False) -> Job | None:
         """Compute the hologram; a preview takes few iterations and writes nothing."""
-        for entry in self._entries():
-            if not entry.check():
-                entry.setFocus()
-                return None
+        if not all(self._understood(entry) for entry in self._entries()):
+            return None
         slm = self.session.bench.slm
         if slm is None or not self.session.is_open("slm"):
             self.refused(None, "The bench's SLM is not open: it is not known what to compute a hologram for.")
@@ -306,6 +304,12 @@ class HologramsPanel(Panel):
         job.ended.connect(lambda: self._set_running(False))
         return job
 
+    def _understood(self, entry: Entry) -> bool:
+        if not entry.check():
+            entry.setFocus()
+            return False
+        return True
+
     def stop(self) -> None:
         """End the computation, or the frames that follow each other on the SLM."""
         if self.job is not None:
@@ -314,7 +318,7 @@ class HologramsPanel(Panel):
     def show_on_slm(self) -> Job | None:
         """Put the computed pattern on the SLM."""
         computed = self.computed
-        if computed is None:
+        if computed is None or not self._understood(self.correction):
             return None
         correction = self.correction.value()
         bench = self.session.bench
@@ -330,13 +334,16 @@ class HologramsPanel(Panel):
     def photograph(self) -> Job | None:
         """Show the pattern, photograph it, and say how close it is to the target."""
         computed = self.computed
-        if computed is None:
+        if computed is None or not self._understood(self.correction):
             return None
         correction, bench = self.correction.value(), self.session.bench
+        suggested = computed.order.out.parent == self._suggestions
         job = self._device_job(
             lambda: self.session.exclusive_job(
                 f"Photographing {computed.order.out.stem}",
-                lambda context: photograph(bench, computed, correction, _AVERAGE, context),
+                lambda context: photograph(
+                    bench, computed, correction, _AVERAGE, context, make_folder=suggested
+                ),
             )
         )
         if job is not None:
@@ -421,11 +428,15 @@ class HologramsPanel(Panel):
         )
         self._suggest_out()
 
+    @property
+    def _suggestions(self) -> Path:
+        """The folder of the names that are suggested: made when it is needed."""
+        return self.session.runs_folder / "holograms"
+
     def _suggest_out(self) -> None:
         if self.out.text() not in ("", str(self._suggested)):
             return  # a name that was chosen stays
-        folder = self.session.runs_folder / "holograms"
-        self._suggested = free_name(folder, Path(self.picture.text()).stem or "slm", ".png")
+        self._suggested = free_name(self._suggestions, Path(self.picture.text()).stem or "slm", ".png")
         self.out.setText(str(self._suggested))
 
     def _show_mode(self) -> None:

@@ -118,6 +118,37 @@ def test_a_preview_writes_nothing(qtbot: QtBot, panel: HologramsPanel) -> None:
     assert not (panel.session.runs_folder / "holograms").exists()
 
 
+def test_photographs_of_a_preview_each_have_a_name_of_their_own(qtbot: QtBot, panel: HologramsPanel) -> None:
+    computed(qtbot, panel, panel.preview_button)
+    for name in ("picture-seen", "picture-seen-2"):
+        click(qtbot, panel.capture_button)
+        with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+            pass
+        assert panel.job.error is None, panel._note.toolTip()
+        for suffix in (".png", ".json"):
+            assert (panel.session.runs_folder / "holograms" / f"{name}{suffix}").is_file()
+
+
+def test_what_is_wrong_is_told_before_the_bench_is_touched(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
+) -> None:
+    panel.out.setText(str(tmp_path / "nowhere" / "pattern.png"))
+    computed(qtbot, panel, panel.preview_button)
+    before = panel.job
+    for button in (panel.show_button, panel.capture_button):
+        panel.correction.setText("absent.json")
+        click(qtbot, button)
+        assert panel.correction.property("refused")
+        assert "no such file" in panel._note.toolTip()
+        assert panel.job is before
+    panel.correction.setText("")
+    click(qtbot, panel.capture_button)
+    with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
+        pass
+    assert "nowhere" in panel._note.toolTip()
+    assert not panel.session.bench.slm.displayed.any()
+
+
 def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: HologramsPanel) -> None:
     panel.weights_mode.setCurrentText("a fovea, dragged")
     before = panel.target.weights()
