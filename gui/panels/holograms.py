@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
     QCheckBox,
@@ -30,6 +31,7 @@ from gui.hologram_work import (
     show_on_slm,
 )
 from gui.jobs import BusyError, Job
+from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
@@ -64,6 +66,8 @@ class HologramsPanel(Panel):
         self.computed: Computed | None = None
         self.job: Job | None = None
         self._suggested: Path | None = None
+        self._reader = NewestOnly(session.jobs, "Reading the picture")
+        self._target_asked: tuple[Any, ...] | None = None
         self.picture = Entry(existing_path, tip="The picture to show: its values are intensities")
         self.fit = _choice(
             ["cover", "contain", "stretch"], "How a picture that is not square fills the field"
@@ -214,7 +218,6 @@ class HologramsPanel(Panel):
     def _connect(self) -> None:
         for entry in self._entries():
             entry.refused.connect(lambda why, field=entry: self.refused(field, why))
-        self.picture.editingFinished.connect(self._picture_changed)
         self.picture.understood.connect(self._picture_changed)
         self.fit.currentTextChanged.connect(lambda _: self._picture_changed())
         self.srgb.toggled.connect(lambda _: self._picture_changed())
@@ -420,13 +423,32 @@ class HologramsPanel(Panel):
     def _picture_changed(self) -> None:
         """Show the target as it fills the field."""
         try:
-            pixels = read_image(self.picture.value()).pixels
-        except BenchError:
+            path = self.picture.value()
+            wanted = (path, path.stat().st_mtime_ns, self.fit.currentText(), self.srgb.isChecked())
+        except (BenchError, OSError):
             return  # refused at its field
-        self.target.show_target(
-            field_picture(pixels, fit=self.fit.currentText(), srgb=self.srgb.isChecked())  # type: ignore[arg-type]
-        )
         self._suggest_out()
+        if wanted == self._target_asked:
+            return
+        self._target_asked = wanted
+        fit, srgb = wanted[2:]
+
+        def read() -> npt.NDArray[Any] | str:
+            try:
+                return field_picture(read_image(path).pixels, fit=fit, srgb=srgb)  # type: ignore[arg-type]
+            except (BenchError, InputError) as error:
+                return str(error)
+
+        self._reader.ask(read, lambda found: self._target_read(wanted, found))
+
+    def _target_read(self, wanted: object, found: npt.NDArray[Any] | str) -> None:
+        if wanted != self._target_asked:
+            return  # another picture is on its way
+        if isinstance(found, str):
+            self._target_asked = None
+            self.refused(self.picture, found)
+        else:
+            self.target.show_target(found)
 
     @property
     def _suggestions(self) -> Path:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import QFileSystemWatcher, Qt, QTimer, QUrl
 from PySide6.QtGui import QColor, QDesktopServices
 from PySide6.QtWidgets import (
@@ -31,6 +33,7 @@ from calibration_routines.sweep import FOLDER
 from calibration_routines.sweep_record import is_sweep
 from gui.forms.as_python import script
 from gui.jobs import BusyError, Job, JobContext
+from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.procedure_run import Ended, ProcedureRun
 from gui.session import BenchSession
@@ -44,6 +47,28 @@ _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _LEVELS = (0.1, 99.9)
 _REST_MS = 500
 """Rest after a change in the folder before it is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A run that was read."""
+
+    run: Run
+    stored: list[int]
+    about: list[str]
+    can_resume: bool
+    is_usable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """A frame that was read, with its levels and what is said of it."""
+
+    image: npt.NDArray[Any]
+    low: float
+    high: float
+    full_scale: int
+    words: str
 
 
 class RunsPanel(Panel):
@@ -67,6 +92,9 @@ class RunsPanel(Panel):
         self.run = ProcedureRun(session, self)
         self.summaries: list[RunSummary] = []
         self.opened: Run | None = None
+        self._opening: Path | None = None
+        self._stored: list[int] = []
+        self._reader = NewestOnly(session.jobs, "Reading a run")
         self._listing: Job | None = None
         self._again = False
         self._wanted: Path | None = None
@@ -117,25 +145,29 @@ class RunsPanel(Panel):
         self._listing.ended.connect(self._listed)
 
     def open_run(self, path: Path) -> None:
-        """Show a run."""
-        try:
-            run = Run.open(path)
-        except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
-            self._close_run(str(error))
+        """Show a run, as soon as it is read."""
+        self._close_run(f"Reading {path.name} …")
+        self._opening = path
+        self._reader.ask(lambda: _look_into(path), self._show_run)
+
+    def _show_run(self, found: _Found | str) -> None:
+        self._opening = None
+        if isinstance(found, str):
+            self._close_run(found)
             return
-        self.opened = run
-        stored = sorted(run.records)
-        self.slider.setEnabled(len(stored) > 1)
-        self.slider.setRange(0, max(0, len(stored) - 1))
-        middle = len(stored) // 2  # the first ones are dark
+        run = self.opened = found.run
+        blocked = self.slider.blockSignals(True)
+        self.slider.setEnabled(len(found.stored) > 1)
+        self.slider.setRange(0, max(0, len(found.stored) - 1))
+        middle = len(found.stored) // 2  # the first ones are dark
         self.slider.setValue(middle)
-        self.about.setPlainText("\n".join(_about(run)))
-        whole = run.condition is RunCondition.COMPLETED and not run.missing()
-        goes_on = run.plan is not None and run.condition is not RunCondition.RUNNING
-        self._can_resume = goes_on and (not whole or lacks_result(run.path))
+        self.slider.blockSignals(blocked)
+        self._stored = found.stored
+        self.about.setPlainText("\n".join(found.about))
+        self._can_resume = found.can_resume and run.condition is not RunCondition.RUNNING
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
-        self.use_button.setEnabled((path / FOLDER).is_dir())
+        self.use_button.setEnabled(found.is_usable)
         self._show_frame(middle)
 
     def as_python(self) -> str:
@@ -250,7 +282,7 @@ class RunsPanel(Panel):
 
     # Inside --------------------------------------------------------------------------------------
     def _show_list(self, summaries: list[RunSummary]) -> None:
-        wanted = self._wanted or (self.opened.path if self.opened is not None else None)
+        wanted = self._wanted or self._opening or (self.opened.path if self.opened is not None else None)
         self.summaries = summaries
         self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
         blocked = self.table.blockSignals(True)
@@ -297,38 +329,32 @@ class RunsPanel(Panel):
                 self.open_run(found.path)
 
     def _close_run(self, why: str) -> None:
-        self.opened = None
+        self._reader.forget()
+        self.opened, self._opening, self._stored = None, None, []
         self.view.clear()
         self.slider.setEnabled(False)
         self.frame_words.clear()
         self.about.setPlainText(why)
+        self._can_resume = False
         self.bar.set_startable("No run is open.")
         self.folder_button.setEnabled(False)
         self.use_button.setEnabled(False)
 
     def _show_frame(self, number: int) -> None:
         run = self.opened
-        stored = sorted(run.records) if run is not None else []
-        if run is None or not stored:
+        if run is None or not self._stored:
             self.view.clear()
             self.frame_words.setText("No frames." if run is not None else "")
             return
-        index = stored[min(number, len(stored) - 1)]
-        try:
-            image, metadata = run.frame(index), run.metadata(index)
-        except Exception as error:  # noqa: BLE001 - a damaged file is told, whatever it raises
-            self.frame_words.setText(str(error))
-            return
-        low, high = np.percentile(image[::4, ::4], _LEVELS)
-        full_scale = (1 << metadata.significant_bits) - 1
-        self.view.show_image(image, float(low), float(max(high, low + 1)), full_scale)
-        words = [
-            f"Frame {index} of {run.n_frames}",
-            f"{metadata.exposure_ms:.4g} ms",
-            metadata.led_pattern or "",
-        ]
-        place = ", ".join(f"{axis} {value:g}" for axis, value in (metadata.stage_position or {}).items())
-        self.frame_words.setText(", ".join(word for word in (*words, place) if word))
+        index = self._stored[min(number, len(self._stored) - 1)]
+        self._reader.ask(lambda: _read_frame(run, index), self._frame_read)
+
+    def _frame_read(self, found: _Picture | str) -> None:
+        if isinstance(found, str):
+            self.frame_words.setText(found)
+        else:
+            self.view.show_image(found.image, found.low, found.high, found.full_scale)
+            self.frame_words.setText(found.words)
 
     def _use(self) -> None:
         if self.opened is not None:
@@ -352,6 +378,39 @@ class RunsPanel(Panel):
         if self.opened is not None:
             self._wanted = self.opened.path
         self.read_folder()
+
+
+def _look_into(path: Path) -> _Found | str:
+    """Read a run; the reason where it cannot be read."""
+    try:
+        run = Run.open(path)
+        whole = run.condition is RunCondition.COMPLETED and not run.missing()
+        can_resume = run.plan is not None and (not whole or lacks_result(run.path))
+        return _Found(run, sorted(run.records), _about(run), can_resume, (path / FOLDER).is_dir())
+    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
+        return str(error)
+
+
+def _read_frame(run: Run, index: int) -> _Picture | str:
+    """Read a frame; the reason where it cannot be read."""
+    try:
+        image, metadata = run.frame(index), run.metadata(index)
+    except Exception as error:  # noqa: BLE001 - a damaged file is told, whatever it raises
+        return str(error)
+    low, high = np.percentile(image[::4, ::4], _LEVELS)
+    words = [
+        f"Frame {index} of {run.n_frames}",
+        f"{metadata.exposure_ms:.4g} ms",
+        metadata.led_pattern or "",
+    ]
+    place = ", ".join(f"{axis} {value:g}" for axis, value in (metadata.stage_position or {}).items())
+    return _Picture(
+        image,
+        float(low),
+        float(max(high, low + 1)),
+        (1 << metadata.significant_bits) - 1,
+        ", ".join(word for word in (*words, place) if word),
+    )
 
 
 def _about(run: Run) -> list[str]:

@@ -14,6 +14,7 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+import gui.panels.holograms as holograms
 import instrument
 from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
@@ -71,6 +72,7 @@ def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path
     panel.show()
     panel.picture.setText(str(tmp_path / "picture.png"))
     qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: panel.target.image is not None, timeout=WAIT_MS)
     panel.iterations.setText("12")
     return panel
 
@@ -248,10 +250,13 @@ def test_views_stand_so_that_they_are_largest() -> None:
     assert best_columns(4, 200, 900) == 1
 
 
-def test_the_target_is_shown_as_it_fills_the_field(panel: HologramsPanel, tmp_path: Path) -> None:
+def test_the_target_is_shown_as_it_fills_the_field(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
+) -> None:
     picture = read_image(tmp_path / "picture.png").pixels / 255
     np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
     panel.fit.setCurrentText("stretch")
+    qtbot.waitUntil(lambda: panel.target.image.shape == picture.shape, timeout=WAIT_MS)
     np.testing.assert_allclose(panel.target.image, picture)
 
 
@@ -300,3 +305,26 @@ def test_a_photograph_leaves_the_light_off_and_the_exposure_as_it_was(
     assert panel.job.error is None
     assert not bench.scene_lit
     assert bench.camera.exposure_ms == before_ms
+
+
+def test_a_picture_is_read_once_and_not_in_the_windows_thread(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = []
+
+    def read(path: Path):
+        threads.append(threading.current_thread())
+        return read_image(path)
+
+    monkeypatch.setattr(holograms, "read_image", read)
+    write_image(tmp_path / "other.png", np.eye(50, dtype=np.uint8))
+    (tmp_path / "words.png").write_text("no picture")
+    panel.picture.setText(str(tmp_path / "other.png"))
+    for _ in range(2):
+        qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: panel.target.image.shape == (50, 50), timeout=WAIT_MS)
+    assert len(threads) == 1
+    assert threads[0] is not threading.main_thread()
+    panel.picture.setText(str(tmp_path / "words.png"))
+    qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: bool(panel.picture.property("refused")), timeout=WAIT_MS)

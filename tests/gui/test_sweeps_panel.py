@@ -147,12 +147,14 @@ def test_a_sweep_with_pause_quality_as_it_arrives_and_its_run_in_the_list(
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
     click_row(qtbot, runs, 0)
+    qtbot.waitUntil(lambda: runs.opened is not None, timeout=WAIT_MS)
     assert runs.opened is not None
     assert "4 PSFs, good" in runs.about.toPlainText()
     assert not runs.bar.start_button.isEnabled()
     runs.slider.setFocus()
     qtbot.keyClick(runs.slider, Qt.Key.Key_End)
-    assert f"Frame {runs.opened.n_frames - 1} of" in runs.frame_words.text()
+    last = f"Frame {runs.opened.n_frames - 1} of"
+    qtbot.waitUntil(lambda: last in runs.frame_words.text(), timeout=WAIT_MS)
 
 
 def click_row(qtbot: QtBot, runs: RunsPanel, row: int) -> None:
@@ -181,6 +183,7 @@ def test_escape_stops_a_sweep_at_once_and_resume_completes_it(
     assert isinstance(runs, RunsPanel)
     qtbot.waitUntil(lambda: runs.table.rowCount() == 1, timeout=WAIT_MS)
     click_row(qtbot, runs, 0)
+    qtbot.waitUntil(lambda: runs.opened is not None, timeout=WAIT_MS)
     compile(runs.as_python(), "resume", "exec")
     assert "ResumeProcedure" in runs.as_python()
     press(qtbot, runs.bar.start_button)
@@ -295,3 +298,21 @@ def test_a_form_is_checked_again_after_somebody_elses_run(
     gate.set()
     qtbot.waitUntil(lambda: job.is_over and panel.run_bar.start_button.isEnabled(), timeout=WAIT_MS)
     assert panel.outlook is not None
+
+
+def test_a_run_is_read_outside_the_windows_thread_and_a_damaged_one_told(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = []
+
+    def damaged(path: Path) -> None:
+        threads.append(threading.current_thread())
+        raise OSError(f"{path} is damaged")
+
+    monkeypatch.setattr("gui.panels.runs.Run.open", damaged)
+    runs = window.show_panel("runs")
+    assert isinstance(runs, RunsPanel)
+    runs.open_run(tmp_path)
+    qtbot.waitUntil(lambda: "is damaged" in runs.about.toPlainText(), timeout=WAIT_MS)
+    assert threads[0] is not threading.main_thread()
+    assert runs.opened is None
