@@ -109,7 +109,7 @@ def main() -> int:
     out = arguments.out or arguments.figure.with_suffix(".json")
     facts = {"date": datetime.now(UTC).isoformat(), "minutes": arguments.minutes, "findings": findings}
     out.write_text(json.dumps({**facts, "done": soak.done, "samples": soak.samples}) + "\n")
-    draw(soak, arguments.minutes, arguments.figure)
+    draw(soak.samples, soak.done, arguments.minutes, arguments.figure)
     print(f"Done: {', '.join(f'{n} {what}' for what, n in sorted(soak.done.items()))}")
     print(f"Wrote {arguments.figure} and {out}")
     for finding in findings or ["Memory flat, no warnings, frame rate held."]:
@@ -246,6 +246,7 @@ class Soak:
         """Take a sample: memory, rates, latency, threads, objects."""
         now = time.perf_counter()
         live, preview = self.session.live.status(), self.preview.follower.status
+        picture = self.preview.follower.newest()
         seconds = now - self._marked_s
         self.samples.append(
             {
@@ -257,6 +258,7 @@ class Soak:
                 "dropped": live.dropped,
                 "latency_ms": None if preview is None else preview.latency_median_ms,
                 "pictures_per_s": None if preview is None else preview.pictures_per_s,
+                "binning": None if picture is None else picture.picture.binning,
                 "threads": threading.active_count(),
                 "objects": len(gc.get_objects()),
                 "cpu_share": (time.process_time() - self._marked_cpu_s) / seconds,
@@ -342,26 +344,29 @@ def until(done: Any, timeout_s: float = 120.0) -> None:
         QTest.qWait(20)
 
 
-def draw(soak: Soak, minutes: float, path: Path) -> None:
+def draw(samples: list[dict[str, Any]], done: dict[str, int], minutes: float, path: Path) -> None:
     """Draw memory, rates and latency over time."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    t = [s["s"] / 60 for s in soak.samples]
+    t = [s["s"] / 60 for s in samples]
     figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True, constrained_layout=True)
-    axes[0].plot(t, [s["memory_mb"] for s in soak.samples], color="#2b6cb0")
-    most_mb = max(s["memory_mb"] for s in soak.samples)
+    axes[0].plot(t, [s["memory_mb"] for s in samples], color="#2b6cb0")
+    axes[0].axvspan(0, SETTLING * t[-1], color="#000000", alpha=0.05, lw=0, label="not judged")
+    most_mb = max(s["memory_mb"] for s in samples)
     axes[0].set(ylabel="memory (MB)", ylim=(0, 1.15 * most_mb))
-    axes[1].plot(t, [s["screen_per_s"] for s in soak.samples], label="on the screen", color="#2f855a")
-    axes[1].plot(t, [s["camera_per_s"] for s in soak.samples], label="of the camera", color="#b7791f", lw=0.9)
-    axes[1].set(ylabel="frames a second", ylim=(0, None))
-    axes[1].legend(loc="lower right")
-    axes[2].plot(t, [s["latency_ms"] or np.nan for s in soak.samples], color="#9b2c2c")
+    axes[0].legend(loc="lower left")
+    # A camera that begins again after a run is measured from there: low values are new streams.
+    axes[1].plot(t, [s["camera_per_s"] for s in samples], ".", label="of the camera", color="#b7791f", ms=4)
+    axes[1].plot(t, [s["screen_per_s"] for s in samples], label="on the screen", color="#2f855a", lw=1.2)
+    axes[1].set(ylabel="frames a second", ylim=(0, 40))
+    axes[1].legend(loc="upper right", ncols=2)
+    axes[2].plot(t, [s["latency_ms"] or np.nan for s in samples], ".", color="#9b2c2c", ms=4)
     axes[2].set(ylabel="median latency of the\nreconstruction (ms)", xlabel="minutes", ylim=(0, None))
-    done = ", ".join(f"{n} {what}" for what, n in sorted(soak.done.items()))
-    figure.suptitle(f"Desktop program for {minutes:g} minutes, SIMULATED bench\n{done}", fontsize=10)
+    what = ", ".join(f"{n} {action}" for action, n in sorted(done.items()))
+    figure.suptitle(f"Desktop program for {minutes:g} minutes, SIMULATED bench\n{what}", fontsize=10)
     for axis in axes:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
