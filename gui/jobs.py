@@ -85,10 +85,6 @@ class JobContext:
             self._send("progress", None)
         self.check()
 
-    def deliver(self, item: object) -> None:
-        """Hand over a part of the result (``Job.arrived``); every one arrives."""
-        self._send("item", item)
-
     def check(self) -> None:
         """Raise JobCancelledError when the job was cancelled."""
         if self.cancel.is_set():
@@ -128,14 +124,13 @@ Work = Callable[[JobContext], Any]
 class Job(QObject):
     """A piece of work in a thread of its own; made by :class:`JobRunner`.
 
-    Signals, all in the window's thread: ``started``; ``progressed`` with the newest report; ``arrived`` with
-    each part delivered; then one of ``succeeded`` with the result, ``failed`` with a text for the user, and
-    ``cancelled`` with what is left, in words; and last ``ended``.
+    Signals, all in the window's thread: ``started``; ``progressed`` with the newest report; then one of
+    ``succeeded`` with the result, ``failed`` with a text for the user, and ``cancelled`` with what is left,
+    in words; and last ``ended``.
     """
 
     started = Signal()
     progressed = Signal(object)
-    arrived = Signal(object)
     succeeded = Signal(object)
     failed = Signal(str)
     cancelled = Signal(str)
@@ -344,8 +339,6 @@ class JobRunner(QObject):
         elif mail.kind == "progress":
             for value in job._context._take_newest():
                 job.progressed.emit(value)
-        elif mail.kind == "item":
-            job.arrived.emit(mail.value)
         else:
             for value in job._context._take_newest():
                 job.progressed.emit(value)

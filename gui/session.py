@@ -111,6 +111,8 @@ class BenchSession(QObject):
         self._from_thread.connect(self._receive, Qt.ConnectionType.QueuedConnection)
         self._handler = _ToSession(self)
         logging.getLogger().addHandler(self._handler)
+        for room in ("instrument", "drivers", "calibration_routines"):
+            logging.getLogger(room).setLevel(logging.INFO)
         self._watch = QTimer(self)
         self._watch.setInterval(_WATCH_MS)
         self._watch.timeout.connect(self._look_after_devices)

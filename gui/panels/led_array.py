@@ -130,6 +130,7 @@ class LedPanel(Panel):
             "from instrument.bench import open_bench\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    bench.led_array.set_pattern({pattern!r})\n"
+            '    input("Enter ends, and turns the light off. ")\n'
         )
 
     def shutdown(self) -> None:

@@ -108,6 +108,7 @@ class SlmPanel(Panel):
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    levels, _ = read_slm_image({self.file.text() or 'phase.png'!r})\n"
             "    show_levels(bench.slm, levels, correction)\n"
+            '    input("Enter ends. ")\n'
         )
 
     def shutdown(self) -> None:

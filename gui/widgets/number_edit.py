@@ -115,13 +115,7 @@ class NumberEdit(QLineEdit):
         if event.key() in (Qt.Key.Key_Up, Qt.Key.Key_Down):
             number, problem = self._read()
             if number is not None and not problem:
-                step = (
-                    1.0
-                    if self._integer
-                    else 10 ** (math.floor(math.log10(abs(number))) - 1)
-                    if number
-                    else 0.1
-                )
+                step = self._step(number)
                 stepped = number + (step if event.key() == Qt.Key.Key_Up else -step)
                 self.setText(self._text(stepped))
                 self.setModified(True)

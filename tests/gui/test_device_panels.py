@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +12,12 @@ from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
+from gui.panel import Panel
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
+from instrument.bench import Bench
+from instrument.config_file import parse_config
 from instrument.slm_correction import SlmCorrection, load_slm_correction
 from instrument.slm_image import write_slm_image
 
@@ -209,3 +214,56 @@ def test_wrong_files_are_refused_at_their_fields(
     assert "no such file" in slm.table_file.toolTip()
     assert not slm.use_table.isEnabled()
     assert window.session.is_open("slm")
+
+
+def run_copied(panel: Panel, text: str, monkeypatch: pytest.MonkeyPatch, look: Callable[[Bench], Any]) -> Any:
+    """Run a panel's lines on a bench of their own; returns what ``look`` saw before it was closed."""
+    seen: list[Any] = []
+
+    class Looked(Bench):
+        def close(self) -> None:
+            seen.append(look(self))
+            super().close()
+
+    monkeypatch.setattr(
+        "instrument.bench.open_bench", lambda _: Looked(parse_config(text, Path("bench.toml"))).open()
+    )
+    asked: list[str] = []
+    monkeypatch.setattr("builtins.input", asked.append)
+    code = panel.as_python()
+    exec(code, {})
+    assert len(seen) == 1
+    assert len(asked) == code.count("input(")
+    return seen[0]
+
+
+def test_the_copied_lines_light_the_same_leds_until_enter(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel, bench_text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    pattern = array.set_pattern(array.single(5, (0, 9, 0)))
+    qtbot.waitUntil(lambda: leds._drawn == pattern, timeout=WAIT_MS)
+    assert "input(" in leds.as_python()
+    lit = run_copied(leds, bench_text, monkeypatch, lambda bench: bench.devices["led_array"].pattern)  # type: ignore[attr-defined]
+    assert lit == pattern
+
+
+def test_the_copied_lines_show_the_same_levels_until_enter(
+    qtbot: QtBot, slm: SlmPanel, bench_text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels = np.arange(60 * 80, dtype=np.uint32).reshape(60, 80).astype(np.uint8)
+    write_slm_image(tmp_path / "phase.png", levels, {})
+    _type(qtbot, slm.file, str(tmp_path / "phase.png"))
+    assert "input(" in slm.as_python()
+    shown = run_copied(slm, bench_text, monkeypatch, lambda bench: bench.devices["slm"].displayed)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(shown, levels)
+
+
+def test_the_copied_lines_bring_the_stage_to_the_same_place(
+    stage: StagePanel, bench_text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage._timer.stop()
+    stage.rows["x_um"].target.set_value(250.0)
+    place = run_copied(stage, bench_text, monkeypatch, lambda bench: bench.source_mount.stage.position())
+    assert place["x_um"] == pytest.approx(250.0, abs=20)

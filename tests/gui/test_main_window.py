@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 
@@ -238,3 +239,11 @@ def test_lists_are_read_without_a_word(window: MainWindow) -> None:
     listings = [job for job in window.session.jobs.jobs if not job.lanes]
     assert listings
     assert all(job.quiet for job in listings)
+
+
+def test_what_drivers_and_instrument_tell_is_in_the_log(qtbot: QtBot, session: BenchSession) -> None:
+    lines: list[tuple[str, str]] = []
+    session.logged.connect(lambda level, text: lines.append((level, text)))
+    for room in ("drivers.stage", "instrument.bench", "calibration_routines.sweep"):
+        logging.getLogger(room).info("told by %s", room)
+    qtbot.waitUntil(lambda: sum("told by" in text for _, text in lines) == 3, timeout=WAIT_MS)
