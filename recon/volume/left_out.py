@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import fftconvolve
 
 from recon.types import Calibration
 from recon.volume.channel import ChannelProblem
@@ -33,6 +32,8 @@ def signs_of_light(
     window : (int, int) or None
         Central part of the PSFs to take.
     """
+    from scipy.signal import fftconvolve
+
     positions, worst = left_out.source_positions_um, 0.0
     for group in members_of_depths(positions):
         off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
