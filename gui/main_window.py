@@ -28,6 +28,7 @@ from gui.session import BenchSession, OperatorRequest
 from gui.theme import THEMES, apply_theme
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.panel_place import PanelPlace
+from gui.widgets.question import Question
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -55,8 +56,9 @@ class MainWindow(QMainWindow):
         self._places: dict[str, PanelPlace] = {}
         self._docks: dict[str, QDockWidget] = {}
         self._may_close = False
-        self.question: QMessageBox | None = None
-        """The question that is open now."""
+        self.question: Question | None = None
+        """The question that was asked last, while it is open."""
+        self._closing_question: Question | None = None
         self.setWindowTitle(f"diffuserbench – {session.config.label}")
         self.setDockOptions(
             QMainWindow.DockOption.AllowTabbedDocks
@@ -301,18 +303,21 @@ class MainWindow(QMainWindow):
             self.job_label.setText(text.splitlines()[0][:200])
 
     def _ask_operator(self, request: OperatorRequest) -> None:
-        box = QMessageBox(QMessageBox.Icon.Information, "To be done by hand", request.text, parent=self)
+        box = Question(QMessageBox.Icon.Information, "To be done by hand", request.text, self)
         done = box.addButton("Done", QMessageBox.ButtonRole.AcceptRole)
         box.addButton("Stop", QMessageBox.ButtonRole.RejectRole)
         box.finished.connect(lambda _: request.confirm() if box.clickedButton() is done else request.refuse())
         request.withdrawn = box.reject
         self._open(box)
 
-    def _open(self, box: QMessageBox) -> None:
+    def _open(self, box: Question) -> None:
         self.question = box
-        box.finished.connect(lambda _: setattr(self, "question", None))
-        box.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        box.open()
+        box.finished.connect(lambda _: self._answered(box))
+        box.ask()
+
+    def _answered(self, box: Question) -> None:
+        if self.question is box:  # not where another was asked meanwhile
+            self.question = None
 
     # The end -------------------------------------------------------------------------------------
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
@@ -323,19 +328,27 @@ class MainWindow(QMainWindow):
             return
         event.ignore()
         running = [job.title for job in self._told_jobs()]
-        if running and self.question is None:
-            box = QMessageBox(
+        if running and self._closing_question is not None:
+            self._closing_question.ask()
+        elif running:
+            box = Question(
                 QMessageBox.Icon.Warning,
                 "Close?",
                 f"{', '.join(running)} is running. Stop it and close?\nWhat was acquired is kept.",
-                parent=self,
+                self,
             )
             stop = box.addButton("Stop and close", QMessageBox.ButtonRole.DestructiveRole)
             stay = box.addButton("Go on", QMessageBox.ButtonRole.RejectRole)
             box.setDefaultButton(stay)
-            box.finished.connect(lambda _: self._end() if box.clickedButton() is stop else None)
+            box.finished.connect(lambda _: self._close_answered(agreed=box.clickedButton() is stop))
+            self._closing_question = box
             self._open(box)
-        elif not running:
+        else:
+            self._end()
+
+    def _close_answered(self, *, agreed: bool) -> None:
+        self._closing_question = None
+        if agreed:
             self._end()
 
     def _end(self) -> None:

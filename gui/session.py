@@ -72,6 +72,8 @@ class BenchSession(QObject):
         Level (``"debug"``, ``"info"``, ``"warning"``, ``"error"``) and text.
     run_finished : Path
         A run's or calibration's folder that was just written.
+    stop_pressed
+        STOP was pressed just now.
     stopped
         STOP was pressed, and everything is safe or known not to be.
     asked : object
@@ -85,6 +87,7 @@ class BenchSession(QObject):
     device_changed = Signal(str)
     logged = Signal(str, str)
     run_finished = Signal(object)
+    stop_pressed = Signal()
     stopped = Signal()
     asked = Signal(object)
     handed_on = Signal(str, object)
@@ -243,10 +246,13 @@ class BenchSession(QObject):
 
         return self.jobs.device(title, on_camera, {"camera"})
 
-    def switch_light(self, light: Light) -> Job:
-        """Light the scene, the point source, or nothing."""
+    def switch_light(self, light: Light, *, quiet: bool = False) -> Job:
+        """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         return self.jobs.device(
-            f"Light: {light}", lambda _: switch_light(self.bench, light), {"led_array", "light"}
+            f"Light: {light}",
+            lambda _: switch_light(self.bench, light),
+            {"led_array", "light"},
+            quiet=quiet,
         )
 
     def exclusive_job(self, title: str, work: Work) -> Job:
@@ -317,6 +323,7 @@ class BenchSession(QObject):
         again until no job can start anything any more.
         """
         self.jobs.cancel_device_jobs()
+        self.stop_pressed.emit()
         for request in list(self._requests):
             request.refuse()
             if request.withdrawn is not None:
@@ -442,7 +449,6 @@ class BenchSession(QObject):
         if what == "open":
             kind, text, simulated = value
             self._set_state(kind, DeviceState("open", text, simulated))
-            self.log("info", f"{kind.replace('_', ' ')} opened: {text}")
         elif what == "failed":
             kind, text = value
             self._set_state(kind, DeviceState("failed", text))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import logging
-import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -22,6 +20,7 @@ from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.camera_settings import apply_table
+from instrument.closing_at_exit import ClosingAtExit
 from instrument.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.config_file import load_config
 from instrument.errors import BenchError
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from instrument.live import LiveView
 
 _log = logging.getLogger(__name__)
-_open_benches: weakref.WeakSet[Bench] = weakref.WeakSet()
+_at_exit = ClosingAtExit()
 
 
 class Bench:
@@ -113,7 +112,7 @@ class Bench:
 
     def open_device(self, kind: Kind) -> Device:
         """Open one device and apply its configured settings."""
-        _open_benches.add(self)
+        _at_exit.watch(self)
         self._claim(kind)
         device = self.devices[kind]
         device.open()
@@ -363,7 +362,7 @@ class Bench:
         try:
             try_all(steps)
         finally:
-            _open_benches.discard(self)
+            _at_exit.forget(self)
 
     def _close_device(self, device: Device) -> None:
         self._opened.discard(device)
@@ -429,15 +428,3 @@ def open_bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | Non
     if not isinstance(config, BenchConfig):
         config = load_config(config)
     return Bench(config, ask).open()
-
-
-def _close_all() -> None:
-    """Leave no light on when the interpreter ends with a bench still open."""
-    for bench in list(_open_benches):
-        try:
-            bench.close()
-        except StepsFailedError as failure:
-            _log.error("%s", failure)
-
-
-atexit.register(_close_all)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtWidgets import QFileDialog, QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBoxLayout, QWidget
 
 from gui.jobs import Job
 from gui.panel import Panel
@@ -13,6 +13,7 @@ from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.views.chart_view import ChartView
 from gui.views.stability_view import StabilityView
+from gui.widgets.question import choose_path
 from instrument.chart_reader import read_chart
 from instrument.errors import FileError
 from instrument.stability_file import read_stability
@@ -93,11 +94,8 @@ class ChartsPanel(Panel):
         self.heading.setToolTip(tip)
 
     def _choose(self) -> None:
-        chosen, _ = QFileDialog.getOpenFileName(
-            self, "Open maps or a chart", str(self.session.runs_folder), "Maps and charts (*.json)"
-        )
-        if chosen:
-            self.open(Path(chosen))
+        start = str(self.session.runs_folder)
+        choose_path(self, "open", "Open maps or a chart", start, self.open, "Maps and charts (*.json)")
 
     def theme_changed(self) -> None:
         """Take over the theme's colours."""

@@ -397,10 +397,10 @@ class LivePanel(Panel):
         """What is lit, as far as the program knows."""
         return light_of(self.session.bench)
 
-    def switch_light(self, light: Light) -> None:
-        """Light the scene, the point source, or nothing."""
+    def switch_light(self, light: Light, *, quiet: bool = False) -> None:
+        """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         try:
-            self.tells(self.session.switch_light(light)).ended.connect(self._show_light)
+            self.tells(self.session.switch_light(light, quiet=quiet)).ended.connect(self._show_light)
         except BusyError as error:
             self.refused(None, str(error))
 
@@ -424,7 +424,7 @@ class LivePanel(Panel):
         if self.session.config.scene.control != "simulated" or self.light is not Light.DARK:
             return
         if "led_array" in self.session.kinds:
-            self.switch_light(Light.SCENE)
+            self.switch_light(Light.SCENE, quiet=True)
         else:  # nobody is asked to darken a point source that may not be there
             job = self.session.device_job(
                 "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True

@@ -13,7 +13,6 @@ from PySide6.QtCore import QTimer
 from PySide6.QtGui import QHideEvent
 from PySide6.QtWidgets import (
     QComboBox,
-    QFileDialog,
     QHBoxLayout,
     QLabel,
     QLineEdit,
@@ -29,6 +28,7 @@ from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
 from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
+from gui.widgets.question import choose_path
 from instrument.calibration_file import is_calibration, load_calibration
 from instrument.full_picture import full_picture
 from instrument.live import LiveResult
@@ -222,9 +222,12 @@ class LiveReconstructionPanel(Panel):
 
     def _browse(self) -> None:
         start = self.file.text() or str(self.session.runs_folder)
-        if name := QFileDialog.getExistingDirectory(self, "Calibration", start):
-            self.file.setText(name)
+
+        def chosen(path: Path) -> None:
+            self.file.setText(str(path))
             self.load()
+
+        choose_path(self, "folder", "Calibration", start, chosen)
 
     def _find_newest(self) -> None:
         """Begin with the newest calibration among the runs, if there is one."""

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
-    QFileDialog,
     QHBoxLayout,
     QLabel,
     QListWidget,
     QListWidgetItem,
+    QMessageBox,
     QPushButton,
     QSplitter,
     QStackedWidget,
@@ -33,6 +33,7 @@ from gui.views.picture_view import PictureView, as_shown
 from gui.views.reconstruct_form import CALIBRATION, PSF, ReconstructForm
 from gui.views.volume_view import VolumeView
 from gui.widgets.colour_maps import table
+from gui.widgets.question import Question, choose_path
 from instrument.errors import BenchError
 from instrument.images import write_image
 from instrument.reconstruction_request import VolumeRequest
@@ -162,11 +163,8 @@ class ReconstructionsPanel(Panel):
         self.open(item.data(Qt.ItemDataRole.UserRole))
 
     def _choose(self) -> None:
-        chosen, _ = QFileDialog.getOpenFileName(
-            self, "Open a result", str(self.session.runs_folder), "Results (*.tif *.tiff *.npy *.json)"
-        )
-        if chosen:
-            self.open(Path(chosen))
+        filters = "Results (*.tif *.tiff *.npy *.json)"
+        choose_path(self.list, "open", "Open a result", str(self.session.runs_folder), self.open, filters)
 
     def open(self, path: Path) -> Job:
         """Open a result, in a job; it is shown when it is there, or the last line says why not."""
@@ -209,11 +207,35 @@ class ReconstructionsPanel(Panel):
         if self.result is None:
             return
         values = "*.tif *.npy" if self.result.volume is None else "*.tif *.ome.zarr *.npy"
-        chosen, _ = QFileDialog.getSaveFileName(
-            self, "Export", str(self.result.path.parent), f"All values ({values});;What is shown (*.png)"
+        filters = f"All values ({values});;What is shown (*.png)"
+        start = str(self.result.path.parent)
+        choose_path(self.viewers, "save", "Export", start, self._export_chosen, filters)
+
+    def _export_chosen(self, target: Path) -> None:
+        """Export, after asking whether files that exist may be replaced."""
+        if self.result is None:
+            return  # closed while the name was chosen
+        present = [path for path in self._export_files(target) if path.exists()]
+        if not present:
+            self.export_to(target)
+            return
+        names = ", ".join(path.name for path in present)
+        box = Question(QMessageBox.Icon.Question, "Replace?", f"{names}: exists already. Replace it?", self)
+        replace = box.addButton("Replace", QMessageBox.ButtonRole.DestructiveRole)
+        box.setDefaultButton(box.addButton("Keep", QMessageBox.ButtonRole.RejectRole))
+        box.finished.connect(
+            lambda _: self.export_to(target, overwrite=True) if box.clickedButton() is replace else None
         )
-        if chosen:
-            self.export_to(Path(chosen), overwrite=True)
+        box.ask()
+
+    def _export_files(self, target: Path) -> dict[Path, str]:
+        """Return the files that an export writes, each with the view that it shows ("" for all values)."""
+        if target.suffix.lower() != ".png":
+            return {target: ""}
+        names = list(self._shown())
+        if len(names) == 1:
+            return {target: names[0]}
+        return {target.with_name(f"{target.stem}-{name}.png"): name for name in names}
 
     def export_to(self, target: Path, *, overwrite: bool = False) -> Job | None:
         """Write what is shown (``.png``: one file for each view), or all values, as the name asks for."""
@@ -221,10 +243,8 @@ class ReconstructionsPanel(Panel):
         if result is None:
             return None
         if target.suffix.lower() == ".png":
-            shown = {
-                (target if len(self._shown()) == 1 else target.with_name(f"{target.stem}-{name}.png")): pixels
-                for name, pixels in self._shown().items()
-            }
+            views = self._shown()
+            shown = {path: views[name] for path, name in self._export_files(target).items()}
 
             def draw(_context: JobContext) -> list[Path]:
                 for path, pixels in shown.items():

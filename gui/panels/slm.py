@@ -10,7 +10,6 @@ import numpy.typing as npt
 from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import (
     QCheckBox,
-    QFileDialog,
     QHBoxLayout,
     QLabel,
     QLineEdit,
@@ -25,6 +24,7 @@ from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
 from gui.widgets.message import elided
 from gui.widgets.plot import curve_pen, plot_widget, restyle
+from gui.widgets.question import choose_path
 from instrument.errors import BenchError
 from instrument.slm_correction import SlmCorrection, load_slm_correction, show_levels
 from instrument.slm_image import read_slm_image
@@ -207,15 +207,16 @@ class SlmPanel(Panel):
         self.look()
 
     def _browse(self) -> None:
-        name, _ = QFileDialog.getOpenFileName(self, "Phase picture", self.file.text(), _IMAGES)
-        if name:
-            self.file.setText(name)
+        def chosen(path: Path) -> None:
+            self.file.setText(str(path))
             self.load()
 
+        choose_path(self.file, "open", "Phase picture", self.file.text(), chosen, _IMAGES)
+
     def _browse_table(self) -> None:
-        name, _ = QFileDialog.getOpenFileName(
-            self, "SLM calibration", self.table_file.text(), "Calibration (*.json)"
-        )
-        if name:
-            self.table_file.setText(name)
+        def chosen(path: Path) -> None:
+            self.table_file.setText(str(path))
             self.load_table()
+
+        filters = "Calibration (*.json)"
+        choose_path(self.table_file, "open", "SLM calibration", self.table_file.text(), chosen, filters)

@@ -25,6 +25,7 @@ from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.widgets.number_edit import NumberEdit
+from gui.widgets.question import Question
 
 _READ_MS = 200
 _FINE, _COARSE = 0.1, 10.0
@@ -115,7 +116,7 @@ class StagePanel(Panel):
         super().__init__(session, parent)
         self.rows: dict[str, _Row] = {}
         self.steps: dict[str, NumberEdit] = {}
-        self.question: QMessageBox | None = None
+        self.question: Question | None = None
         self._reading: Job | None = None
         self.state = QLabel()
         self.state.setWordWrap(True)
@@ -302,19 +303,27 @@ class StagePanel(Panel):
 
     def ask_home(self) -> None:
         """Ask whether the stage may be homed, then do it."""
-        box = QMessageBox(
+        if self.question is not None:
+            self.question.ask()
+            return
+        box = Question(
             QMessageBox.Icon.Question,
             "Home the stage?",
             "Every axis moves to its reference and then to its home position. Is its way free?",
-            parent=self,
+            self,
         )
         go = box.addButton("Home", QMessageBox.ButtonRole.AcceptRole)
         stay = box.addButton("Stay", QMessageBox.ButtonRole.RejectRole)
         box.setDefaultButton(stay)
-        box.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        box.finished.connect(lambda _: self._home() if box.clickedButton() is go else None)
         self.question = box
-        box.open()
+        box.finished.connect(lambda _: self._home_answered(agreed=box.clickedButton() is go))
+        self.session.stop_pressed.connect(box.reject)
+        box.ask()
+
+    def _home_answered(self, *, agreed: bool) -> None:
+        self.question = None
+        if agreed:
+            self._home()
 
     def _home(self) -> None:
         stage = self.session.bench.stage

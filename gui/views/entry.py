@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from PySide6.QtCore import Signal
 from PySide6.QtGui import QFocusEvent
-from PySide6.QtWidgets import QComboBox, QFileDialog, QHBoxLayout, QLineEdit, QToolButton, QWidget
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QToolButton, QWidget
 
+from gui.widgets.question import Browse, choose_path
 from instrument.errors import BenchError
-
-Browse = Literal["open", "folder", "save"]
 
 
 class Entry(QLineEdit):
@@ -113,16 +112,12 @@ class PathEntry(QWidget):
         self._browse = browse
 
     def _choose(self) -> None:
-        start = self.entry.text()
-        if self._browse == "folder":
-            chosen = QFileDialog.getExistingDirectory(self, "Choose a folder", start)
-        elif self._browse == "save":
-            chosen, _ = QFileDialog.getSaveFileName(self, "Choose a name", start, self._filters)
-        else:
-            chosen, _ = QFileDialog.getOpenFileName(self, "Choose a file", start, self._filters)
-        if chosen:
-            self.entry.setText(chosen)
-            self.entry.check()
+        words = {"open": "Choose a file", "folder": "Choose a folder", "save": "Choose a name"}[self._browse]
+        choose_path(self, self._browse, words, self.entry.text(), self._chosen, self._filters)
+
+    def _chosen(self, path: Path) -> None:
+        self.entry.setText(str(path))
+        self.entry.check()
 
 
 def narrow(box: QComboBox) -> None:

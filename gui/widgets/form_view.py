@@ -12,7 +12,6 @@ from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
-    QFileDialog,
     QFormLayout,
     QHBoxLayout,
     QLabel,
@@ -27,6 +26,7 @@ from PySide6.QtWidgets import (
 
 from gui.forms.field import Field, Form
 from gui.widgets.number_edit import NumberEdit
+from gui.widgets.question import choose_path
 
 _TEXT_HEIGHT_PX = 300
 
@@ -218,9 +218,7 @@ class FormView(QWidget):
             self.changed.emit()
 
     def _browse(self, field: Field, line: QLineEdit) -> None:
-        name, _ = QFileDialog.getOpenFileName(self, field.label, line.text())
-        if name:
-            line.setText(name)
+        choose_path(line, "open", field.label, line.text(), lambda path: line.setText(str(path)))
 
     def _read(self, field: Field) -> tuple[Any, str]:
         widget = self.widgets[field.name]

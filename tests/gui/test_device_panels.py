@@ -16,6 +16,7 @@ from gui.panel import Panel
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
+from gui.widgets.question import Question
 from instrument.bench import Bench
 from instrument.config_file import parse_config
 from instrument.slm_correction import SlmCorrection, load_slm_correction
@@ -60,6 +61,21 @@ def test_home_asks_first(qtbot: QtBot, window: MainWindow, stage: StagePanel) ->
     qtbot.waitUntil(
         lambda: "homed" in stage.state.text() and "Not" not in stage.state.text(), timeout=WAIT_MS
     )
+
+
+def test_stop_takes_clicks_while_home_is_asked_and_withdraws_it(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    qtbot.mouseClick(stage.home_button, LEFT)
+    qtbot.mouseClick(stage.home_button, LEFT)  # not asked twice
+    (box,) = stage.findChildren(Question)
+    assert box is stage.question
+    assert not box.isModal()
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, LEFT)
+        assert stage.question is None
+    assert window.session.bench.stage is not None
+    assert not window.session.bench.stage.is_homed
 
 
 def test_jogging_by_keys(qtbot: QtBot, window: MainWindow, stage: StagePanel) -> None:

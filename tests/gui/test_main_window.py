@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from PySide6.QtCore import QSettings, Qt
@@ -17,6 +18,8 @@ from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES
 from gui.widgets.message import TextWindow
+from gui.widgets.question import choose_path
+from instrument.snapshot import Light
 
 WAIT_MS = 20_000
 
@@ -132,8 +135,16 @@ def test_closing_while_something_runs_asks_and_then_ends_safely(qtbot: QtBot, wi
     assert not job.is_over
     assert window.isVisible()
     window.close()
-    assert window.question is not None
-    stop = next(b for b in window.question.buttons() if b.text() == "Stop and close")
+    first = window.question
+    assert first is not None
+    assert not first.isModal()
+    window.close()  # not asked twice
+    assert window.question is first
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
+    assert job.is_over
+    assert first.isVisible()
+    stop = next(b for b in first.buttons() if b.text() == "Stop and close")
     with qtbot.waitSignal(session.closed, timeout=WAIT_MS):
         qtbot.mouseClick(stop, Qt.MouseButton.LeftButton)
     assert job.is_over
@@ -231,6 +242,39 @@ def test_closing_asks_before_a_short_job_is_broken_off_and_not_before_a_listing(
     window.question.reject()
     gate.set()
     qtbot.waitUntil(lambda: job.is_over, timeout=WAIT_MS)
+
+
+def test_stop_takes_clicks_while_a_file_is_chosen(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+    panel = window.show_panel("reconstructions")
+    chosen: list[Path] = []
+    start = tmp_path / "sub" / "name.tif"
+    start.parent.mkdir()
+    start.touch()
+    dialogue = choose_path(panel, "open", "A file", str(start), chosen.append)
+    assert choose_path(panel, "open", "A file", str(start), chosen.append) is dialogue
+    assert dialogue.isVisible()
+    assert not dialogue.isModal()
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, Qt.MouseButton.LeftButton)
+    qtbot.keyClick(dialogue, Qt.Key.Key_Return)
+    assert chosen == [start]
+
+
+def test_nobody_is_asked_to_close_what_was_only_just_opened(
+    qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = window.session
+    qtbot.waitUntil(lambda: not session.jobs.is_busy("light"), timeout=WAIT_MS)
+    gate = threading.Event()
+    monkeypatch.setattr("gui.session.switch_light", lambda *_: gate.wait(WAIT_MS / 1000))
+    live = window.panel("live")
+    monkeypatch.setattr(type(live), "light", Light.DARK)
+    live._light_the_scene()  # type: ignore[attr-defined]
+    qtbot.waitUntil(lambda: session.jobs.is_busy("light"), timeout=WAIT_MS)
+    window.close()
+    assert window.question is None
+    gate.set()
+    qtbot.waitUntil(lambda: session.is_closed, timeout=WAIT_MS)
 
 
 def test_lists_are_read_without_a_word(window: MainWindow) -> None:
