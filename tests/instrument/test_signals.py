@@ -44,8 +44,10 @@ def here(tmp_path: Path) -> Path:
 
 
 def program(code: str, folder: Path) -> subprocess.Popen[str]:
+    """Start a program that minds SIGHUP, even where nohup runs the tests and its ignoring is inherited."""
+    heeding = "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
     return subprocess.Popen(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", heeding + code],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -71,7 +73,10 @@ def test_a_signal_ends_the_run_safely_and_says_where_it_is(here: Path, number: i
     process = program(RUN, here)
     until(process, "camera.snap", 3)
     process.send_signal(number)
-    rest, errors = process.communicate(timeout=60)
+    try:
+        rest, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == status
     calls = rest.split()
     assert "led_array.set_pattern" not in calls[calls.index("led_array.off") :]
