@@ -13,7 +13,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.methods import Problem, method_named, method_names
 from recon.noise import NoiseModel
-from recon.preparation import Field, Prepared, prepare
+from recon.preparation import Field, Precision, Prepared, prepare
 from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
 from recon.result import Reconstruction
 from recon.solvers.base import Keeper, Outcome, Solver
@@ -72,6 +72,7 @@ def reconstruct(
     cancel: threading.Event | None = None,
     judged: bool = True,
     keeper: Keeper | None = None,
+    precision: Precision = "float32",
 ) -> Reconstruction:
     """Reconstruct the picture of one depth from a lensless camera's measurement.
 
@@ -126,6 +127,9 @@ def reconstruct(
         Say whether the result can be trusted (``verdict``), at the cost of about two iterations.
     keeper : Keeper, optional
         Keeps the solver's state, and has it go on from what was kept of the same reconstruction.
+    precision : "float32" or "float64"
+        Of the solver's arithmetic; the picture is float32. With float64, which takes twice the memory, the
+        model is one convolution: the others compute in float32.
 
     Returns
     -------
@@ -140,7 +144,7 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
-    prevented = _no_choice(calibration, model, method, prior, initial, keeper)
+    prevented = _no_choice(calibration, model, method, prior, initial, keeper, precision)
     if prevented is None:
         from recon.auto.picture import reconstruct_chosen
 
@@ -169,6 +173,11 @@ def reconstruct(
 
         require_choice(wishes, prevented)
     varying = _varying_model(calibration, z_um, model, method, prior, initial)
+    if varying is not None and varying[0] != "convolution" and precision != "float32":
+        raise InputError(
+            f"The {varying[0]} model computes in float32. For precision={precision!r} choose "
+            'model="convolution".'
+        )
     if varying is not None and varying[0] != "convolution":
         assert isinstance(calibration, Calibration)
         return reconstruct_varying(
@@ -193,7 +202,13 @@ def reconstruct(
             keeper=keeper,
         )
     problem = prepare(
-        measurement, calibration, z_um=z_um, noise=noise, background=background, erasures=erasures
+        measurement,
+        calibration,
+        z_um=z_um,
+        noise=noise,
+        background=background,
+        erasures=erasures,
+        precision=precision,
     )
     problem.grid(field, z_um)
     peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
@@ -298,6 +313,7 @@ def _no_choice(
     prior: str | Prior,
     initial: Reconstruction | None,
     keeper: Keeper | None,
+    precision: Precision,
 ) -> str | None:
     """Return what prevents that everything is chosen; None where nothing does."""
     preventing = {
@@ -307,6 +323,7 @@ def _no_choice(
         f"prior={prior!r}": not (isinstance(prior, str) and prior in VOLUME_PRIORS),
         "a start (initial)": initial is not None,
         "a checkpoint (keeper)": keeper is not None,
+        f"precision={precision!r}": precision != "float32",
     }
     return next((what for what, prevents in preventing.items() if prevents), None)
 

@@ -18,6 +18,9 @@ from recon.types import Calibration, Geometry
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 Field = Literal["sensor", "full"]
+Precision = Literal["float32", "float64"]
+PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
+"""Of all arithmetic in the solver."""
 
 LEAST_NOISE = 1e-5
 """Noise assumed at least, relative to the measurement's root mean square: float32 holds no more."""
@@ -35,7 +38,8 @@ class Prepared:
         The camera with unit-energy PSFs; with erasures when some pixels are not valid.
     camera : PadCropConvolution
         The same without erasures.
-    data : ndarray, float32, (n_channels, height, width)
+    data : ndarray, (n_channels, height, width)
+        In the precision asked for, like the operators.
     noise : ndarray, float32, (n_channels,)
         Standard deviation of the noise, counts.
     image_scale : ndarray, float32, (n_channels, 1, 1)
@@ -48,7 +52,7 @@ class Prepared:
 
     operator: LinearOperator
     camera: PadCropConvolution
-    data: Floats
+    data: Array
     noise: Floats
     image_scale: Floats
     noise_norm: float
@@ -98,8 +102,12 @@ def prepare(
     noise: NoiseModel | float | None = None,
     background: npt.ArrayLike | None = None,
     erasures: npt.ArrayLike | None = None,
+    precision: Precision = "float32",
 ) -> Prepared:
     """Check, subtract the background, scale. Parameters as :func:`recon.reconstruct`."""
+    if precision not in PRECISIONS:
+        raise InputError(f"The precision is {' or '.join(PRECISIONS)}, not {precision!r}.")
+    dtype = np.dtype(precision)
     data, valid, saturated = data_of(measurement, background, erasures)
     if isinstance(calibration, Calibration):
         psfs, psf_z_um = select_psf(calibration, z_um)
@@ -118,12 +126,12 @@ def prepare(
     deviation = np.array([channel_noise(d, v, noise) for d, v in zip(data, valid, strict=True)], np.float32)
     energy = np.sqrt(np.sum(psfs.astype(np.float64) ** 2, axis=(1, 2))).astype(np.float32)
     shape = (data.shape[1], data.shape[2])
-    camera = PadCropConvolution(psfs / energy[:, None, None], shape, n_channels=len(data))
-    operator: LinearOperator = camera if valid.all() else Erasures(valid, data.shape) @ camera
+    camera = PadCropConvolution(psfs / energy[:, None, None], shape, n_channels=len(data), dtype=dtype)
+    operator: LinearOperator = camera if valid.all() else Erasures(valid, data.shape, dtype=dtype) @ camera
     return Prepared(
         operator=operator,
         camera=camera,
-        data=np.where(valid, data / deviation[:, None, None], 0).astype(np.float32),
+        data=np.where(valid, data / deviation[:, None, None], 0).astype(dtype),
         noise=deviation,
         image_scale=(deviation / energy)[:, None, None],
         noise_norm=float(np.sqrt(np.count_nonzero(valid))),

@@ -14,7 +14,7 @@ from gui.session import BenchSession
 from gui.views.chart_view import ChartView
 from gui.views.stability_view import StabilityView
 from gui.widgets.question import choose_path
-from instrument.chart_reader import read_chart
+from instrument.chart.reader import read_chart
 from instrument.errors import FileError
 from instrument.stability_file import read_stability
 from recon.stability.shipped import shipped_file
@@ -108,7 +108,7 @@ class ChartsPanel(Panel):
             lines = [
                 "from pathlib import Path",
                 "",
-                "from instrument.chart_reader import read_chart",
+                "from instrument.chart.reader import read_chart",
                 "",
                 f"points = read_chart({expression(self.chart_path)})['points']",
                 f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "

@@ -1,15 +1,20 @@
-"""``diffuserbench chart``: every method on one scene or photograph, time and memory against the error."""
+"""``diffuserbench chart``: every setting on one problem, what it costs against how good it is."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
+from instrument.cli.etendue import parse_size
 from instrument.cli.progress import progress_bar
 from instrument.errors import BenchError
+
+if TYPE_CHECKING:
+    from instrument.chart.data import ChartData
+    from recon.chart.scored import Named, Problem
 
 app = command_app()
 
@@ -20,6 +25,8 @@ app = command_app()
         "diffuserbench chart --scene beads --size 40 --budget 120 --out beads-chart",
         "diffuserbench chart --calibration demo/calibration --image photo.tif --z-mm 30",
         "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
+        "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
+        "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
     )
 )
 def chart(
@@ -41,15 +48,56 @@ def chart(
         Path | None,
         typer.Option("--image", "-i", metavar="FILE", help="Your photograph.", show_default=False),
     ] = None,
-    z_mm: Annotated[
-        float | None,
+    hologram: Annotated[
+        list[str] | None,
         typer.Option(
-            "--z-mm", metavar="MM", help="Distance of a flat scene, of several depths.", show_default=False
+            "--hologram",
+            metavar="TARGET",
+            help="A picture to be shown by the bench's SLM, once for each plane: a file, or portrait, "
+            "relief, head, leaves, clouds.",
+            show_default=False,
+        ),
+    ] = None,
+    z_mm: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--z-mm",
+            metavar="MM",
+            help="Distance of a flat scene, of several depths; of each hologram's plane.",
+            show_default=False,
         ),
     ] = None,
     volume: Annotated[
         bool, typer.Option("--volume", help="With --image: a volume of all calibrated depths.")
     ] = False,
+    expansion: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--expansion",
+            "-q",
+            help="With --hologram: étendue expansions. Default: 4, 16 and the bench's.",
+            show_default=False,
+        ),
+    ] = None,
+    frames: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--frames",
+            min=1,
+            help="With --hologram: time-multiplexed frames. Default: 1, 2, 3.",
+            show_default=False,
+        ),
+    ] = None,
+    slm: Annotated[
+        str | None,
+        typer.Option(
+            "--slm",
+            metavar="HxW",
+            help="With --hologram: other SLM pixels than the bench's: few, for a quick chart.",
+            show_default=False,
+        ),
+    ] = None,
+    bench: BenchOption = None,
     size: Annotated[int, typer.Option("--size", min=16, metavar="N", help="Pixels of a scene's side.")] = 48,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the scene.")] = 0,
     budget_s: Annotated[
@@ -60,55 +108,123 @@ def chart(
         typer.Option("--out", "-o", metavar="FOLDER", help="For chart.png, .html, .csv, .json."),
     ] = Path("chart"),
 ) -> None:
-    """Chart every applicable method, model, prior, count of iterations and binning on one problem.
+    """Chart what every setting costs against how good it is, each in a process of its own, quick ones first.
 
-    With a ground truth the error is PSNR, SSIM and NRMSE; without one the error on 5 % of the pixels, which
-    are held out and predicted from the rest. Each setting runs in a process of its own, quick ones first. Run
-    the same command again to go on where it stopped.
+    Reconstructions (of --scene, or --calibration and --image): method, model, prior, iterations, binning and
+    precision. With a ground truth the error is PSNR, SSIM and NRMSE; without one the error on 5 % of the
+    pixels, which are held out and predicted from the rest. Holograms (--hologram): loss, method, expansion,
+    frames and iterations. Run the same command again to go on where it stopped.
     """
-    if (scene is None) == (calibration is None and image is None):
-        raise BenchError("Give --scene NAME, or your own --calibration FOLDER and --image FILE.")
-    from instrument.chart_figure import write_charts
-    from instrument.chart_job import make_chart, problem_of_job, problem_of_scene
-    from recon.chart import Setting
+    subject = _only(
+        {
+            "--scene": scene is not None,
+            "--calibration and --image": calibration is not None or image is not None,
+            "--hologram": bool(hologram),
+        }
+    )
+    _refuse(
+        subject,
+        {
+            "--volume": (volume, ("--calibration and --image",)),
+            "--z-mm": (bool(z_mm), ("--calibration and --image", "--hologram")),
+            "--expansion": (bool(expansion), ("--hologram",)),
+            "--frames": (bool(frames), ("--hologram",)),
+            "--slm": (slm is not None, ("--hologram",)),
+            "--bench": (bench is not None, ("--hologram",)),
+        },
+    )
+    from instrument.chart.figure import write_charts
+    from instrument.chart.problems import problem_of_pictures, problem_of_scene
 
+    problem: Problem
     if scene is not None:
         problem, about = problem_of_scene(scene, size, seed)
+    elif hologram:
+        problem, about = problem_of_pictures(
+            load_and_say(bench),
+            hologram,
+            z_mm or (),
+            expansion or (),
+            frames or (1, 2, 3),
+            None if slm is None else parse_size(slm),
+        )
     else:
-        if calibration is None or image is None:
-            raise BenchError("Your own chart needs both --calibration FOLDER and --image FILE.")
-        from instrument.reconstruction_job import job_from_calibration
-
-        job = job_from_calibration(calibration, image)
-        for name, text in job.notes.items():
-            typer.echo(f"{name:<12}{text}")
-        problem, about = problem_of_job(job, None if z_mm is None else 1e3 * z_mm, volume=volume)
+        problem, about = _photograph(calibration, image, z_mm or [], volume=volume)
     if about.get("simulated"):
-        typer.echo("SIMULATED   scene or input come from a simulation")
+        typer.echo("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
     record = out / "chart.json"
+    data = _made(problem, about, record, budget_s)
+    if not data.points:
+        if not data.failed:
+            raise BenchError("There was no time for any setting: give a longer --budget.")
+        raise BenchError("No setting could be run: " + "; ".join(f"{k}: {v}" for k, v in data.failed.items()))
+    files = write_charts(out, data)
+    _tell(data)
+    typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")
+
+
+def _only(given: dict[str, bool]) -> str:
+    chosen = [name for name, is_given in given.items() if is_given]
+    if len(chosen) != 1:
+        found = f"; {' and '.join(chosen)} exclude each other" if chosen else ""
+        raise BenchError(
+            f"Give --scene NAME, your own --calibration FOLDER and --image FILE, or --hologram TARGET{found}."
+        )
+    return chosen[0]
+
+
+def _refuse(subject: str, options: dict[str, tuple[bool, tuple[str, ...]]]) -> None:
+    for name, (is_given, subjects) in options.items():
+        if is_given and subject not in subjects:
+            raise BenchError(f"{name} goes with {' or '.join(subjects)}, not with {subject}.")
+
+
+def _photograph(
+    calibration: Path | None, image: Path | None, z_mm: list[float], *, volume: bool
+) -> tuple[Problem, dict[str, Any]]:
+    if calibration is None or image is None:
+        raise BenchError("Your own chart needs both --calibration FOLDER and --image FILE.")
+    if len(z_mm) > 1 or (z_mm and volume):
+        raise BenchError("--z-mm is the one distance of a flat scene: give it once, and without --volume.")
+    from instrument.chart.problems import problem_of_job
+    from instrument.reconstruction_job import job_from_calibration
+
+    job = job_from_calibration(calibration, image)
+    for name, text in job.notes.items():
+        typer.echo(f"{name:<12}{text}")
+    return problem_of_job(job, 1e3 * z_mm[0] if z_mm else None, volume=volume)
+
+
+def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
+    from instrument.chart.job import make_chart
+
     with saying_what_is_left(record), progress_bar() as bar:
         task = bar.add_task("settings", total=None, note="")
 
-        def told(place: int, total: int, setting: Setting, left_s: float) -> None:
+        def told(place: int, total: int, setting: Named, left_s: float) -> None:
             bar.update(
                 task, total=total, completed=place, note=f"{setting.name}, {left_s:.0f} s of the budget left"
             )
 
-        data = make_chart(problem, about, record, budget_s=budget_s, told=told)
-    if not data.points:
-        raise BenchError("No setting could be run: " + "; ".join(f"{k}: {v}" for k, v in data.failed.items()))
-    files = write_charts(out, data)
-    unit = "dB" if data.has_truth else "noise, held out"
-    typer.echo(f"{'Pareto front':<44}{'iterations':>10}{'s':>9}{'MiB':>8}{unit:>18}")
-    for p in data.front():
-        value = p.psnr_db if data.has_truth else p.held_out
-        typer.echo(f"{p.setting:<44}{p.iterations:>10}{p.seconds:>9.3g}{p.peak_mib:>8.3g}{value:>18.3f}")
-    for name, why in data.failed.items():
-        typer.echo(f"Warning: {name} could not be run: {why}", err=True)
+        return make_chart(problem, about, record, budget_s=budget_s, told=told)
+
+
+def _tell(data: ChartData) -> None:
+    """Print the fronts, what failed, and what there was no time for."""
+    score, cost = data.kind.score_of(data.points), data.kind.costs[0]
+    heading = f"{'iterations':>10}{cost.key:>9}{'MiB':>8}"
+    for group, front in data.fronts().items():
+        name = f"Pareto front {group}".rstrip()
+        typer.echo(f"{name:<44}{heading}  {score.words}")
+        for p in front:
+            paid, value = getattr(p, cost.key), getattr(p, score.key)
+            typer.echo(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
+    for setting, why in data.failed.items():
+        typer.echo(f"Warning: {setting} could not be run: {why}", err=True)
     if data.missing:
+        some = ", ".join(data.missing[:3]) + (", ..." if len(data.missing) > 3 else "")
         typer.echo(
-            f"No time, or not enough, for {len(data.missing)} settings "
-            f"({', '.join(data.missing[:3])}, ...): run the same command again to go on."
+            f"No time, or not enough, for {len(data.missing)} settings ({some}): run the same command again "
+            "to go on."
         )
-    typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")

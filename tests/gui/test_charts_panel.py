@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.panels.charts import ChartsPanel
 from gui.views.chart_view import describe
-from instrument.chart_reader import read_chart
+from instrument.chart.reader import read_chart
 from instrument.errors import FileError
 from instrument.images import read_image
 from instrument.stability_file import read_stability
@@ -127,7 +127,8 @@ def chart(tmp_path: Path) -> Path:
         for s, n, t, p in POINTS
     ]  # fmt: skip
     record = {
-        "schema": 1,
+        "schema": 2,
+        "kind": "reconstruction",
         "about": {"scene": "beads", "simulated": True},
         "points": points,
         "pareto": [],
@@ -170,7 +171,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
 
 def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel, tmp_path: Path) -> None:
     path = chart(tmp_path)
-    path.write_text(path.read_text().replace('"schema": 1', '"schema": 7'))
+    path.write_text(path.read_text().replace('"schema": 2', '"schema": 7'))
     with pytest.raises(FileError, match="version 7"):
         read_chart(path)
     path.write_text("no JSON")

@@ -16,7 +16,7 @@ from recon import chart as recon_chart
 @pytest.fixture
 def quick(monkeypatch):
     """Two settings, in this process."""
-    import instrument.chart_job as job
+    import instrument.chart.job as job
 
     settings = (
         recon_chart.Setting("wiener", "convolution", "none"),
@@ -29,8 +29,8 @@ def quick(monkeypatch):
         ran.append(setting.name)
         return recon_chart.run_setting(problem, setting, counts=(2, 5))
 
-    monkeypatch.setattr(job, "settings_for", lambda problem: settings)
-    monkeypatch.setattr(job, "_in_own_process", here)
+    monkeypatch.setattr(recon_chart.ChartProblem, "settings", lambda problem: settings)
+    monkeypatch.setattr(job, "in_own_process", here)
     return ran
 
 
@@ -62,9 +62,10 @@ def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
 
 
 def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_path):
-    import instrument.chart_job as job
+    import instrument.chart.job as job
+    from instrument.chart.problems import problem_of_scene
 
-    whole = job._in_own_process
+    whole = job.in_own_process
 
     def cut(problem, setting, limit_s):
         curve = whole(problem, setting, limit_s)
@@ -72,16 +73,16 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
         return recon_chart.Curve(curve.points[:1], False) if shorter else curve
 
     out = tmp_path / "chart"
-    problem, about = job.problem_of_scene("sparse-picture", 32, 0)
+    problem, about = problem_of_scene("sparse-picture", 32, 0)
     path = tmp_path / "chart.json"
     arguments = {"budget_s": 100.0, "told": lambda *_: None}
-    monkeypatch.setattr(job, "_in_own_process", cut)
+    monkeypatch.setattr(job, "in_own_process", cut)
     assert run("--scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
     data = job.make_chart(problem, about, path, **arguments)
     assert [p.iterations for p in data.points] == [0, 2]
     assert data.missing == ("admm convolution tv",)
     quick.clear()
-    monkeypatch.setattr(job, "_in_own_process", whole)
+    monkeypatch.setattr(job, "in_own_process", whole)
     data = job.make_chart(problem, about, path, **arguments)
     assert quick == ["admm convolution tv"]
     assert [p.iterations for p in data.points] == [0, 2, 5]
@@ -92,7 +93,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
 
 
 def test_a_chart_tells_noise_erasures_and_truth_apart():
-    from instrument.chart_job import _fingerprint, problem_of_scene
+    from instrument.chart.problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     others = [
@@ -100,12 +101,12 @@ def test_a_chart_tells_noise_erasures_and_truth_apart():
         replace(problem, erasures=np.eye(32, dtype=bool)),
         replace(problem, truth=None),
     ]
-    assert len({_fingerprint(p) for p in (problem, *others)}) == 4
-    assert _fingerprint(replace(problem)) == _fingerprint(problem)
+    assert len({p.fingerprint() for p in (problem, *others)}) == 4
+    assert replace(problem).fingerprint() == problem.fingerprint()
 
 
 def test_the_noise_that_the_photograph_tells_is_used():
-    from instrument.chart_job import problem_of_job
+    from instrument.chart.problems import problem_of_job
 
     calibration = Calibration(np.ones((1, 1, 8, 8), np.float32), np.array([[0, 0, 1e4]]))
     grey = Job(np.ones((8, 8), np.float32), calibration, {}, known_noise=NoiseModel(3.0, 0.3))
@@ -120,12 +121,24 @@ def test_another_scene_does_not_mix_with_a_chart(tmp_path):
     assert run("--scene", "sparse-picture", "--size", 32, "--out", tmp_path).exit_code == 0
     other = run("--scene", "sparse-picture", "--size", 32, "--seed", 5, "--out", tmp_path)
     assert other.exit_code != 0
-    assert "another photograph or calibration" in str(other.exception)
+    assert "chart of something else" in str(other.exception)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [((), "Give --scene"), (("--scene", "bead"), "not known"), (("--image", "x.tif"), "both")],
+    [
+        ((), "Give --scene"),
+        (("--scene", "bead"), "not known"),
+        (("--image", "x.tif"), "both"),
+        (("--scene", "beads", "--hologram", "leaves"), "exclude each other"),
+        (("--scene", "beads", "--frames", 2), "--frames goes with --hologram"),
+        (("--hologram", "leaves", "--volume"), "--volume goes with"),
+        (("--hologram", "levaes"), "no such file, and no such sample picture"),
+        (("--hologram", "leaves", "--hologram", "clouds"), "--z-mm once for each"),
+        (("--hologram", "leaves", "--hologram", "clouds", "--z-mm", 1, "--z-mm", 1), "a depth of its own"),
+        (("--hologram", "leaves", "-q", 5), "must be a square"),
+        (("--calibration", "c", "--image", "i", "--z-mm", 1, "--z-mm", 2), "give it once"),
+    ],
 )
 def test_mistakes_are_named(arguments, said, tmp_path):
     result = run(*arguments, "--out", tmp_path / "c")
@@ -134,12 +147,54 @@ def test_mistakes_are_named(arguments, said, tmp_path):
 
 
 def test_a_setting_runs_in_a_process_of_its_own():
-    from instrument.chart_job import _in_own_process, problem_of_scene
+    from instrument.chart.problems import problem_of_scene
+    from instrument.chart.process import in_own_process
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    found = _in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    found = in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
     assert not isinstance(found, str)
     assert found.points[0].peak_mib < 500
     assert found.finished
-    refused = _in_own_process(problem, recon_chart.Setting("admm", "convolution", "tv-haar"), 20.0)
+    refused = in_own_process(problem, recon_chart.Setting("admm", "convolution", "tv-haar"), 20.0)
     assert isinstance(refused, str)
+
+
+def test_memory_taken_aside_does_not_count():
+    from instrument.chart.process import MemoryMeter
+
+    meter = MemoryMeter()
+    own = np.ones(4 << 20)  # 32 MiB
+    with meter.aside():
+        scored = np.ones(16 << 20)  # 128 MiB, kept
+    peak = meter.peak_mib()
+    if peak != peak:
+        pytest.skip("this system does not say how much memory was taken")
+    assert 25 < peak < 60
+    del own, scored
+
+
+@pytest.mark.usefixtures("quick")
+def test_holograms_are_charted(monkeypatch, tmp_path):
+    import instrument.chart.job as job
+
+    def here(problem, setting, limit_s):
+        if setting.frames == 2:
+            return "no second frame"
+        return problem.run(setting, limit_s=limit_s, counts=(1, 2))
+
+    monkeypatch.setattr(job, "in_own_process", here)
+    arguments = ("--hologram", "leaves", "--slm", "16x24", "-q", 4, "-q", 9, "--frames", 1, "--frames", 2)
+    result = run(*arguments, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    for told in ("Pareto front 4x", "Pareto front 9x", "SIMULATED", "no second frame"):
+        assert told in result.output
+    record = json.loads((tmp_path / "chart.json").read_text())
+    assert record["kind"] == "hologram"
+    assert {p["group"] for p in record["pareto"]} == {"4x", "9x"}
+    assert (
+        (tmp_path / "chart.csv")
+        .read_text()
+        .startswith("setting,iterations,seconds,psnr_db,ssim,middle_psnr_db")
+    )
+    assert (tmp_path / "chart.png").stat().st_size > 5000
+    assert "middle_psnr_db" in (tmp_path / "chart.html").read_text()

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from recon.chart import ChartProblem, Point, Setting, pareto, run_setting, settings_for
+from recon.errors import InputError, StructureError
+from recon.picture import PRIORS, reconstruct
 from recon.scenes import make_scene
 from recon.types import Calibration
 
@@ -35,7 +37,7 @@ def test_held_out_pixels_were_not_looked_at():
     garbled = ChartProblem(
         whole.measurement + np.float32(0), whole.calibration, False, None, whole.noise, whole.truth
     )
-    from recon.chart import _Judge
+    from recon.chart.reconstruction import _Judge
 
     judge = _Judge(garbled, Setting("admm", "convolution", "nonnegative"), 0)
     assert 0.02 < judge.held.mean() < 0.1
@@ -56,7 +58,7 @@ def test_held_out_pixels_were_not_looked_at():
 @pytest.mark.parametrize("shape", [(102, 98), (100, 97), (96, 110), (99, 103)])
 def test_held_out_scores_are_of_the_same_light_at_every_binning(shape, monkeypatch):
     from recon.auto.reduced import binned
-    from recon.chart import _Judge
+    from recon.chart.reconstruction import _Judge
 
     rng = np.random.default_rng(0)
     psf = np.zeros((1, 1, *shape), np.float32)
@@ -87,6 +89,9 @@ def test_a_run_says_whether_time_cut_it_off(setting):
 
 def test_settings_fit_the_problem():
     single = settings_for(problem())
+    assert {s.precision for s in single if s.method != "volume"} == {"float32", "float64"}
+    assert {s.prior for s in single if s.method == "fista"} == set(PRIORS)
+    assert not any(s.prior == "tv-haar" for s in single if s.method != "fista")
     assert {s.model for s in single} == {"convolution"}
     assert single[0].method == "wiener"
     varying = settings_for(problem(grid=3))
@@ -120,3 +125,38 @@ def test_the_front_is_what_nothing_beats():
     ]
     assert [p.setting for p in pareto(made, "psnr_db")] == ["quick", "slow good"]
     assert [p.setting for p in pareto(made, "held_out")] == ["quick", "slow good"]
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("method", ["wiener", "admm", "admm-sensor", "fista"])
+def test_precisions_agree(precision, method):
+    scene = make_scene("sparse-picture", size=24)
+    given = {"method": method, "model": "convolution", "judged": False, "prior": "nonnegative"}
+    given |= {} if method == "wiener" else {"iterations": 5}
+    found = reconstruct(scene.measurement, scene.calibration, precision=precision, **given)
+    again = reconstruct(scene.measurement, scene.calibration, **given)
+    assert found.state.dtype == precision
+    np.testing.assert_allclose(found.image, again.image, atol=2e-3 * again.image.max())
+
+
+def test_every_setting_of_a_picture_runs_and_no_other():
+    """What the table of methods and priors says is what the solvers take."""
+    case = problem()
+    for setting in settings_for(case):
+        if setting.method != "volume" and setting.binning == 1:
+            assert run_setting(case, setting, counts=(1,)).points
+    for method in ("admm", "admm-sensor"):
+        with pytest.raises(StructureError):
+            reconstruct(
+                case.measurement, case.calibration, method=method, model="convolution", prior="tv-haar"
+            )
+        with pytest.raises(InputError, match="does not apply"):
+            run_setting(case, Setting(method, "convolution", "tv-haar"))
+
+
+def test_float64_is_refused_where_it_would_be_float32():
+    varying = problem(grid=3)
+    with pytest.raises(InputError, match="computes in float32"):
+        reconstruct(varying.measurement, varying.calibration, model="local", precision="float64")
+    with pytest.raises(InputError, match="float32 or float64"):
+        reconstruct(varying.measurement, varying.calibration, model="convolution", precision="float16")

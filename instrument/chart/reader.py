@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from instrument.chart.data import SCHEMA
 from instrument.errors import FileError
+from recon.chart.scored import KINDS
 
-SCHEMA = 1
 _MAKE = "Make it with diffuserbench chart."
 
 
@@ -18,8 +19,9 @@ def read_chart(path: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``about`` (what was reconstructed), ``points`` (``setting``, ``iterations``, ``seconds``, scores; None
-        where one is not known), ``failed`` (settings and why), ``missing`` (settings without time).
+        ``kind`` (of :data:`recon.chart.scored.KINDS`), ``about`` (what was charted), ``points`` (the fields
+        of :class:`recon.chart.Point`; None where one is not known), ``failed`` (settings and why),
+        ``missing`` (settings without time).
 
     Raises
     ------
@@ -31,11 +33,13 @@ def read_chart(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise FileError(path, f"cannot be read as JSON: {error}.", _MAKE) from error
     if not is_chart(record):
-        raise FileError(path, "holds no chart of speed against accuracy.", _MAKE)
+        raise FileError(path, "holds no chart.", _MAKE)
     if record["schema"] != SCHEMA:
         raise FileError(
             path, f"has version {record['schema']}; this program reads {SCHEMA}.", "Make it again."
         )
+    if record.get("kind") not in KINDS:
+        raise FileError(path, f"charts {record.get('kind')!r}; known are {', '.join(KINDS)}.", _MAKE)
     found: dict[str, Any] = record
     return found
 

@@ -9,34 +9,47 @@ it is of the same light and in the same units whatever a setting's binning is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.auto.reduced import binned, blocks, enlarged, reduced_calibration
+from recon.chart.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.errors import InputError
+from recon.gpu import array_namespace
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
-from recon.picture import reconstruct
-from recon.preparation import channel_noise, data_of
+from recon.picture import PRIORS, reconstruct
+from recon.preparation import PRECISIONS, Precision, channel_noise, data_of
+from recon.scenes import make_scene
+from recon.scenes.scene import Family
 from recon.scenes.score import score
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.types import Calibration
-from recon.volume.channel import ChannelProblem, VolumePrior
+from recon.volume.channel import PRIORS as VOLUME_PRIORS
+from recon.volume.channel import ChannelProblem
 from recon.volume.model import ModelName, members_of_depths
 from recon.volume.reconstruct import prepare_volume, reconstruct_volume
 
 Array = npt.NDArray[Any]
-Measure = Literal["psnr_db", "held_out"]
 
 COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
 """Iterations at which a run is scored."""
 HELD_SHARE = 0.05
-PICTURE_METHODS = ("admm", "admm-sensor", "fista")
-PICTURE_PRIORS: tuple[VolumePrior, ...] = ("tv", "l1", "nonnegative")
-VOLUME_PRIORS: tuple[VolumePrior, ...] = ("tv", "l1")
+PICTURE_METHODS: dict[str, tuple[str, ...]] = {
+    "wiener": ("nonnegative", "none"),
+    "admm": tuple(p for p in PRIORS if p != "tv-haar"),
+    "admm-sensor": tuple(p for p in PRIORS if p != "tv-haar"),
+    "fista": tuple(PRIORS),
+}
+"""Methods of a picture, each with the priors that it has a way for. Wiener's knows bounds only."""
+GPU_PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
+"""Those of ``admm-gpu``, in float32, where there is a GPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +64,8 @@ class Setting:
     binning : int
     background : bool
         Whether a smooth one is estimated as well.
+    precision : str
+        Of the arithmetic.
     """
 
     method: str
@@ -58,6 +73,7 @@ class Setting:
     prior: str
     binning: int = 1
     background: bool = False
+    precision: Precision = "float32"
 
     @property
     def name(self) -> str:
@@ -67,60 +83,14 @@ class Setting:
             parts.append("background")
         if self.binning > 1:
             parts.append(f"bin {self.binning}")
+        if self.precision != "float32":
+            parts.append(self.precision)
         return " ".join(parts)
 
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """One score of one setting.
-
-    Attributes
-    ----------
-    setting : str
-        Its name.
-    iterations : int
-        0 for one-shot methods.
-    seconds : float
-        Wall time of the solver up to here.
-    residual : float
-        Norm of the residual over that of the noise, on the pixels that were used.
-    held_out : float
-        Root mean square error of the predicted held-out blocks' means, in units of these means' noise;
-        the blocks are those of the coarsest binning.
-    psnr_db, ssim, nrmse : float
-        Against the truth; NaN without one.
-    peak_mib : float
-        Memory at the run's peak beyond what the process took before it; NaN where it was not measured.
-    """
-
-    setting: str
-    iterations: int
-    seconds: float
-    residual: float
-    held_out: float
-    psnr_db: float = float("nan")
-    ssim: float = float("nan")
-    nrmse: float = float("nan")
-    peak_mib: float = float("nan")
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it with None for what is not known."""
-        return {k: None if v != v else v for k, v in asdict(self).items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """One setting's scores.
-
-    Attributes
-    ----------
-    points : tuple of Point
-    finished : bool
-        False where the time limit cut the run off: given longer, it would go on.
-    """
-
-    points: tuple[Point, ...]
-    finished: bool
+    @property
+    def family(self) -> str:
+        """Method and model."""
+        return f"{self.method} {self.model}"
 
 
 @dataclass(frozen=True)
@@ -146,27 +116,82 @@ class ChartProblem:
     erasures: npt.NDArray[np.bool_] | None = None
     noise: NoiseModel | float | None = None
     truth: npt.NDArray[np.float32] | None = None
+    kind: KindName = "reconstruction"
+
+    @property
+    def pixels(self) -> tuple[int, ...]:
+        """Of the measurement."""
+        return self.measurement.shape
+
+    def settings(self) -> tuple[Setting, ...]:
+        """As :func:`settings_for`."""
+        return settings_for(self)
+
+    def run(self, setting: Setting, *, limit_s: float | None, aside: Aside) -> Curve:
+        """As :func:`run_setting`."""
+        return run_setting(self, setting, limit_s=limit_s, aside=aside)
+
+    def warm_up(self, setting: Setting) -> None:
+        """Reconstruct a small scene of the same sort once."""
+        family: Family = "beads" if self.volume else "sparse-picture"
+        scene = make_scene(family, size=16, grid=3, **({"depths": 2} if self.volume else {}))
+        small = ChartProblem(scene.measurement, scene.calibration, self.volume)
+        run_setting(small, replace(setting, binning=1), counts=(1,))
+
+    def fingerprint(self) -> str:
+        """Digest measurement, calibration, erasures, noise and truth."""
+        digest = hashlib.sha256()
+        for array in (self.measurement, self.calibration.psfs, self.calibration.source_positions_um):
+            digest.update(np.ascontiguousarray(array).data)
+        for part in (self.erasures, self.truth):
+            digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
+        digest.update(f"{self.volume} {self.noise}".encode())
+        return digest.hexdigest()[:16]
 
 
 def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
-    """Return every applicable setting, the quick ones first."""
+    """Return every applicable setting, the quick ones first.
+
+    Float64 is for the methods of a picture with one convolution; what varies over the field, or is a volume,
+    is computed in float32.
+    """
     varies = len(problem.calibration.psfs) > len(members_of_depths(problem.calibration.source_positions_um))
     models: tuple[ModelName, ...] = ("convolution", "lowrank", "local") if varies else ("convolution",)
     found: list[Setting] = []
     for binning in _binnings(problem):
         if not problem.volume:
-            found.append(Setting("wiener", "convolution", "none", binning))
             found += [
-                Setting(method, "convolution", prior, binning)
-                for prior in PICTURE_PRIORS
-                for method in PICTURE_METHODS
+                Setting(method, "convolution", prior, binning, precision=precision)
+                for precision in PRECISIONS
+                for method, priors in PICTURE_METHODS.items()
+                for prior in priors
             ]
-        for prior in VOLUME_PRIORS:
-            for model in models:
-                for background in (False, True):
-                    if problem.volume or model != "convolution" or background:
-                        found.append(Setting("volume", model, prior, binning, background))
+            if _has_gpu():
+                found += [Setting("admm-gpu", "convolution", prior, binning) for prior in GPU_PRIORS]
+        found += [
+            Setting("volume", model, prior, binning, background)
+            for prior in VOLUME_PRIORS
+            for model in models
+            for background in (False, True)
+            # Without either, the methods of a picture solve the same problem.
+            if problem.volume or model != "convolution" or background
+        ]
     return tuple(sorted(found, key=_cost))
+
+
+@cache
+def _has_gpu() -> bool:
+    try:
+        array_namespace("gpu")
+    except InputError:
+        return False
+    return True
+
+
+def require_applicable(problem: ChartProblem, setting: Setting) -> None:
+    """Raise InputError for a setting that does not apply: it would be run as another one, or not at all."""
+    if setting not in settings_for(problem):
+        raise InputError(f"The setting '{setting.name}' does not apply to this problem.")
 
 
 def _binnings(problem: ChartProblem) -> list[int]:
@@ -176,10 +201,13 @@ def _binnings(problem: ChartProblem) -> list[int]:
 
 
 def _cost(setting: Setting) -> float:
-    """Rough order of time."""
+    """Rough order of time, and of how much there is to learn."""
     slow = {"convolution": 1.0, "lowrank": 20.0, "local": 30.0}[setting.model]
-    method = {"wiener": 0.01, "admm": 1.0, "fista": 1.5, "admm-sensor": 2.0, "volume": 3.0}[setting.method]
-    return slow * method / setting.binning**2
+    methods = {"wiener": 0.01, "admm": 1.0, "fista": 1.5, "admm-sensor": 2.0, "admm-gpu": 2.0, "volume": 3.0}
+    # What differs from the usual way by little comes after what differs by much.
+    usual = setting.prior in ("tv", "l1") or setting.method == "wiener"
+    rank = (1 if usual else 4) * (1 if setting.precision == "float32" else 8)
+    return slow * methods[setting.method] / setting.binning**2 * rank
 
 
 def run_setting(
@@ -189,6 +217,7 @@ def run_setting(
     limit_s: float | None = None,
     counts: Sequence[int] = COUNTS,
     seed: int = 0,
+    aside: Aside = nothing_aside,
 ) -> Curve:
     """Reconstruct once and score on the way.
 
@@ -200,12 +229,22 @@ def run_setting(
         Iterations to score at, ascending.
     seed : int
         Of the pixels held out; the same for all settings that are compared.
+    aside : Aside
+        In which points are scored.
+
+    Raises
+    ------
+    InputError
+        When the setting does not apply to the problem.
     """
+    require_applicable(problem, setting)
     judge = _Judge(problem, setting, seed)
     points: list[Point] = []
 
     def note(record: IterationRecord, now: Callable[[], Array]) -> None:
-        if record.iteration in counts:
+        if record.iteration not in counts:
+            return
+        with aside():
             points.append(judge.point(now(), record.iteration, record.seconds))
 
     common: dict[str, Any] = {
@@ -239,10 +278,12 @@ def run_setting(
         prior=setting.prior,
         tolerance=None if one_shot else 1e-7,
         callback=None if one_shot else note,
+        precision=setting.precision,
         **common,
     )
     if one_shot:
-        points = [judge.point(result.image, 0, result.seconds)]
+        with aside():
+            points = [judge.point(result.image, 0, result.seconds)]
     return Curve(tuple(points), result.stop_reason is not StopReason.TIME)
 
 
@@ -299,6 +340,7 @@ class _Judge:
             seconds,
             float(np.sqrt(np.mean(used**2))),
             float(np.sqrt(np.mean(held**2))) if held.size else float("nan"),
+            family=self.setting.family,
         )
         if self.problem.truth is None:
             return point
@@ -355,16 +397,3 @@ def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:
         _, count = blocks(blocks(n, factor)[1], block // factor)
         before, behind = min(before, count // 2), min(behind, count - count // 2)
     return n // 2 - before * block, before + behind
-
-
-def pareto(points: Iterable[Point], measure: Measure) -> list[Point]:
-    """Return the points that no other is both quicker and better than, the quickest first."""
-    better = 1.0 if measure == "psnr_db" else -1.0
-    front: list[Point] = []
-    best = -np.inf
-    for point in sorted(points, key=lambda p: (p.seconds, -better * getattr(p, measure))):
-        value = better * getattr(point, measure)
-        if value > best:
-            front.append(point)
-            best = value
-    return front
