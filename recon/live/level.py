@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,8 +21,8 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
 
-class Level:
-    """Pictures at one binning.
+class FilterLevel:
+    """Wiener pictures at one binning: made in a moment, for the first picture.
 
     Parameters
     ----------
@@ -44,12 +46,7 @@ class Level:
         self.camera = PadCropConvolution(binned_psfs / energy, frame.shape[1:], n_channels=len(frame))
         # One binned pixel holds the light of all its pixels: in units of one, pictures of all binnings agree.
         self._image_scale = self._deviation / energy / np.float32(binning**2)
-        data = self.data(frame)
-        peak = float(np.max(np.abs(self.camera.adjoint(data))))
-        weight = max(NOISE_WEIGHT, LEAST_TAU * peak)
-        self.filter = WienerFilter(self.camera, cross_validated(self.camera, data))
-        self.solver = SensorAdmm(self.camera, data, TotalVariation(weight) + NonNegativity())
-        self.solver.compile()
+        self.filter = WienerFilter(self.camera, cross_validated(self.camera, self.data(frame)))
 
     def data(self, frame: Floats) -> Floats:
         """Return a frame on binned pixels in units of its noise."""
@@ -59,16 +56,65 @@ class Level:
         """Return Wiener's picture of a frame on binned pixels, (n_channels, height, width)."""
         return self._picture(np.maximum(self.filter(self.data(frame)), 0))
 
-    def solved(self) -> Floats:
-        """Return the solver's present picture, (n_channels, height, width)."""
-        return self._picture(self.solver.solution)
-
     def _picture(self, solution: Array) -> Floats:
         (row, column), (height, width) = self.camera.centre, self.camera.sensor_shape
         top, left = row - height // 2, column - width // 2
         window = solution[:, top : top + height, left : left + width]
         picture: Floats = window * self._image_scale
         return picture
+
+
+class Level(FilterLevel):
+    """Pictures at one binning, with a solver: parameters as of :class:`FilterLevel`."""
+
+    def __init__(self, psfs: Floats, binning: int, frame: Floats, noise: NoiseModel | float | None) -> None:
+        super().__init__(psfs, binning, frame, noise)
+        data = self.data(frame)
+        peak = float(np.max(np.abs(self.camera.adjoint(data))))
+        weight = max(NOISE_WEIGHT, LEAST_TAU * peak)
+        self.solver = SensorAdmm(self.camera, data, TotalVariation(weight) + NonNegativity())
+        self.solver.compile()
+        self.solver.advance()  # the first finds memory and threads, at a picture's cost
+
+    def solved(self) -> Floats:
+        """Return the solver's present picture, (n_channels, height, width)."""
+        return self._picture(self.solver.solution)
+
+
+class ComingLevel:
+    """A level being made in a thread of its own, while pictures go on at the one before.
+
+    Parameters
+    ----------
+    make : callable
+        Returns the level.
+    """
+
+    def __init__(self, make: Callable[[], Level]) -> None:
+        self._make = make
+        self._made: Level | None = None
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._work, name="live level")
+        self._thread.start()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the level is made, or the time is over; return whether it is made."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def result(self) -> Level:
+        """Return the level; waits for it, and raises what went wrong with it."""
+        self.wait()
+        if self._error is not None:
+            raise self._error
+        assert self._made is not None
+        return self._made
+
+    def _work(self) -> None:
+        try:
+            self._made = self._make()
+        except Exception as error:  # noqa: BLE001 - raised where the level is asked for
+            self._error = error
 
 
 def binned(image: Array, factor: int) -> Floats:

@@ -1,13 +1,15 @@
 """How fine a live picture the machine affords at present: binning and iterations for a budget of time.
 
-Knows no clock: it is told what things took.
+Knows no clock: it is told what things took. Two times are told apart: the work of the picture's thread, which
+pixels cost, and its waiting for a processor that others use, which coarser pixels may or may not lessen. What
+a binning takes is measured while it is in use; a coarser one that did not help is left again.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import median
 
 LEAST_ITERATIONS = 2
@@ -17,27 +19,80 @@ not keep up with a moving scene, two do, and binning 2 x 2 loses less than the s
 ROOM = 1.25
 """A finer binning is gone back to where it leaves this much room in the budget, so that it stays there."""
 
-PATIENCE_COARSER, PATIENCE_FINER = 3, 20
-"""Frames in a row for which another binning must look right: a picture's pixels should not flicker."""
+PATIENCE_COARSER, PATIENCE_FINER, PATIENCE_NEW = 3, 20, 5
+"""Frames in a row for which another binning must look right (a finer one that was never tried: fewer): a
+picture's pixels should not flicker."""
+
+LARGEST_PATIENCE = 320
+"""A finer binning that had to be left again soon is waited for twice as long, up to this."""
+
+SOON = 60
+"""Pictures within which a finer binning that is left again has failed."""
 
 MEMORY = 7
-"""Pictures whose median tells how busy the machine is: of single ones it says nothing."""
+"""Pictures whose median tells what things take: of single ones it says nothing."""
+
+HELPED = 0.8
+"""A coarser binning has helped when its pictures take at most this share of the finer one's time."""
+
+LEAST_WORK = 0.2
+"""Share of a picture's time that must be work for coarser pixels to be worth trying."""
+
+HOLD = 150
+"""Pictures for which no coarser binning is tried after one did not help."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What something took, milliseconds."""
+
+    wall_ms: float
+    work_ms: float
+    """Of it, processor time of the thread."""
+
+    def scaled(self, factor: float) -> Spent:
+        """Return the same on ``factor`` times as many pixels."""
+        return Spent(factor * self.wall_ms, factor * self.work_ms)
+
+    def for_work(self, work_ms: float) -> Spent:
+        """Return what other work takes where this is what this work took."""
+        return Spent(self.wall_ms * work_ms / max(self.work_ms, 1e-3), work_ms)
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a picture takes at one binning, milliseconds."""
+    """What a picture takes at one binning."""
 
-    fixed_ms: float
+    fixed: Spent
     """Everything but the iterations."""
-    step_ms: float
+    step: Spent
     """One iteration."""
-    filter_ms: float
-    """The Wiener filter in place of iterations."""
 
     def scaled(self, factor: float) -> Cost:
         """Return the cost on ``factor`` times as many pixels."""
-        return Cost(factor * self.fixed_ms, factor * self.step_ms, factor * self.filter_ms)
+        return Cost(self.fixed.scaled(factor), self.step.scaled(factor))
+
+    @property
+    def least(self) -> Spent:
+        """A picture of ``LEAST_ITERATIONS``."""
+        fixed, step = self.fixed, self.step
+        return Spent(
+            fixed.wall_ms + LEAST_ITERATIONS * step.wall_ms, fixed.work_ms + LEAST_ITERATIONS * step.work_ms
+        )
+
+
+@dataclass
+class _Record:
+    """What one binning's last pictures took."""
+
+    fixed: deque[Spent] = field(default_factory=lambda: deque(maxlen=MEMORY))
+    step: deque[Spent] = field(default_factory=lambda: deque(maxlen=MEMORY))
+    least_step_ms: float = float("inf")
+    least_filter_ms: float = float("inf")
+
+    @property
+    def cost(self) -> Cost | None:
+        return Cost(_median(self.fixed), _median(self.step)) if self.fixed and self.step else None
 
 
 class Pace:
@@ -51,51 +106,126 @@ class Pace:
 
     def __init__(self, levels: Sequence[int]) -> None:
         self.levels = tuple(levels)
-        self.costs: dict[int, Cost] = {}
-        self._ratios: deque[float] = deque([1.0], MEMORY)
+        self._records: dict[int, _Record] = {}
+        self._known: dict[int, Cost] = {}
+        """Of binnings that were in use before: their work still tells, their waiting does not."""
+        self._level = self.levels[0]
         self._votes = 0
+        self._since = 0
+        """Pictures since the binning in use was entered."""
+        self._held = 0
+        """Pictures for which no coarser binning is tried."""
+        self._came_from: tuple[int, float] | None = None
+        """The finer binning that was left for this one, and what its pictures took."""
+        self._went_finer = False
+        self._patience = PATIENCE_FINER
 
-    @property
-    def busy(self) -> float:
-        """Time that things take at present, relative to when ``costs`` were measured."""
-        return median(self._ratios)
+    # What things take ------------------------------------------------------------------------------
+    def note(self, fixed: Spent, steps: Spent, count: int) -> None:
+        """Take note of a picture of ``count`` iterations, which took ``steps``, and ``fixed`` the rest."""
+        record = self._record
+        step = Spent(steps.wall_ms / count, steps.work_ms / count)
+        record.fixed.append(fixed)
+        record.step.append(step)
+        record.least_step_ms = min(record.least_step_ms, step.wall_ms)
+
+    def note_filter(self, spent: Spent) -> None:
+        """Take note of a Wiener picture: it tells how busy the machine is, so what a step would take."""
+        record = self._record
+        record.least_filter_ms = min(record.least_filter_ms, spent.wall_ms)
+        if record.step:
+            step_ms = record.least_step_ms * spent.wall_ms / record.least_filter_ms
+            record.step.append(Spent(step_ms, min(_median(record.step).work_ms, step_ms)))
+
+    def cost(self, level: int) -> Cost | None:
+        """Return what a level takes, another's guessed from the one in use; None where that is not known."""
+        here = self._record.cost
+        if level == self._level or here is None:
+            return here
+        known = self._known.get(level)
+        if known is None:
+            return here.scaled((self._level / level) ** 2)
+        return Cost(here.fixed.for_work(known.fixed.work_ms), here.step.for_work(known.step.work_ms))
 
     def affordable(self, level: int, budget_ms: float) -> int:
-        """Return how many iterations fit into a budget at a level."""
+        """Return how many iterations fit into a budget at a level; the least before anything is known."""
         cost = self.cost(level)
-        return max(int((budget_ms / self.busy - cost.fixed_ms) / cost.step_ms), 0)
-
-    def cost(self, level: int) -> Cost:
-        """Return the cost of a level, guessed by its pixels from the nearest measured one."""
-        if level in self.costs:
-            return self.costs[level]
-        known = min(self.costs, key=lambda other: abs(other - level))
-        return self.costs[known].scaled((known / level) ** 2)
+        if cost is None:
+            return LEAST_ITERATIONS
+        return max(int((budget_ms - cost.fixed.wall_ms) / max(cost.step.wall_ms, 1e-3)), 0)
 
     def fits(self, level: int, budget_ms: float) -> bool:
         """Whether a level leaves time for enough iterations."""
         return self.affordable(level, budget_ms) >= LEAST_ITERATIONS
 
-    def learn(self, took_ms: float, expected_ms: float) -> None:
-        """Take note of what a picture took, and what ``costs`` had said."""
-        self._ratios.append(took_ms / expected_ms)
+    # The binning -----------------------------------------------------------------------------------
+    def enter(self, level: int) -> None:
+        """Go on at another level."""
+        before = self._record.cost
+        if before is not None:
+            self._known[self._level] = before
+        self._came_from = None
+        if level > self._level:
+            if self._went_finer and self._since < SOON:
+                self._patience = min(2 * self._patience, LARGEST_PATIENCE)
+            if before is not None and self._held == 0:
+                self._came_from = self._level, before.least.wall_ms
+        self._went_finer = level < self._level
+        self._level, self._votes, self._since = level, 0, 0
+        self._records[level] = _Record()
 
-    def next_level(self, level: int, budget_ms: float) -> int:
-        """Return the level for the next frame: another one only when several frames in a row asked for it."""
-        wanted = self._right(level, budget_ms)
-        if wanted == level:
+    def next_level(self, budget_ms: float) -> int:
+        """Return the level for the pictures to come: another one only when several in a row asked for it."""
+        self._since += 1
+        self._held = max(self._held - 1, 0)
+        if self._went_finer and self._since == SOON:
+            self._patience = PATIENCE_FINER
+        if self._did_not_help():
+            assert self._came_from is not None
+            self._held = HOLD
+            return self._came_from[0]
+        wanted = self._right(budget_ms)
+        if wanted == self._level:
             self._votes = 0
-            return level
-        direction = 1 if wanted > level else -1
+            return wanted
+        direction = 1 if wanted > self._level else -1
         self._votes = self._votes + direction if self._votes * direction > 0 else direction
-        if abs(self._votes) < (PATIENCE_COARSER if direction > 0 else PATIENCE_FINER):
-            return level
+        if direction > 0:
+            patience = PATIENCE_COARSER
+        else:
+            patience = self._patience if wanted in self._known else PATIENCE_NEW
+        if abs(self._votes) < patience:
+            return self._level
         self._votes = 0
         return wanted
 
-    def _right(self, level: int, budget_ms: float) -> int:
-        if not self.fits(level, budget_ms):
-            coarser = [b for b in self.levels if b > level]
-            return next((b for b in coarser if self.fits(b, budget_ms)), self.levels[-1])
-        finer = [b for b in self.levels if b < level]
-        return next((b for b in finer if self.fits(b, budget_ms / ROOM)), level)
+    def _did_not_help(self) -> bool:
+        """Whether this level, by now measured, is hardly faster than the finer one that was left for it."""
+        if self._came_from is None or len(self._record.step) < MEMORY:
+            return False
+        cost = self._record.cost
+        helped = cost is not None and cost.least.wall_ms <= HELPED * self._came_from[1]
+        if helped:
+            self._came_from = None
+        return not helped
+
+    def _right(self, budget_ms: float) -> int:
+        level, cost = self._level, self._record.cost
+        if cost is None or len(self._record.step) < PATIENCE_COARSER:
+            return level
+        if self.fits(level, budget_ms):
+            finer = [b for b in self.levels if b < level]
+            return next((b for b in finer if self.fits(b, budget_ms / ROOM)), level)
+        coarser = [b for b in self.levels if b > level]
+        least = cost.least
+        if self._held or not coarser or least.work_ms < LEAST_WORK * least.wall_ms:
+            return level
+        return next((b for b in coarser if self.fits(b, budget_ms)), coarser[-1])
+
+    @property
+    def _record(self) -> _Record:
+        return self._records.setdefault(self._level, _Record())
+
+
+def _median(spent: deque[Spent]) -> Spent:
+    return Spent(median(s.wall_ms for s in spent), median(s.work_ms for s in spent))

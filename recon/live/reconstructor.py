@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from recon.checks import as_channels, check_psf, require_finite, select_psf
 from recon.errors import InputError
-from recon.live.level import Array, Floats, Level, binned
-from recon.live.pace import Cost, Pace
+from recon.live.level import Array, ComingLevel, FilterLevel, Floats, Level, binned
+from recon.live.pace import Pace, Spent
 from recon.live.stillness import SceneState, SceneWatch
 from recon.noise import NoiseModel
 from recon.types import Calibration
@@ -23,6 +23,14 @@ LEAST_SIDE = 16
 
 SETTLED = 1e-3
 """Change an iteration below which a frame's picture is done: 55 dB from where it would end."""
+
+AT_ONCE = 150_000
+"""Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
+
+_POLL_S = 0.005
+
+_Stamp = tuple[float, float]
+"""Seconds on the clock, and of this thread's processor time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +88,10 @@ class LiveReconstructor:
     one before (:class:`instrument.live.LiveView` does). Where the machine is too slow, pictures get coarser
     (binning) and then rougher (fewer iterations, at last a Wiener filter), and say so; they do not get late.
 
-    While the scene is still, frames are averaged and iterations go on from frame to frame, so that the
-    picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
+    The first picture of a scene is a Wiener filter's, at once; from the next on, or by :meth:`refine`, it is
+    iterated. While the scene is still, frames are averaged and iterations go on from frame to frame, so that
+    the picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
+    Another binning is prepared in a thread of its own while pictures go on.
 
     Parameters
     ----------
@@ -138,20 +148,23 @@ class LiveReconstructor:
         self._background = None if background is None else self._like_psf(background)
         fine_enough = [b for b in range(finest, coarsest + 1) if min(self._psfs.shape[1:]) >= LEAST_SIDE * b]
         self._pace = Pace(fine_enough or [finest])
-        self._level: Level | None = None
+        self._level: FilterLevel | None = None
+        self._coming: ComingLevel | None = None
         self._watch = SceneWatch(average)
         self._shape: tuple[int, ...] = ()
         self._scene = SceneState.NEW
         self._follows = False
         """Whether the solver knows the scene as it was a frame ago."""
+        self._greeted = False
+        """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
 
     # Pictures --------------------------------------------------------------------------------------
     def feed(self, image: Array) -> LivePicture:
         """Return a picture of a frame.
 
-        The first takes longer, as the machine is timed at one binning after the other; so does a change of
-        binning (tenths of a second on a megapixel), and, a little, the first of a new scene.
+        The first makes its filter, which takes about a tenth of a second; the first of another scene takes a
+        little longer than others.
 
         Parameters
         ----------
@@ -164,29 +177,34 @@ class LiveReconstructor:
             When the image does not fit the PSF or the frames before, or is not finite; such a frame is left
             out, and the next goes on as if it had not been.
         """
-        began_s = time.perf_counter()
+        began = _now()
         frame = self._on_calibration_pixels(image)
         level = self._level_for(frame)
-        cost = self._pace.cost(level.binning)
         small = binned(frame, level.binning)
         self._scene = self._watch.see(small)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
-        if affordable < 1 and self._scene is not SceneState.STILL:
+        cut = self._scene is SceneState.NEW and not self._greeted
+        too_slow = affordable < 1 and self._scene is not SceneState.STILL
+        self._greeted = self._scene is SceneState.NEW
+        if not isinstance(level, Level) or cut or too_slow:
             self._follows = self._settled = False
-            picture = self._told(level, "wiener", level.filtered(small), 0, 0, began_s)
-            self._pace.learn(picture.work_ms, cost.fixed_ms + cost.filter_ms)
-            return picture
-        anew = self._scene is SceneState.NEW or not self._follows
+            filtered = level.filtered(self._watch.mean)
+            if too_slow:
+                self._pace.note_filter(_since(began))
+            return self._told(level, "wiener", filtered, 0, 0, began)
         data = level.data(self._watch.mean)
+        anew = self._scene is SceneState.NEW or not self._follows
         if anew:
             level.solver.restart(data)
         else:
             level.solver.set_data(data)
         self._follows = True
-        done = self._iterate(level, began_s, max(affordable, 1), lambda: False)
-        picture = self._told(level, "admm", level.solved(), done, level.solver.iteration, began_s)
-        if not anew:
-            self._pace.learn(picture.work_ms, cost.fixed_ms + done * cost.step_ms)
+        done, steps = self._iterate(level, began, max(affordable, 1), lambda: False)
+        picture = self._told(level, "admm", level.solved(), done, level.solver.iteration, began)
+        after = _since(began)
+        if not anew and self._coming is None:  # otherwise it tells nothing of the pictures to come
+            fixed = Spent(after.wall_ms - steps.wall_ms, after.work_ms - steps.work_ms)
+            self._pace.note(fixed, steps, done)
         return picture
 
     def refine(self, newer: Callable[[], bool] = lambda: False) -> LivePicture | None:
@@ -202,81 +220,89 @@ class LiveReconstructor:
         LivePicture or None
             None when there is nothing to refine, or nothing more to gain.
         """
-        level = self._level
-        if level is None or self._settled or not self._follows:
+        if self._level is None or self._settled:
             return None
-        began_s = time.perf_counter()
-        done = self._iterate(level, began_s, None, newer)
-        return self._told(level, "admm", level.solved(), done, level.solver.iteration, began_s)
+        level = self._solving_level(newer)
+        if level is None:
+            return None
+        began = _now()
+        if not self._follows:
+            level.solver.restart(level.data(self._watch.mean))
+            self._follows = True
+        done, _ = self._iterate(level, began, None, newer)
+        self._greeted = False
+        return self._told(level, "admm", level.solved(), done, level.solver.iteration, began)
 
     def restart(self) -> None:
         """Forget the scene, the machine's timing and the noise: the next frame is the first."""
-        self._level = None
+        self._level = self._coming = None
         self._pace = Pace(self._pace.levels)
         self._shape = ()
+        self._watch.forget()
+        self._follows = self._greeted = self._settled = False
 
     # Pieces ----------------------------------------------------------------------------------------
-    def _iterate(self, level: Level, began_s: float, at_most: int | None, newer: Callable[[], bool]) -> int:
-        """Do one iteration, and more while they fit into the budget; return how many."""
+    def _iterate(
+        self, level: Level, began: _Stamp, at_most: int | None, newer: Callable[[], bool]
+    ) -> tuple[int, Spent]:
+        """Do one iteration, and more while they fit into the budget; return how many, and what they took."""
         cost = self._pace.cost(level.binning)
+        ahead_ms = 0.0 if cost is None else cost.step.wall_ms + 0.5 * cost.fixed.wall_ms
+        first = _now()
         done = 0
         while True:
             change = level.solver.advance().change
             done += 1
             self._settled = change < SETTLED
-            ahead_ms = self._pace.busy * (cost.step_ms + 0.5 * cost.fixed_ms)
-            spent_ms = 1e3 * (time.perf_counter() - began_s)
+            spent_ms = _since(began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
-                return done
+                return done, _since(first)
 
-    def _level_for(self, frame: Floats) -> Level:
-        """Return the level for the next frame; a new one knows nothing of the scene."""
+    def _level_for(self, frame: Floats) -> FilterLevel:
+        """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
-            for binning in self._pace.levels:
-                level = self._enter(binning, frame)
-                if self._pace.fits(binning, self.budget_ms):
-                    break
-            return level
-        wanted = self._pace.next_level(self._level.binning, self.budget_ms)
-        return self._level if wanted == self._level.binning else self._enter(wanted, frame)
+            binning = self._first_binning()
+            small = binned(frame, binning).copy()
+            self._level = FilterLevel(self._psfs, binning, small, self._noise)
+            self._pace.enter(binning)
+            self._make(binning, small)
+        elif self._coming is not None:
+            if self._coming.wait(0):
+                self._enter(self._coming.result())
+        elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.binning:
+            self._make(wanted, binned(frame, wanted).copy())
+        return self._level
 
-    def _enter(self, binning: int, frame: Floats) -> Level:
-        """Make a level, and time it when it is the first time."""
-        self._level = None  # its memory is needed
-        small = binned(frame, binning)
-        level = self._level = Level(self._psfs, binning, small, self._noise)
-        if binning not in self._pace.costs:
-            self._pace.costs[binning] = self._timed(level, frame)
-        self._watch.forget()
-        self._follows = False
-        return level
+    def _first_binning(self) -> int:
+        """Return the finest binning at which a first picture takes no time to speak of."""
+        n_pixels = int(np.prod(self._psfs.shape[1:]))
+        levels = self._pace.levels
+        return next((b for b in levels if n_pixels <= AT_ONCE * b**2), levels[-1])
 
-    def _timed(self, level: Level, frame: Floats) -> Cost:
-        """Time a picture's parts; of each the fastest of three, as other work on the machine only adds."""
+    def _make(self, binning: int, small: Floats) -> None:
+        """Begin to make a level for a frame on its pixels."""
+        self._coming = ComingLevel(lambda: Level(self._psfs, binning, small, self._noise))
 
-        def fastest_ms(part: Callable[[], object]) -> float:
-            times = []
-            for _ in range(3):
-                began_s = time.perf_counter()
-                part()
-                times.append(1e3 * (time.perf_counter() - began_s))
-            return min(times)
+    def _solving_level(self, newer: Callable[[], bool]) -> Level | None:
+        """Return the level in use once it has a solver; None when a newer frame comes first."""
+        while not isinstance(self._level, Level):
+            if self._coming is None:
+                return None
+            if self._coming.wait(_POLL_S):
+                self._enter(self._coming.result())
+            elif newer():
+                return None
+        return self._level
 
-        def all_but_iterations() -> None:
-            watch = SceneWatch(2)
-            small = binned(frame, level.binning)
-            watch.see(small)
-            watch.see(small)
-            level.solver.set_data(level.data(watch.mean))
-            level.solved()
-
-        level.solver.advance()  # the first does more
-        small = binned(frame, level.binning)
-        return Cost(
-            fixed_ms=fastest_ms(all_but_iterations),
-            step_ms=fastest_ms(level.solver.advance),
-            filter_ms=fastest_ms(lambda: level.filtered(small)),
-        )
+    def _enter(self, level: Level) -> None:
+        """Go on at another level; one of other pixels knows nothing of the scene."""
+        assert self._level is not None
+        if level.binning != self._level.binning:
+            self._watch.forget()
+            self._greeted = True  # a scene already shown is iterated at once
+            self._pace.enter(level.binning)
+        self._level, self._coming = level, None
+        self._follows = self._settled = False
 
     def _on_calibration_pixels(self, image: Array) -> Floats:
         """Return a frame (n_channels, height, width) less background on the PSF's pixels."""
@@ -328,12 +354,12 @@ class LiveReconstructor:
 
     def _told(
         self,
-        level: Level,
+        level: FilterLevel,
         method: Literal["admm", "wiener"],
         channels: Floats,
         done: int,
         total: int,
-        began_s: float,
+        began: _Stamp,
     ) -> LivePicture:
         image = channels[0] if len(self._shape) == 2 else np.ascontiguousarray(np.moveaxis(channels, 0, 2))
         return LivePicture(
@@ -343,11 +369,20 @@ class LiveReconstructor:
             iterations=done,
             total_iterations=total,
             scene=self._scene,
-            frames=self._watch.count if method == "admm" else 1,
+            frames=self._watch.count,
             settled=self._settled,
-            work_ms=1e3 * (time.perf_counter() - began_s),
+            work_ms=_since(began).wall_ms,
             budget_ms=self.budget_ms,
         )
+
+
+def _now() -> _Stamp:
+    return time.perf_counter(), time.thread_time()
+
+
+def _since(began: _Stamp) -> Spent:
+    wall_s, work_s = _now()
+    return Spent(1e3 * (wall_s - began[0]), 1e3 * (work_s - began[1]))
 
 
 def _channels(image: Array) -> Array:

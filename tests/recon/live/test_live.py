@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from recon import Calibration, InputError, NoiseModel, reconstruct
-from recon.live import LiveReconstructor, SceneState, SceneWatch
-from recon.live.level import binned
-from recon.live.pace import Cost, Pace
+from recon.live import LivePicture, LiveReconstructor, SceneState, SceneWatch
+from recon.live.level import Level, binned
+from recon.live.pace import HOLD, Pace, Spent
 from recon.metrics import psnr
 
 SHAPE = (64, 96)
+AMPLE_MS = 5000.0
+"""A budget that no machine exhausts: iterations go on until the picture has settled."""
 NOISE = NoiseModel(read_noise=2.0, counts_per_electron=0.05)
 
 
@@ -43,15 +45,25 @@ def live(**settings: object) -> LiveReconstructor:
     return LiveReconstructor(spots_psf(), **settings)  # type: ignore[arg-type]
 
 
-def slow(reconstructor: LiveReconstructor, factor: float) -> None:
-    """Have the reconstructor believe that everything takes ``factor`` times as long, from now on."""
-    reconstructor._pace._ratios.extend([factor] * 7)
+def iterated(reconstructor: LiveReconstructor, frame: np.ndarray) -> LivePicture:
+    """Feed a first frame and wait until its picture is iterated."""
+    assert reconstructor.feed(frame).method == "wiener"
+    picture = reconstructor.refine()
+    assert picture is not None
+    return picture
+
+
+def taking(reconstructor: LiveReconstructor, fixed_ms: float, step_ms: float) -> None:
+    """Have the reconstructor believe that pictures take so long."""
+    fixed, step = (Spent(ms, ms) for ms in (fixed_ms, step_ms))
+    for _ in range(7):
+        reconstructor._pace.note(fixed, step, 1)
 
 
 def test_a_still_scene_converges_to_the_reconstruction() -> None:
     reconstructor = live(average=1)
     frame = photograph(0, 1)
-    first = reconstructor.feed(frame)
+    first = iterated(reconstructor, frame)
     assert first.scene is SceneState.NEW
     assert (first.binning, first.method, first.frames) == (1, "admm", 1)
     reference = reconstruct(
@@ -86,49 +98,104 @@ def test_averaging_frames_of_a_still_scene_lessens_noise() -> None:
     assert psnr(many.image, clean) > psnr(one.image, clean) + 1
 
 
-def test_warm_start_follows_a_moving_scene_and_a_cut_begins_anew() -> None:
-    reconstructor = live()
-    reconstructor.feed(photograph(0, 0))
+def test_warm_start_follows_a_moving_scene() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    iterated(reconstructor, photograph(0, 0))
     moved = reconstructor.feed(photograph(0.5, 1))
-    assert (moved.scene, moved.frames) == (SceneState.MOVING, 1)
+    assert (moved.scene, moved.frames, moved.method) == (SceneState.MOVING, 1, "admm")
     assert moved.total_iterations > moved.iterations
     assert np.unravel_index(np.argmax(moved.image), SHAPE)[1] >= 22
+
+
+def test_a_cut_is_shown_by_a_wiener_filter_at_once_then_iterated_from_the_start() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    iterated(reconstructor, photograph(0, 0))
     cut = reconstructor.feed(photograph(0, 2)[:, ::-1])
-    assert cut.scene is SceneState.NEW
-    assert cut.total_iterations == cut.iterations
+    assert (cut.scene, cut.method, cut.iterations) == (SceneState.NEW, "wiener", 0)
+    assert "Wiener filter" in cut.quality
+    after = reconstructor.feed(photograph(0, 3)[:, ::-1])
+    assert (after.scene, after.method) == (SceneState.STILL, "admm")
+    assert after.total_iterations == after.iterations
+    # Scene after scene: only the first is a filter's.
+    reconstructor.feed(photograph(0, 4))
+    again = reconstructor.feed(photograph(0, 5)[::-1])
+    assert (again.scene, again.method) == (SceneState.NEW, "admm")
+
+
+def test_refining_goes_on_from_the_wiener_picture_of_the_newest_frame() -> None:
+    reconstructor = live(budget_ms=AMPLE_MS)
+    iterated(reconstructor, photograph(0, 0))
+    rough = reconstructor.feed(photograph(0, 2)[:, ::-1])
+    better = reconstructor.refine()
+    assert better is not None
+    assert better.method == "admm"
+    assert better.total_iterations == better.iterations
+    for _ in range(100):
+        better = reconstructor.refine() or better
+    reference = reconstruct(
+        photograph(0, 2)[:, ::-1], spots_psf(), method="admm-sensor", background=20.0, noise=NOISE,
+        iterations=200, tolerance=0,
+    ).image  # fmt: skip
+    assert psnr(better.image, reference) > psnr(rough.image, reference) + 6
 
 
 def test_quality_gives_way_not_time() -> None:
-    reconstructor = live(coarsest=8, budget_ms=500.0)
-    fine = reconstructor.feed(photograph(0, 0))
-    assert fine.binning == 1
-    cost = reconstructor._pace.costs[1]
+    reconstructor = live(coarsest=8, budget_ms=100.0)
+    assert iterated(reconstructor, photograph(0, 0)).binning == 1
     # Room for one iteration and a half: too few, so the pixels get coarser, after a few frames.
-    reconstructor.budget_ms = cost.fixed_ms + 1.5 * cost.step_ms
-    binnings = [reconstructor.feed(photograph(0.5 * (n % 2), n)).binning for n in range(6)]
-    assert binnings[0] == 1
-    assert max(binnings) > 1
+    fed = 0
+    while reconstructor._coming is None:
+        taking(reconstructor, fixed_ms=10, step_ms=60)
+        assert reconstructor.feed(photograph(0.5 * (fed % 2), fed)).binning == 1
+        fed += 1
+    assert fed == 3
+    reconstructor._coming.wait()
+    coarse = reconstructor.feed(photograph(0, 0))
+    assert (coarse.binning, coarse.method) == (2, "admm")
+    assert coarse.image.shape == (32, 48)
+    assert "binned 2 x 2" in coarse.quality
     # Room for nothing: the Wiener filter.
-    slow(reconstructor, 1e5)
-    for n in range(6):
-        rough = reconstructor.feed(photograph(3 * n, n))
-        slow(reconstructor, 1e5)
-    assert rough.method == "wiener"
-    assert rough.binning == 4  # of 64 rows, no coarser
-    assert rough.image.shape == (16, 24)
+    taking(reconstructor, fixed_ms=90, step_ms=60)
+    rough = reconstructor.feed(photograph(3, 1))
+    assert (rough.method, rough.iterations) == ("wiener", 0)
     assert "Wiener filter" in rough.quality
-    assert "binned 4 x 4" in rough.quality
+
+
+def test_no_pixels_are_given_up_where_they_are_not_what_costs_time() -> None:
+    reconstructor = live(coarsest=8, budget_ms=100.0)
+    iterated(reconstructor, photograph(0, 0))
+    waiting = Spent(90.0, 1.0)
+    for n in range(12):
+        for _ in range(7):
+            reconstructor._pace.note(waiting, waiting, 1)
+        picture = reconstructor.feed(photograph(3.0 * n, n))
+    assert reconstructor._coming is None
+    assert (picture.binning, picture.method) == (1, "wiener")
+
+
+def test_a_level_that_cannot_be_made_is_told_by_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    class NoMemory(Level):
+        def __init__(self, *_: object) -> None:
+            raise MemoryError("none left")
+
+    monkeypatch.setattr("recon.live.reconstructor.Level", NoMemory)
+    reconstructor = live()
+    reconstructor.feed(photograph(0, 0))
+    assert reconstructor._coming is not None
+    reconstructor._coming.wait()
+    with pytest.raises(MemoryError, match="none left"):
+        reconstructor.feed(photograph(0, 1))
 
 
 def test_brightness_does_not_depend_on_binning() -> None:
-    pictures = [live(finest=b, coarsest=b).feed(photograph(0, 0)) for b in (1, 2, 4)]
+    pictures = [iterated(live(finest=b, coarsest=b, budget_ms=AMPLE_MS), photograph(0, 0)) for b in (1, 2, 4)]
     sums = [float(p.image.sum()) * p.binning**2 for p in pictures]
     assert sums == pytest.approx([sums[0]] * 3, rel=0.1)
 
 
 def test_refining_ends_when_a_newer_frame_is_there() -> None:
     reconstructor = live()
-    reconstructor.feed(photograph(0, 0))
+    iterated(reconstructor, photograph(0, 0))
     reconstructor._settled = False
     refined = reconstructor.refine(lambda: True)
     assert refined is not None
@@ -242,28 +309,99 @@ def test_identical_frames_are_still() -> None:
 
 
 # The pace -------------------------------------------------------------------------------------------
+def tell(pace: Pace, fixed_ms: float, step_ms: float, busy: float = 1.0, waiting_ms: float = 0.0) -> None:
+    """Seven pictures of two iterations; everything takes ``busy`` times its work, and ``waiting_ms`` more."""
+    for _ in range(7):
+        fixed = Spent(busy * fixed_ms + waiting_ms, fixed_ms)
+        pace.note(fixed, Spent(2 * busy * step_ms, 2 * step_ms), 2)
+
+
+def turns(pace: Pace, budget_ms: float, at_most: int = 400) -> tuple[int, int]:
+    """Return after how many pictures another level is wanted, and which; 0 if none is."""
+    here = pace.next_level(budget_ms)
+    for count in range(1, at_most):
+        if here != pace._level:
+            return count, here
+        here = pace.next_level(budget_ms)
+    return 0, here
+
+
 def test_pace_goes_coarser_soon_and_finer_late() -> None:
     pace = Pace([1, 2, 3, 4])
-    pace.costs = {1: Cost(2, 12, 4)}
-    assert pace.cost(2) == Cost(0.5, 3, 1)
-    assert pace.fits(1, 33)
-    for _ in range(7):
-        pace.learn(30.0, 10.0)
-    assert pace.busy == 3.0
-    assert [pace.next_level(1, 33) for _ in range(4)] == [1, 1, 2, 1]
-    for _ in range(7):
-        pace.learn(10.0, 10.0)
-    finer = [pace.next_level(2, 40) for _ in range(25)]
-    assert finer.index(1) == 19
-    assert pace.next_level(2, 27) == 2  # level 1 would fit, but with no room to spare
+    assert pace.affordable(1, 33) == 2  # before anything is known
+    tell(pace, 2, 12)
+    assert pace.affordable(1, 33) == 2
+    assert turns(pace, 33) == (0, 1)
+    tell(pace, 2, 30)
+    assert turns(pace, 33) == (3, 2)
+    pace.enter(2)
+    tell(pace, 0.5, 7)
+    assert turns(pace, 33) == (0, 2)  # the finer one is known not to fit
+    tell(pace, 0.5, 3)
+    assert pace.cost(1).step.work_ms == 30
+    assert turns(pace, 100) == (20, 1)
+
+
+def test_pace_tries_a_finer_level_it_does_not_know_sooner() -> None:
+    pace = Pace([1, 2, 3, 4])
+    pace.enter(3)
+    tell(pace, 1, 2)
+    assert turns(pace, 33) == (5, 2)
 
 
 def test_pace_takes_one_slow_picture_for_what_it_is() -> None:
+    pace = Pace([1, 2])
+    tell(pace, 2, 12)
+    pace.note(Spent(5000, 2), Spent(24, 24), 2)
+    assert pace.affordable(1, 33) == 2
+
+
+def test_pace_takes_back_a_coarser_level_that_did_not_help() -> None:
+    pace = Pace([1, 2, 3, 4])
+    tell(pace, 5, 20, busy=2.5)  # work of 45 ms takes 112: pixels seem to matter
+    assert turns(pace, 33) == (3, 2)
+    pace.enter(2)
+    tell(pace, 1, 5, waiting_ms=95)  # they did not
+    assert pace.next_level(33) == 1
+    pace.enter(1)
+    tell(pace, 5, 20, busy=2.5)
+    count, level = turns(pace, 33)
+    assert (level, count) == (2, HOLD + 2)  # tried again, much later
+
+
+def test_pace_keeps_a_coarser_level_that_helped_though_not_enough() -> None:
+    pace = Pace([1, 2, 3, 4])
+    tell(pace, 5, 20, busy=4)
+    pace.enter(2)
+    tell(pace, 1, 5, waiting_ms=60)
+    assert pace.next_level(33) == 2
+    assert turns(pace, 33) == (0, 2)  # it is not work that takes the time: no coarser
+
+
+def test_pace_waits_longer_for_a_finer_level_that_failed() -> None:
+    pace = Pace([1, 2])
+    tell(pace, 2, 30)
+    pace.enter(2)
+    tell(pace, 1, 3)
+    assert turns(pace, 100)[0] == 20
+    pace.enter(1)
+    tell(pace, 2, 30, busy=3)
+    assert turns(pace, 100)[1] == 2
+    pace.enter(2)
+    tell(pace, 1, 3)
+    assert turns(pace, 100)[0] == 40
+
+
+def test_pace_tells_from_wiener_pictures_that_there_is_time_again() -> None:
     pace = Pace([1])
-    pace.costs = {1: Cost(2, 12, 4)}
-    for took in (10.0, 10.0, 5000.0, 10.0):
-        pace.learn(took, 10.0)
-    assert pace.busy == 1.0
+    tell(pace, 2, 12)
+    pace.note_filter(Spent(5, 5))
+    for _ in range(7):
+        pace.note_filter(Spent(50, 5))
+    assert pace.affordable(1, 33) == 0
+    for _ in range(7):
+        pace.note_filter(Spent(5, 5))
+    assert pace.affordable(1, 33) == 2
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 5])
