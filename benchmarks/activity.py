@@ -36,15 +36,15 @@ from recon.video.solver import BLOCK
 SHAPE = (128, 160)
 READ_NOISE = 2.0
 NEAR_PX = 3.0
-DEFAULT = {"photons": 3000.0, "neurons": 20, "tissue": 1.0, "warm": 6, "motion_px": 0.0}
+DEFAULT = {"photons": 3000.0, "neurons": 20, "tissue": 1.0, "warm": 6, "motion_px": 0.0, "bleached": 0.33}
 SWEEPS = {
     "photons": (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0),
     "neurons": (5, 10, 20, 40, 80),
     "tissue": (0.0, 1.0, 3.0, 10.0),
     "warm": (1, 2, 3, 6, 12),
     "motion_px": (0.0, 0.5, 1.0, 3.0),
+    "bleached": (0.0, 0.33, 0.7, 0.9, 0.97),
 }
-
 
 BEADS = ((10, 3000), (10, 300), (10, 100), (10, 30), (20, 3000), (40, 3000), (80, 3000))
 
@@ -99,7 +99,17 @@ def solve(psf: np.ndarray, frames: list[np.ndarray], warm: int) -> np.ndarray:
     return np.stack(pictures)
 
 
-def neurons(frames: int, *, photons, neurons: int, tissue: float, warm: int, motion_px: float, seed: int = 0):
+def neurons(
+    frames: int,
+    *,
+    photons: float,
+    neurons: int,
+    tissue: float,
+    warm: int,
+    motion_px: float,
+    bleached: float,
+    seed: int = 0,
+):
     """Simulate, reconstruct, search; return figures, pictures, dF/F, regions, traces and truth."""
     rng = np.random.default_rng(seed)
     camera = build_camera(SHAPE, seed=1)
@@ -113,7 +123,7 @@ def neurons(frames: int, *, photons, neurons: int, tissue: float, warm: int, mot
     )
     active = transients(neurons, frames, rng)
     way = motion_px * np.sin(2 * np.pi * np.arange(frames) / 60)
-    bleach = np.exp(-np.arange(frames) / frames * 0.4)
+    bleach = (1 - bleached) ** (np.arange(frames) / frames)
     brightest = float((cast.sum(axis=0) + around).max())
     raw = []
     for t in range(frames):
