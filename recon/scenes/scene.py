@@ -63,9 +63,8 @@ class SceneSpec:
     grid_field : float
         Extent of the calibration grid relative to the field that is opposite to the sensor.
     calibration_photons : float
-        Photo-electrons at the brightest pixel of the first PSF (read noise as in the measurement), averages
-        included. It is of the nearest depth and, with ``grid`` above 1, of the field's corner: where the
-        response falls off, PSFs nearer to the axis have more.
+        Photo-electrons at the brightest pixel of a PSF on the axis at the nearest depth (read noise as in the
+        measurement), averages included. PSFs at other places are taken with the same exposure.
     drift_px, drift_scale, drift_deg : float
         How the diffuser moved after the calibration: shift along both axes, relative scale, rotation.
     depth_error : float
@@ -324,25 +323,22 @@ def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.fl
 def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator) -> tuple[Calibration, float]:
     """Photograph a point source at every depth and place; also return the counts of a unit power.
 
-    One exposure serves all, set by the first PSF: of the nearest depth and, with ``grid`` above 1, of the
-    corner. Where the response falls off, the axis then gets more light than ``calibration_photons``. The
-    shipped maps were made so.
+    One exposure serves all, set by a point on the axis at the nearest depth, whether the grid holds it or
+    not: neither the number of calibration points nor the response's fall-off changes what the axis gets.
     """
     height, width = spec.shape
     across = np.linspace(-0.5, 0.5, spec.grid) * spec.grid_field if spec.grid > 1 else np.zeros(1)
     true_z = _depth_um(spec, _plane_places(spec), camera.distance_um)
+    colours = _channels(spec, np.ones((1, 3)))
+    on_axis = np.stack([camera.light([[0.0, 0.0, true_z[0], 1.0]], c) for c, _ in colours])
+    unit = spec.calibration_photons / float(on_axis.max())
     psfs, positions = [], []
-    unit = 0.0
     for z in true_z:
         to_scene = -camera.pitch_um * z / camera.distance_um
         for row in across * height:
             for column in across * width:
                 source = (column * to_scene, row * to_scene, z)
-                light = np.stack(
-                    [camera.light([[*source, 1.0]], c) for c, _ in _channels(spec, np.ones((1, 3)))]
-                )
-                # One exposure for all, set by the first PSF (see above).
-                unit = unit or spec.calibration_photons / float(light.max())
+                light = np.stack([camera.light([[*source, 1.0]], c) for c, _ in colours])
                 counts = rng.poisson(light * unit) + rng.normal(0, spec.read_noise_e, light.shape)
                 psfs.append(np.maximum(counts, 0).astype(np.float32))
                 positions.append((source[0], source[1], z * (1 + spec.depth_error)))

@@ -128,3 +128,13 @@ def test_mistakes_are_named():
         make_scene("beads", z_near=20.0)
     with pytest.raises(InputError, match=r"\(4, 4\)"):
         score(np.zeros((4, 4)), np.zeros((5, 5)))
+
+
+def test_the_calibrations_exposure_depends_neither_on_its_grid_nor_on_the_fall_off():
+    spec = spec_of("sparse-picture", size=32, calibration_photons=1e5)
+    on_axis = [
+        make_scene(replace(spec, grid=grid, fall_off_deg=angle)).calibration.psfs[grid**2 // 2].max()
+        for grid, angle in ((1, np.inf), (3, np.inf), (3, 8.0), (5, 8.0))
+    ]
+    # Photon noise of the brightest pixel is 0.3 %.
+    np.testing.assert_allclose(on_axis, 1e5, rtol=0.03)
