@@ -16,6 +16,7 @@ import json
 import platform
 import sys
 from collections import Counter
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -36,7 +37,10 @@ TUNED_BELOW = 389
 """Scenes before this one served to set the thresholds; those from it on are reported apart."""
 IN_VIEW = set(range(389, 444))
 """Of those, the scenes with which the number of similar cases was decided."""
-PICTURE_METHODS, VOLUME_METHODS = ("admm tv", "admm l1", "wiener"), ("volume tv", "volume l1")
+AUTO = ", auto"
+"""After a method's name: with the model that ``model="auto"`` chooses, as users reconstruct."""
+PICTURE_METHODS = ("admm tv" + AUTO, "admm tv", "admm l1", "wiener")
+VOLUME_METHODS = ("volume tv" + AUTO, "volume l1" + AUTO, "volume tv", "volume l1")
 
 
 def scene(index: int) -> tuple[SceneSpec, Options]:
@@ -78,12 +82,17 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
 
 
 def run(first: int, count: int, keep: Path) -> None:
-    """Reconstruct scenes and append evidence and severity to a file."""
+    """Reconstruct scenes and append evidence and severity to a file, but for those that it has."""
+    done = {(e["index"], e["method"]) for e in read(keep)}
     for index in range(first, first + count):
         spec, handled = scene(index)
         one_depth = spec.is_picture or spec.depths == 1
         for method in PICTURE_METHODS if one_depth else VOLUME_METHODS:
-            trial = run_scene(spec, method, handled, "quick")
+            if (index, method) in done:
+                continue
+            name, auto, _ = method.partition(AUTO)
+            options = replace(handled, model="auto", estimate_background=None) if auto else handled
+            trial = run_scene(spec, name, options, "quick")
             severity, failure = worst(trial.severities)
             entry = {
                 "index": index,
@@ -99,6 +108,17 @@ def run(first: int, count: int, keep: Path) -> None:
     print(file=sys.stderr)
 
 
+def read(keep: Path) -> list[dict]:
+    """Return what was kept; a last line that an interruption cut off is taken from the file."""
+    if not keep.exists():
+        return []
+    text = keep.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        keep.write_text(whole, encoding="utf-8")
+    return [json.loads(line) for line in whole.splitlines()]
+
+
 def table(entries: list[dict]) -> tuple[list[str], dict[str, float]]:
     """Return the table's lines by group of methods, and the figures of all together."""
     counts: dict[str, Counter] = {}
@@ -106,9 +126,10 @@ def table(entries: list[dict]) -> tuple[list[str], dict[str, float]]:
         if not entry["evidence"]:
             continue  # refused by the reconstruction itself, with a sentence
         evidence = Evidence(**{**entry["evidence"], "planes": int(entry["evidence"]["planes"])})
-        region = verdict_on(evidence, entry["method"]).region
+        method, auto, _ = entry["method"].partition(AUTO)
+        region = verdict_on(evidence, method).region
         good = entry["severity"] < 1
-        for name in (group_of(entry["method"]), "all"):
+        for name in (f"{group_of(method)}{auto}", "all"):
             counts.setdefault(str(name), Counter())[(region, good)] += 1
     lines = [
         "| methods | reconstructions | good ones | called reliable | of these failed "
@@ -156,7 +177,7 @@ def main() -> None:
     a = parser.parse_args()
     set_threads(1)
     run(a.first, a.count, a.keep)
-    entries = [json.loads(line) for line in a.keep.read_text(encoding="utf-8").splitlines()]
+    entries = read(a.keep)
     held_out = [e for e in entries if e["index"] >= TUNED_BELOW]
     lines, figures = table(held_out)
     before, _ = table([e for e in entries if e["index"] < TUNED_BELOW])

@@ -63,18 +63,18 @@ class Options:
     ----------
     model : str, optional
         Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
-        map shows what one model does, so it leaves no choice to ``"auto"``.
+        map shows what one model does, so it leaves no choice to ``"auto"`` unless it says so.
     leave_out_saturated : bool
     subtract_background : bool
         Give the true background, as a user who photographed it would.
-    estimate_background : bool
-        Of a volume.
+    estimate_background : bool or None
+        Of a volume; None as the model says.
     """
 
     model: ModelName | None = None
     leave_out_saturated: bool = False
     subtract_background: bool = True
-    estimate_background: bool = False
+    estimate_background: bool | None = False
 
 
 @lru_cache(maxsize=4)
