@@ -17,6 +17,7 @@ from recon.solvers import StoppingRules
 from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome
 from recon.solvers.fista import Fista
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.stability.failure import PRECISION, Failure, bounded, convergence_severity
 from recon.stability.map import Axis, Size, StressMap, Trial
 from recon.stability.maps_light import PICTURE
@@ -91,8 +92,27 @@ def _fista(problem: Prepared, step: float, weight: float) -> Outcome:
         return Fista(problem.operator, problem.data, prior, step=length).run(_rules())
 
 
+class _OffBalance(SensorAdmm):
+    """ADMM on the sensor whose penalties are a factor off those that it guesses and balances by itself."""
+
+    factor: float
+
+    def _first_penalties(self) -> Array:
+        return super()._first_penalties() * self.factor
+
+    def _balanced_penalties(self) -> Array:
+        return super()._balanced_penalties() * self.factor
+
+
+def _sensor_admm(problem: Prepared, penalty: float, weight: float) -> Outcome:
+    prior = TotalVariation(weight) + NonNegativity()
+    off = type("OffBalance", (_OffBalance,), {"factor": penalty})
+    return off(problem.operator, problem.data, prior).run(_rules())
+
+
 _PICTURE_SOLVERS: dict[str, Callable[[Prepared, float, float], Outcome]] = {
     "admm tv": _admm,
+    "admm-sensor tv": _sensor_admm,
     "fista tv": _fista,
 }
 
@@ -138,7 +158,7 @@ MAPS = (
         f" After {STEPS} iterations.",
         PENALTY,
         WEIGHT,
-        ("admm tv", "fista tv", "volume tv", "volume l1"),
+        ("admm tv", "admm-sensor tv", "fista tv", "volume tv", "volume l1"),
         _penalties,
     ),
 )

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
+from recon.operators import PadCropConvolution
+from recon.priors import NonNegativity, TotalVariation
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.stability.catalogue import MAPS, map_named
 from recon.stability.failure import Failure
 from recon.stability.map import Axis, Cell, StressMap, Trial, as_text, boundary, severity_grid
+from recon.stability.maps_solver import _OffBalance
 from recon.stability.run import run_map
 
 X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
@@ -64,3 +68,12 @@ def test_the_catalogue_is_in_order() -> None:
                 assert not axis.logarithmic or values[0] > 0
     with pytest.raises(InputError, match="no map"):
         map_named("nothing")
+
+
+def test_penalties_off_balance_are_those_of_the_solver_times_a_factor() -> None:
+    operator = PadCropConvolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
+    data = np.random.default_rng(1).random((1, 8, 8)).astype(np.float32)
+    prior = TotalVariation(0.1) + NonNegativity()
+    ten = type("Ten", (_OffBalance,), {"factor": 10.0})
+    own, off = (solver(operator, data, prior)._mu for solver in (SensorAdmm, ten))
+    np.testing.assert_allclose(off, 10 * own, rtol=1e-5)
