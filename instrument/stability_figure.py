@@ -66,10 +66,16 @@ def _draw(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[str,
     for which, count in (("x", n_x), ("y", n_y)):
         about = record[which]
         getattr(axes, f"set_{which}ticks")(range(count))
-        getattr(axes, f"set_{which}ticklabels")([_short(v) for v in about["values"]], fontsize=8)
+        getattr(axes, f"set_{which}ticklabels")(ticks_of(about), fontsize=8)
         getattr(axes, f"set_{which}label")(_named(about), fontsize=9, color=_INK)
     axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=_INK, loc="left")
     return image
+
+
+def ticks_of(axis: Mapping[str, Any]) -> list[str]:
+    """Return the names of an axis' ticks: their own where it has some, else the values."""
+    own: list[str] = axis.get("ticks", [])
+    return own or [_short(v) for v in axis["values"]]
 
 
 def _named(axis: Mapping[str, Any]) -> str:

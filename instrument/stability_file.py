@@ -148,12 +148,14 @@ def read_stability(path: Path) -> dict[str, Any]:
 
 
 def _axis(axis: Axis, size: Size) -> dict[str, Any]:
+    ticks = {} if axis.named is None else {"ticks": [axis.named(v, size) for v in axis.at(size)]}
     return {
         "key": axis.key,
         "label": axis.label,
         "unit": axis.unit,
         "values": list(axis.at(size)),
         "logarithmic": axis.logarithmic,
+        **ticks,
     }
 
 

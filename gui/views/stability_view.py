@@ -117,7 +117,9 @@ class StabilityView(QWidget):
             about = record[which]
             unit = f" ({about['unit']})" if about["unit"] else ""
             self.plot.setLabel(side, f"{about['label']}{unit}")
-            self.plot.getAxis(side).setTicks([[(i, _short(v)) for i, v in enumerate(about["values"])]])
+            self.plot.getAxis(side).setTicks(
+                [list(enumerate(about.get("ticks") or map(_short, about["values"])))]
+            )
         rows, columns = severity.shape
         self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
         self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)

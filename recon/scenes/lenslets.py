@@ -26,6 +26,9 @@ LENSLETS, PATCHES = 49, 784
 its caustics."""
 APERTURE = 0.66
 """Side of the aperture relative to the sensor's."""
+PITCH_UM = 20.0
+DISTANCE = 0.9
+"""Defaults: pixel pitch, and the diffuser's distance from the sensor relative to the sensor's longer side."""
 
 
 @njit(nogil=True, cache=True)
@@ -143,8 +146,8 @@ def build_camera(
     *,
     optics: Optics = "random",
     seed: int = 0,
-    pitch_um: float = 20.0,
-    distance: float = 0.9,
+    pitch_um: float = PITCH_UM,
+    distance: float = DISTANCE,
     focus: float = 6.0,
     aberration: float = 0.0,
     fall_off_deg: float = np.inf,

@@ -9,13 +9,22 @@ from recon.stability import (
     maps_light,
     maps_scene,
     maps_solver,
+    maps_time,
     maps_volume,
 )
 from recon.stability.map import StressMap
 
 MAPS: dict[str, StressMap] = {
     stress.name: stress
-    for module in (maps_light, maps_volume, maps_scene, maps_calibration, maps_solver, maps_display)
+    for module in (
+        maps_light,
+        maps_volume,
+        maps_scene,
+        maps_time,
+        maps_calibration,
+        maps_solver,
+        maps_display,
+    )
     for stress in module.MAPS
 }
 

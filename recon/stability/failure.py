@@ -14,6 +14,7 @@ dip            0.2 over the least dip between neighbouring points (two-point res
 convergence    change of the last iteration over ten times the tolerance, where a limit ended the run
 picture        ``10^((20 - PSNR) / 20)``: a hologram's error over a tenth of its picture's white
 precision      difference of float32 from float64 over 1 % of the solution
+alone          error over that of the same frames reconstructed one by one: the prior over time does harm
 =============  ==========================================================================================
 
 Severities are continuous, so that a boundary can be drawn between the cells of a coarse map.
@@ -59,6 +60,7 @@ class Failure(enum.StrEnum):
     CONVERGENCE = "not converged"
     PICTURE = "picture below 20 dB"
     PRECISION = "float32 differs from float64"
+    ALONE = "worse than each frame on its own"
 
 
 Severities = Mapping[Failure, float]

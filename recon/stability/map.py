@@ -27,6 +27,8 @@ class Axis:
     quick : tuple of float
         For the quick size.
     logarithmic : bool
+    named : callable, optional
+        ``named(value, size)`` says what a value is in other units: the name of its tick.
     """
 
     key: str
@@ -35,6 +37,7 @@ class Axis:
     values: tuple[float, ...]
     quick: tuple[float, ...]
     logarithmic: bool = False
+    named: Callable[[float, Size], str] | None = None
 
     def at(self, size: Size) -> tuple[float, ...]:
         """Return the values of a size."""

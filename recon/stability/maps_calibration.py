@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from recon.scenes import SceneSpec
+from recon.scenes.lenslets import DISTANCE, PITCH_UM
 from recon.stability.map import Axis, Size, StressMap, Trial
 from recon.stability.maps_light import ELECTRONS, PICTURE, scene_map
-from recon.stability.scene_trial import Options, judge, run_scene, scene_of, solve, spec_at
+from recon.stability.scene_trial import PIXELS, Options, judge, run_scene, scene_of, solve, spec_at
 
 SIZE_ERROR = Axis(
     "size_error", "depth error: PSF too large by", "%", (0.5, 1, 2, 3, 5, 8), (1, 3, 5, 8), logarithmic=True
@@ -22,8 +23,31 @@ SHIFT = Axis("drift_px", "shift", "pixels", (0.1, 0.3, 0.6, 1, 2, 4), (0.3, 1, 4
 COLOUR = Axis(
     "colour", "deflection at another colour", "% more", (0.3, 1, 3, 5, 10, 20), (1, 5, 20), logarithmic=True
 )
-POINTS_A_SIDE = Axis("grid", "calibration points along a side", "points", (1, 2, 3, 5, 7), (1, 3, 5))
-FALL_OFF = Axis("fall_off_deg", "angular response", "degrees (sigma)", (6, 9, 13, 20, 40), (9, 13, 40))
+SPACED = replace(PICTURE, z_near=1.0, z_far=1.0, photons=10_000.0)
+
+
+def _spacing(points: float, size: Size) -> str:
+    spec = replace(SPACED, size=PIXELS[size])
+    extent_um = spec.grid_field * PIXELS[size] * PITCH_UM * spec.z_near
+    return f"{points:g}" if points < 2 else f"{points:g}\n{extent_um / (points - 1):.0f} um apart"
+
+
+def _width(sigma_deg: float, size: Size) -> str:
+    distance_um = SPACED.z_near * DISTANCE * PIXELS[size] * PITCH_UM
+    return f"{sigma_deg:g}\n{distance_um * np.tan(np.deg2rad(sigma_deg)):.0f} um"
+
+
+POINTS_A_SIDE = Axis(
+    "grid", "calibration points along a side", "points", (1, 2, 3, 5, 7), (1, 3, 5), named=_spacing
+)
+FALL_OFF = Axis(
+    "fall_off_deg",
+    "angular response, sigma",
+    "degrees; um in the scene",
+    (6, 9, 13, 20, 40),
+    (9, 13, 40),
+    named=_width,
+)
 
 MEAN_INVERSE, INVERSE_RANGE = (1 / 12 + 1 / 4) / 2, 1 / 4 - 1 / 12
 """Inverse depths of the default scenes, relative to the distance from diffuser to sensor."""
@@ -89,7 +113,7 @@ MAPS = (
         "spacing",
         "Spacing of calibration points and width of the angular response",
         "How many points over the field does a sensor need whose response falls off with the angle?",
-        replace(PICTURE, z_near=1.0, z_far=1.0, photons=10_000.0),
+        SPACED,
         POINTS_A_SIDE,
         FALL_OFF,
         ("admm tv",),

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from instrument.cli.stability import app
 from instrument.errors import BenchError, FileError
+from instrument.stability_figure import ticks_of
 from instrument.stability_file import CellLog, read_stability
 from recon.stability import catalogue
 from recon.stability.failure import Failure
@@ -121,3 +122,14 @@ def test_mistakes_are_sentences(tmp_path: Path) -> None:
 
 def test_the_list_names_maps_and_methods() -> None:
     assert "first; stops" in run("--list")
+
+
+def test_an_axis_may_name_its_values_in_other_units(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named = replace(AXES[0], named=lambda value, size: f"{value:g} e in {size}")
+    stress = StressMap("easy", "Easy", "Is it easy?", named, AXES[1], ("first",), trial)
+    monkeypatch.setattr(catalogue, "MAPS", {"easy": stress})
+    run("easy", "--out", str(tmp_path))
+    record = read_stability(tmp_path / "stability.json")["maps"]["easy"]
+    assert record["x"]["ticks"] == ["1 e in quick", "10 e in quick"]
+    assert ticks_of(record["x"]) == record["x"]["ticks"]
+    assert ticks_of(record["y"]) == ["1", "4"]
