@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.operators import Convolution3D, PadCropConvolution
+from recon.operators import Convolution3D, LinearOperator, PadCropConvolution
 from recon.preparation import Prepared, prepare
 from recon.priors import NonNegativity, TotalVariation
+from recon.priors.base import Prior
 from recon.scenes import SceneSpec
 from recon.solvers import StoppingRules
 from recon.solvers.admm import Admm, Penalties
@@ -95,19 +96,20 @@ def _fista(problem: Prepared, step: float, weight: float) -> Outcome:
 class _OffBalance(SensorAdmm):
     """ADMM on the sensor whose penalties are a factor off those that it guesses and balances by itself."""
 
-    factor: float
+    def __init__(self, operator: LinearOperator, data: Array, prior: Prior, factor: float) -> None:
+        self._factor = factor  # asked for while the solver is being built
+        super().__init__(operator, data, prior)
 
     def _first_penalties(self) -> Array:
-        return super()._first_penalties() * self.factor
+        return super()._first_penalties() * self._factor
 
     def _balanced_penalties(self) -> Array:
-        return super()._balanced_penalties() * self.factor
+        return super()._balanced_penalties() * self._factor
 
 
 def _sensor_admm(problem: Prepared, penalty: float, weight: float) -> Outcome:
     prior = TotalVariation(weight) + NonNegativity()
-    off = type("OffBalance", (_OffBalance,), {"factor": penalty})
-    return off(problem.operator, problem.data, prior).run(_rules())
+    return _OffBalance(problem.operator, problem.data, prior, penalty).run(_rules())
 
 
 _PICTURE_SOLVERS: dict[str, Callable[[Prepared, float, float], Outcome]] = {

@@ -74,6 +74,6 @@ def test_penalties_off_balance_are_those_of_the_solver_times_a_factor() -> None:
     operator = PadCropConvolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
     data = np.random.default_rng(1).random((1, 8, 8)).astype(np.float32)
     prior = TotalVariation(0.1) + NonNegativity()
-    ten = type("Ten", (_OffBalance,), {"factor": 10.0})
-    own, off = (solver(operator, data, prior)._mu for solver in (SensorAdmm, ten))
+    own = SensorAdmm(operator, data, prior)._mu
+    off = _OffBalance(operator, data, prior, 10.0)._mu
     np.testing.assert_allclose(off, 10 * own, rtol=1e-5)
