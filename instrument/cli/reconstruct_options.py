@@ -307,7 +307,8 @@ ToleranceOption = Annotated[
         "--tolerance",
         min=0.0,
         metavar="X",
-        help="Stop when the relative change falls below X. Default: 2e-3 (fista: 5e-4).",
+        help="Stop when the relative change an iteration falls below X (and residuals below 10 X). Default: "
+        "2e-3 (fista 5e-4; volumes, --model local or lowrank 1e-3; varying PSFs by auto 8e-3). 0: never.",
         show_default=False,
     ),
 ]

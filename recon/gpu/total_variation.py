@@ -75,6 +75,7 @@ class PlainTotalVariation(PlainSolver):
             volume = xp.asarray(initial, dtype).reshape(camera.domain_shape)
             self.e = self.data - camera.forward(volume)
             self.X = xp.fft.rfft2(volume)
+            self.S[3] = xp.maximum(volume, 0)
         self.penalty = self._used = _PENALTY * float(camera.power().mean())
         self._misfit = 0.5 * float(xp.vdot(self.e, self.e))
 
@@ -188,9 +189,8 @@ class PlainTotalVariation(PlainSolver):
 
     @property
     def solution(self) -> npt.NDArray[Any]:
-        """The iterate's non-negative part in the host's memory, (1, n_z, height, width)."""
-        xp = self.camera.xp
-        return to_host(xp.maximum(xp.fft.irfft2(self.X, s=self.camera.grid_shape), 0))[None]
+        """The split variable that is not negative, in the host's memory, (1, n_z, height, width)."""
+        return to_host(self.camera.xp.maximum(self.S[3], 0))[None]
 
 
 def _squares(a: Array) -> float:

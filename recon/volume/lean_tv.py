@@ -38,6 +38,8 @@ from recon.volume.memory import Storage
 from recon.volume.sensor_system import residual_norm
 from recon.volume.splitting import VolumeSplitting
 
+_POSITIVE = 3
+"""Which of the four states is that of non-negativity."""
 _TILE = 256
 """Spectral columns solved together: all planes of a tile fit a core's second-level cache."""
 
@@ -126,6 +128,7 @@ class LeanTotalVariation(VolumeSplitting):
             volume = np.ascontiguousarray(initial, dtype).reshape(operator.domain_shape)
             self.e -= self.system.masked(operator.forward(volume)[0])
             fft.rfft(volume[0], out=self.X)
+            np.maximum(volume[0], 0, out=self.S[:, :, _POSITIVE])
         if penalty is None:
             penalty = _PENALTY * float(operator.power().mean())
         self.penalty = float(penalty)
@@ -149,19 +152,12 @@ class LeanTotalVariation(VolumeSplitting):
 
     @property
     def solution(self) -> Array:
-        """The present iterate's non-negative part; computed on demand."""
-        _, nz, ny, nx = self.operator.domain_shape
-        volume = np.empty((1, nz, ny, nx), self.operator.dtype)
-        scratch = np.empty(self.g.shape[1:], self.g.dtype)
-        for z in range(nz):
-            scratch[...] = self.X[z]
-            fft.irfft(scratch, nx, out=volume[0, z])
-            np.maximum(volume[0, z], 0, out=volume[0, z])
-        return volume
+        """The split variable that is not negative: what is empty is zero, not nearly so. A copy."""
+        return np.asarray(np.maximum(self.S[:, :, _POSITIVE], 0))[None]
 
     def _end(self) -> Array:
         if not self.keep_state:
-            del self.S
+            del self.X, self.g
         return self.solution
 
     def step(self) -> IterationRecord:

@@ -15,13 +15,13 @@ def quality_db() -> dict[float | None, float]:
     return {r.spacing_um: r.psnr_db for r in results}
 
 
-def test_points_closer_than_nyquist_gain_little(quality_db: dict[float | None, float]) -> None:
-    # 0.96 dB at this coarse size, against 1.9 dB for the step from 400 to 600 um, and 0.4 dB at the
-    # benchmark's size. How far the solver gets is not why: 1.41, 0.96 and 1.15 dB after 20, 60 and 200
-    # iterations.
-    closer = quality_db[200.0] - quality_db[400.0]
-    assert closer < 1.0
-    assert closer < 0.6 * (quality_db[400.0] - quality_db[600.0])
+def test_the_step_beyond_nyquist_costs_more_than_the_step_below_it_brings(
+    quality_db: dict[float | None, float],
+) -> None:
+    # 0.96 dB against 1.88 dB. How much closer points bring hangs on the diffuser: with five others it is 1.9
+    # to 4.4 dB, against 3.0 to 5.4 dB for the step from 400 to 600 um; with this one at the benchmark's size
+    # 0.4 dB. In all six the step beyond is the larger one, by 0.7 to 1.6 dB.
+    assert quality_db[200.0] - quality_db[400.0] < quality_db[400.0] - quality_db[600.0]
 
 
 def test_beyond_nyquist_the_picture_degrades(quality_db: dict[float | None, float]) -> None:
