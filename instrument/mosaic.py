@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -9,13 +10,17 @@ import numpy.typing as npt
 
 from instrument.errors import BenchError, FileError
 from instrument.images import ImageFile
-from instrument.preparation import Crop, FloatImage
-from recon.bayer import PATTERNS, Pattern, split_bayer
+from instrument.preparation import Crop, FloatImage, reduce
+from recon.bayer import PATTERNS, Pattern, interpolate_bayer, split_bayer
+from recon.types import Calibration
+
+MosaicChoice = Pattern | Literal["auto"] | None
+"""A colour mosaic; None for none; "auto" for what the image's metadata say."""
 
 _GENICAM: dict[str, Pattern] = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}
 
 
-def mosaic_named(text: str) -> Pattern | Literal["auto"] | None:
+def mosaic_named(text: str) -> MosaicChoice:
     """Return the pattern that ``--bayer`` names; None for ``none``.
 
     Raises
@@ -100,3 +105,48 @@ def reduce_mosaic(
     count = known[kept].reshape(cells).sum(axis=(1, 3))
     total = image[kept].reshape(cells).sum(axis=(1, 3), dtype=np.float64)
     return (total / count).astype(np.float32), np.ones((height, width, 3), bool)
+
+
+def pattern_of(choice: MosaicChoice, image: ImageFile) -> Pattern | None:
+    """Return the mosaic asked for, or that of the metadata; refused where the image cannot be one."""
+    pattern = mosaic_of(image) if choice == "auto" else choice
+    if pattern is not None:
+        require_mosaic(image, pattern)
+    return pattern
+
+
+def mosaic_psf(psf: FloatImage, pattern: Pattern, crop: Crop | None, factor: int) -> FloatImage:
+    """Bring a PSF to a mosaic's measurement: binned, each colour by the pixels that saw it, as that is."""
+    if psf.ndim == 3:
+        return reduce(psf, 0.0, crop, factor)
+    if factor > 1:
+        return reduce_mosaic(psf, pattern, crop, factor)[0]
+    return reduce(interpolate_bayer(psf, pattern), 0.0, crop, 1)
+
+
+def matched_mosaic(
+    raw: FloatImage, pattern: Pattern, match: int, crop: Crop | None, factor: int
+) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
+    """Bring a raw frame to a calibration's pixels, then cut and bin on those."""
+    if match == 1:
+        return reduce_mosaic(raw, pattern, crop, factor)
+    image = reduce(reduce_mosaic(raw, pattern, None, match)[0], 0.0, crop, factor)
+    return image, np.ones(image.shape, bool)
+
+
+def on_every_pixel(level: float | FloatImage, match: int, shape: tuple[int, ...]) -> float | FloatImage:
+    """Bring a dark level on a calibration's pixels to those of the raw frame."""
+    if not isinstance(level, np.ndarray):
+        return level
+    spread = np.repeat(np.repeat(level, match, axis=0), match, axis=1)
+    grown: FloatImage = np.zeros(shape[:2], np.float32)
+    grown[: spread.shape[0], : spread.shape[1]] = spread
+    return grown
+
+
+def in_colour(calibration: Calibration, pattern: Pattern, match: int) -> Calibration:
+    """Fill the colours of PSFs that are raw frames themselves; binned ones are grey and serve all colours."""
+    if calibration.psfs.shape[1] > 1 or match > 1:
+        return calibration
+    psfs = np.stack([np.moveaxis(interpolate_bayer(psf[0], pattern), -1, 0) for psf in calibration.psfs])
+    return replace(calibration, psfs=psfs, background=None)

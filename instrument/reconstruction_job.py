@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,9 +14,16 @@ from instrument.calibration_file import is_calibration, load_calibration
 from instrument.erasures import Choice, Erased, erasures_of, reduce_valid
 from instrument.errors import BenchError, FileError
 from instrument.images import ImageFile, read_image
-from instrument.mosaic import mosaic_of, reduce_mosaic, require_mosaic
+from instrument.mosaic import (
+    MosaicChoice,
+    in_colour,
+    matched_mosaic,
+    mosaic_psf,
+    on_every_pixel,
+    pattern_of,
+    reduce_mosaic,
+)
 from instrument.preparation import (
-    AUTO_PIXELS,
     Crop,
     Dark,
     FloatImage,
@@ -32,7 +38,17 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
-from recon.bayer import Pattern, interpolate_bayer
+from instrument.reconstruction_record import (
+    crop_record,
+    dark_record,
+    describe,
+    describe_window,
+    mosaic_note,
+    noise_note,
+    noise_of,
+    slices_record,
+    source_record,
+)
 from recon.noise import NoiseModel
 from recon.refocus import at_depth
 from recon.types import Calibration
@@ -64,8 +80,6 @@ class Reduction:
 
 
 DarkChoice = Literal["auto"] | float | Path
-MosaicChoice = Pattern | Literal["auto"] | None
-"""A colour mosaic; None for none; "auto" for what the image's metadata say."""
 NoiseChoice = NoiseModel | float | Literal["estimate"] | None
 """A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
 Binning = int | None
@@ -146,7 +160,7 @@ def job_from_files(
     psf, image = read_image(psf_path), read_image(image_path)
     _refuse_constant(image)
     warnings = check_psf(psf, allow_saturated=allow_saturated)
-    pattern = _pattern(mosaic, image)
+    pattern = pattern_of(mosaic, image)
     check_pair(psf, image, allow_mixed_depth=allow_mixed_depth, mosaic=pattern is not None)
     level = _dark(dark, psf, image)
     window = _window(crop, image)
@@ -161,7 +175,7 @@ def job_from_files(
     else:
         measurement, known = reduce_mosaic(reduce(image.pixels, level.image, None, 1), pattern, crop, factor)
         valid = known if valid is None else known & valid[..., None]
-        psf_pixels = _mosaic_psf(reduce(psf.pixels, level.psf, None, 1), pattern, crop, factor)
+        psf_pixels = mosaic_psf(reduce(psf.pixels, level.psf, None, 1), pattern, crop, factor)
     psf_pixels = np.maximum(psf_pixels, 0)
     if not psf_pixels.any():
         raise FileError(
@@ -173,21 +187,21 @@ def job_from_files(
         measurement,
         _calibration_of(psf_pixels, psf),
         {
-            "PSF": _describe(psf),
-            "Image": _describe(image),
+            "PSF": describe(psf),
+            "Image": describe(image),
             "Dark": level.reason,
-            "Pixels": _describe_window(crop, binning, factor, measurement),
+            "Pixels": describe_window(crop, binning, factor, measurement),
             "Erased": erased.reason,
-            **_mosaic_note(pattern),
-            **_noise_note(noise_of(image)),
+            **mosaic_note(pattern),
+            **noise_note(noise_of(image)),
         },
         valid,
         (*warnings, *_saturation(image, erased)),
         {
-            "psf": _source(psf),
-            "image": _source(image),
-            "dark": _dark_record(level),
-            "crop": _crop_record(crop, image),
+            "psf": source_record(psf),
+            "image": source_record(image),
+            "dark": dark_record(level),
+            "crop": crop_record(crop, image),
             "binning": factor,
             "erased": erased.reason,
             "mosaic": pattern,
@@ -242,7 +256,7 @@ def job_with(
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
-    pattern = _pattern(mosaic, image)
+    pattern = pattern_of(mosaic, image)
     if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
     pixels, level = _calibrated_dark(dark, image, calibration, match)
@@ -253,33 +267,33 @@ def job_with(
     if pattern is None:
         measurement = reduce(pixels, level.image, crop, factor)
     else:
-        offset = _on_every_pixel(level.image, match, image.pixels.shape)
-        measurement, known = _matched_mosaic(
+        offset = on_every_pixel(level.image, match, image.pixels.shape)
+        measurement, known = matched_mosaic(
             reduce(image.pixels, offset, None, 1), pattern, match, crop, factor
         )
         valid = known if valid is None else known & valid[..., None]
-        calibration = _in_colour(calibration, pattern, match)
+        calibration = in_colour(calibration, pattern, match)
     return Job(
         measurement,
         _reduced_calibration(calibration, crop, factor),
         {
             "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
-            "Image": _describe(image)
+            "Image": describe(image)
             + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
             "Dark": level.reason,
-            "Pixels": _describe_window(crop, factor, factor, measurement),
+            "Pixels": describe_window(crop, factor, factor, measurement),
             "Erased": erased.reason,
-            **_mosaic_note(pattern),
-            **_noise_note(noise_of(image)),
+            **mosaic_note(pattern),
+            **noise_note(noise_of(image)),
         },
         valid,
         _saturation(image, erased),
         {
             "calibration": str(folder.resolve()),
-            "image": _source(image),
-            "dark": _dark_record(level),
+            "image": source_record(image),
+            "dark": dark_record(level),
             "image_binning": match,
-            "crop": None if crop is None else _slices_record(crop.slices((shape[0], shape[1]))),
+            "crop": None if crop is None else slices_record(crop.slices((shape[0], shape[1]))),
             "binning": factor,
             "erased": erased.reason,
             "mosaic": pattern,
@@ -346,79 +360,6 @@ def find_calibration(folder: Path) -> Path:
     return inside[0]
 
 
-# Colour mosaics ----------------------------------------------------------------------------------------
-def _pattern(choice: MosaicChoice, image: ImageFile) -> Pattern | None:
-    pattern = mosaic_of(image) if choice == "auto" else choice
-    if pattern is not None:
-        require_mosaic(image, pattern)
-    return pattern
-
-
-def _mosaic_psf(psf: FloatImage, pattern: Pattern, crop: Crop | None, factor: int) -> FloatImage:
-    """Bring a PSF to a mosaic's measurement: binned, each colour by the pixels that saw it, as that is."""
-    if psf.ndim == 3:
-        return reduce(psf, 0.0, crop, factor)
-    if factor > 1:
-        return reduce_mosaic(psf, pattern, crop, factor)[0]
-    return reduce(interpolate_bayer(psf, pattern), 0.0, crop, 1)
-
-
-def _mosaic_note(pattern: Pattern | None) -> dict[str, str]:
-    if pattern is None:
-        return {}
-    return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
-
-
-def noise_of(image: ImageFile) -> NoiseModel | None:
-    """Return a pixel's noise as the metadata of a photograph tell it, the mean of its frames regarded."""
-    told: Any = image.metadata.get("noise")
-    try:
-        average = float(image.metadata.get("average", 1))
-        model = NoiseModel(
-            float(told["read_noise_counts"]) / average**0.5, float(told["counts_per_electron"]) / average
-        )
-    except (TypeError, KeyError, ValueError, ZeroDivisionError):
-        return None  # somebody else's metadata
-    known = np.isfinite([model.read_noise, model.counts_per_electron]).all()
-    return model if known and min(model.read_noise, model.counts_per_electron) >= 0 else None
-
-
-def _noise_note(noise: NoiseModel | None) -> dict[str, str]:
-    if noise is None:
-        return {}
-    known = f"read noise {noise.read_noise:.3g} counts, {noise.counts_per_electron:.3g} counts an electron"
-    return {"Noise": f"{known}, as the photograph's metadata say, unless --noise is given"}
-
-
-def _matched_mosaic(
-    raw: FloatImage, pattern: Pattern, match: int, crop: Crop | None, factor: int
-) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
-    """Bring a raw frame to a calibration's pixels, then cut and bin on those."""
-    if match == 1:
-        return reduce_mosaic(raw, pattern, crop, factor)
-    image = reduce(reduce_mosaic(raw, pattern, None, match)[0], 0.0, crop, factor)
-    return image, np.ones(image.shape, bool)
-
-
-def _on_every_pixel(level: float | FloatImage, match: int, shape: tuple[int, ...]) -> float | FloatImage:
-    """Bring a dark level on a calibration's pixels to those of the raw frame."""
-    if not isinstance(level, np.ndarray):
-        return level
-    spread = np.repeat(np.repeat(level, match, axis=0), match, axis=1)
-    grown: FloatImage = np.zeros(shape[:2], np.float32)
-    grown[: spread.shape[0], : spread.shape[1]] = spread
-    return grown
-
-
-def _in_colour(calibration: Calibration, pattern: Pattern, match: int) -> Calibration:
-    """Fill the colours of PSFs that are raw frames themselves; binned ones are grey and serve all colours."""
-    if calibration.psfs.shape[1] > 1 or match > 1:
-        return calibration
-    psfs = np.stack([np.moveaxis(interpolate_bayer(psf[0], pattern), -1, 0) for psf in calibration.psfs])
-    return replace(calibration, psfs=psfs, background=None)
-
-
-# Pieces ------------------------------------------------------------------------------------------------
 def _dark(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
     if choice == "auto":
         return dark_from_corners(psf, image)
@@ -514,46 +455,3 @@ def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
         return ()
     share = f"{count / image.pixels.size:.2%}"
     return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
-
-
-def _describe(file: ImageFile) -> str:
-    return ", ".join((f"{file.path}: {file.describe()}", *file.notes))
-
-
-def _describe_window(crop: Crop | None, asked: Binning, factor: int, result: FloatImage) -> str:
-    window = "whole image" if crop is None else f"window of {crop.height} x {crop.width}"
-    is_automatic = asked is None and factor > 1
-    binned = f"binned {factor} x {factor}" if factor > 1 else "not binned"
-    limit = f"at most {AUTO_PIXELS / 1e6:g} megapixel"
-    why = f" (automatic: {limit}; --bin 1 for all)" if is_automatic else ""
-    return f"{window}, {binned}{why}: {result.shape[0]} x {result.shape[1]}"
-
-
-def _source(file: ImageFile) -> dict[str, Any]:
-    digest = hashlib.sha256(np.ascontiguousarray(file.pixels).data).hexdigest()
-    return {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
-
-
-def _dark_record(dark: Dark) -> dict[str, Any]:
-    values = {
-        name: float(np.mean(value))
-        for name, value in (("image_counts", dark.image), ("psf_counts", dark.psf))
-    }
-    return {**values, "from": dark.reason}
-
-
-def _crop_record(crop: Crop | None, image: ImageFile) -> dict[str, int] | None:
-    if crop is None:
-        return None
-    height, width = image.pixels.shape[:2]
-    return _slices_record(crop.slices((height, width)))
-
-
-def _slices_record(slices: tuple[slice, slice]) -> dict[str, int]:
-    rows, columns = slices
-    return {
-        "top": rows.start,
-        "left": columns.start,
-        "height": rows.stop - rows.start,
-        "width": columns.stop - columns.start,
-    }

@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from instrument.erasures import Choice as ErasuresChoice
 from instrument.errors import BenchError
+from instrument.mosaic import MosaicChoice
 from instrument.preparation import Crop
 from instrument.reconstruction_job import (
     Binning,
     DarkChoice,
     Job,
-    MosaicChoice,
     NoiseChoice,
     job_from_calibration,
     job_from_files,

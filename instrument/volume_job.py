@@ -9,8 +9,9 @@ import numpy as np
 from instrument.calibration_file import is_calibration
 from instrument.erasures import Choice
 from instrument.images import read_stack
+from instrument.mosaic import MosaicChoice
 from instrument.preparation import Crop, darkest_block
-from instrument.reconstruction_job import DarkChoice, Job, MosaicChoice, job_from_calibration, job_with
+from instrument.reconstruction_job import DarkChoice, Job, job_from_calibration, job_with
 from instrument.store.layout import STATE
 from recon.types import Calibration
 

@@ -7,7 +7,8 @@ from instrument.bench import open_bench
 from instrument.cli import main
 from instrument.config_file import load_config
 from instrument.images import ImageFile, read_image, write_image
-from instrument.reconstruction_job import Job, noise_of
+from instrument.reconstruction_job import Job
+from instrument.reconstruction_record import noise_of
 from instrument.reconstruction_words import parse_noise
 from recon import Calibration, NoiseModel
 
