@@ -27,6 +27,7 @@ from gui.panels import PANELS, PanelEntry
 from gui.session import BenchSession, OperatorRequest
 from gui.theme import THEMES, apply_theme
 from gui.widgets.device_chips import DeviceChips
+from gui.widgets.number_edit import NumberEdit
 from gui.widgets.panel_place import PanelPlace
 from gui.widgets.question import Question
 
@@ -224,8 +225,11 @@ class MainWindow(QMainWindow):
         bench.addAction(leave)
 
     def _on_live_panel(self, what: str) -> None:
-        """Do what the live view offers, whatever panel is in front."""
-        getattr(self.panel("live"), what)()
+        """Do what the live view offers, whatever panel is in front, with what is being typed there."""
+        panel, typed = self.panel("live"), QApplication.focusWidget()
+        if isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
+            return  # refused where it stands
+        getattr(panel, what)()
 
     def _panel_action(self, name: str, entry: PanelEntry) -> QAction:
         action = QAction(entry.title, self)

@@ -23,6 +23,7 @@ from drivers.errors import (
     LimitError,
     StoppedError,
 )
+from drivers.frame import Frame
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
@@ -266,7 +267,13 @@ class BenchSession(QObject):
 
         def alone(context: JobContext) -> Any:
             self.live.stop()
-            with self.live.watching(lambda: self.bench.newest_frame):
+            before = self.bench.newest_frame  # of an earlier job, and not to be taken for a new one
+
+            def newest() -> Frame | None:
+                frame = self.bench.newest_frame
+                return None if frame is before else frame
+
+            with self.live.watching(newest):
                 return work(context)
 
         return self.jobs.exclusive(title, alone)

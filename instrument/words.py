@@ -5,8 +5,8 @@ from __future__ import annotations
 
 def size(n_bytes: float) -> str:
     """Return a number of bytes for people."""
-    for unit in ("bytes", "kB", "MB", "GB"):
-        if n_bytes < 1000 or unit == "GB":
+    for unit in ("bytes", "kB", "MB", "GB", "TB"):
+        if n_bytes < 1000 or unit == "TB":
             return f"{n_bytes:.0f} {unit}" if unit == "bytes" else f"{n_bytes:.3g} {unit}"
         n_bytes /= 1000
     raise AssertionError

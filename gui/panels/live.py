@@ -13,13 +13,14 @@ from PySide6.QtWidgets import (
     QHBoxLayout,
     QLabel,
     QPushButton,
+    QSizePolicy,
     QSplitter,
     QVBoxLayout,
     QWidget,
 )
 
 from drivers.frame import Frame
-from gui.jobs import BusyError, JobContext
+from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.panels.camera_form import CameraForm
 from gui.panels.live_overlays import CrossHair, ProfileLine, RegionBox
@@ -31,6 +32,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import curve_pen, plot_widget
 from instrument.frame_view import histogram, line_profile, percentiles, sensor_roi
+from instrument.live_camera import LiveCameraStatus
 from instrument.snapshot import Light, check_target, led_pattern, light_of, photograph_name, write_snapshot
 
 FRAME_MS = 32
@@ -63,6 +65,9 @@ class LivePanel(Panel):
         self.status = QLabel("Waiting for the first frame …")
         self.status.setObjectName("dim")
         self.status.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        # A line of figures that grows must not push the picture about.
+        self.status.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        self.status.setWordWrap(True)
         self.under_mouse = QLabel()
         self.view.hovered.connect(self.under_mouse.setText)
         self._levels = (0.0, 1.0)
@@ -102,6 +107,7 @@ class LivePanel(Panel):
         )
         self.average = NumberEdit("frames", 1, minimum=1, integer=True, tip="Frames averaged in a photograph")
         self.average.setFixedWidth(90)
+        self.average.refused.connect(lambda why: self.refused(None, why))
         self.colour_map = QComboBox()
         self.colour_map.addItems(NAMES)
         self.colour_map.setCurrentText(self.view.colour_map)
@@ -132,7 +138,9 @@ class LivePanel(Panel):
             light.addWidget(button)
         self.cross_button = _toggle("✛", "Cross-hair: a click moves it", self.cross_hair.set_enabled)
         self.profile_button = _toggle("Profile", "Counts along a line; drag its ends", self._toggle_profile)
-        self.region_button = _toggle("Region", "Drag a region of interest", self._toggle_region)
+        self.region_button = _toggle(
+            "Region", "Drag a region of interest on the picture", self._toggle_region
+        )
         self.apply_region = QPushButton("Send")
         self.apply_region.setToolTip("Send the region to the camera")
         self.apply_region.clicked.connect(self.send_region)
@@ -186,8 +194,7 @@ class LivePanel(Panel):
         left.addWidget(self.view, 1)
         left.addWidget(self.profile_plot)
         line = QHBoxLayout()
-        line.addWidget(self.status)
-        line.addStretch(1)
+        line.addWidget(self.status, 1)
         line.addWidget(self.under_mouse)
         left.addLayout(line)
         split = QSplitter(Qt.Orientation.Horizontal)
@@ -274,6 +281,7 @@ class LivePanel(Panel):
     def _draw(self, frame: Frame) -> None:
         low, high = self._levels
         self.view.show_image(frame.image, low, high, frame.full_scale)
+        self.under_mouse.setText(self.view.under_mouse())
 
     @property
     def screen_rate(self) -> float:
@@ -331,7 +339,7 @@ class LivePanel(Panel):
         words = [
             f"{width} × {height}, {frame.metadata.significant_bits} bit",
             f"screen {self.screen_rate:.1f}/s",
-            f"camera {now.frames_per_s:.1f}/s" if now.running else "camera used by a run or held",
+            self._camera_words(now),
             f"dropped {now.dropped}",
             f"saturated {frame.metadata.saturated_fraction:.3%}",
         ]
@@ -343,6 +351,12 @@ class LivePanel(Panel):
             if row < height and column < width:
                 words.append(f"✛ {self.view.describe(column, row)}")
         return "   ".join(words)
+
+    def _camera_words(self, now: LiveCameraStatus) -> str:
+        if now.running:
+            return f"camera {now.frames_per_s:.1f}/s"
+        user = next((job.title for job in self.session.jobs.jobs if _holds_camera(job)), "")
+        return f"camera used by: {user}" if user else "held"
 
     def _levels_by_hand(self, low: float, high: float) -> None:
         self._levels = (low, high)
@@ -364,6 +378,9 @@ class LivePanel(Panel):
 
     def snap(self) -> None:
         """Take a photograph into the runs' folder."""
+        if not self.average.submit():
+            self.average.setFocus()
+            return
         bench, average = self.session.bench, int(self.average.value or 1)
         target = self.session.runs_folder / "photographs" / photograph_name()
 
@@ -445,6 +462,10 @@ class LivePanel(Panel):
         else:
             state = self.session.state("camera")
             self.status.setText(" ".join(state.text.split()) or f"The camera is {state.condition}.")
+
+
+def _holds_camera(job: Job) -> bool:
+    return not job.quiet and (job.exclusive or "camera" in job.lanes)
 
 
 def _toggle(text: str, tip: str, switched: object) -> QPushButton:

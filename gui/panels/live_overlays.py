@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pyqtgraph as pg
-from PySide6.QtCore import QObject, Signal
+from PySide6.QtCore import QObject, QPointF, Signal
 
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
@@ -81,7 +81,7 @@ class ProfileLine:
 
 
 class RegionBox:
-    """A rectangle dragged with the mouse; ``rectangle`` in pixels of the frame."""
+    """A rectangle dragged with the mouse: anew on the frame, or by its handles; ``rectangle`` in pixels."""
 
     def __init__(self, view: ImageView) -> None:
         self._view = view
@@ -99,9 +99,22 @@ class RegionBox:
             )
             self.item.addScaleHandle([0, 0], [1, 1])
             self._view.box.addItem(self.item)
+            self._view.drag_taker = self.draw
         elif not enabled and self.item is not None:
             self._view.box.removeItem(self.item)
+            self._view.drag_taker = None
             self.item = None
+
+    def draw(self, start: QPointF, now: QPointF) -> None:
+        """Make it the rectangle between two places of the frame, in pixels, cut off at the frame's edges."""
+        if self.item is None or self._view.image is None:
+            return
+        height, width = self._view.image.shape[:2]
+        left, right = sorted(min(max(place.x(), 0.0), width) for place in (start, now))
+        top, bottom = sorted(min(max(place.y(), 0.0), height) for place in (start, now))
+        if right - left >= 1 and bottom - top >= 1:
+            self.item.setPos((left, top))
+            self.item.setSize((right - left, bottom - top))
 
     @property
     def rectangle(self) -> tuple[float, float, float, float] | None:

@@ -16,6 +16,7 @@ from instrument.recorder import Recorder, RecordingStatus
 from instrument.recording import prepare_recording
 from instrument.snapshot import Lit
 from instrument.store import Run
+from instrument.words import size
 
 _DISK_MS = 5000
 
@@ -75,6 +76,9 @@ class RecordBar(QWidget):
         if not self._session.is_open("camera"):
             self._panel.refused(self.button, "The camera is not connected.")
             return
+        if not self.seconds.submit():
+            self.seconds.setFocus()
+            return
         session = self._session
         seconds, label = self.seconds.value, self.label.text().strip() or "recording"
 
@@ -133,10 +137,18 @@ class RecordBar(QWidget):
             folder = folder.parent
         import shutil
 
-        usage = shutil.disk_usage(folder)
         self.gauge.setRange(0, 1000)
-        self.gauge.setValue(round(1000 * (1 - usage.free / usage.total)))
-        self.gauge.setFormat(f"{free_bytes(folder) / 1e9:.1f} GB free")
+        try:
+            usage, free = shutil.disk_usage(folder), free_bytes(folder)
+        except OSError as error:  # a drive that was taken away, a server that does not answer
+            self.gauge.setValue(0)
+            self.gauge.setFormat("disk not known")
+            self.gauge.setToolTip(f"{folder}: {error.strerror or error}")
+            return
+        # Some file systems of servers and user space tell no size.
+        self.gauge.setValue(round(1000 * (1 - usage.free / usage.total)) if usage.total else 0)
+        self.gauge.setFormat(f"{size(free)} free" if usage.total else "disk not known")
+        self.gauge.setToolTip(f"How full the disk is that holds {self._session.runs_folder}")
 
 
 def _duration(seconds: float) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, QRectF, Signal
+from PySide6.QtCore import QPointF, QRectF, Qt, Signal
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from gui.theme import colours
@@ -51,9 +52,15 @@ class ImageView(QWidget):
         self.graphics.setCentralItem(self.box)
         self.item: Any = pg.ImageItem()
         self.box.addItem(self.item)
+        self.drag_taker: Callable[[QPointF, QPointF], object] | None = None
+        """Called instead of panning while the left button drags: start and present place, in pixels."""
+        self._pan = self.box.mouseDragEvent
+        self.box.mouseDragEvent = self._dragged
         self.image: Image | None = None
         self._colour_map = colour_map or colours().colour_map
         self._placed: tuple[Any, ...] = ()
+        self._mouse: QPointF | None = None
+        """The last place of the mouse in the scene."""
         self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
@@ -159,9 +166,25 @@ class ImageView(QWidget):
         words = " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
         return f"x {column}  y {row}  value {words}"
 
+    def under_mouse(self) -> str:
+        """Return place and value under the mouse in words, as they are now; empty outside."""
+        if self._mouse is None or not self.graphics.underMouse():
+            return ""
+        pixel = self.pixel_at(self._mouse)
+        return "" if pixel is None else self.describe(*pixel)
+
     def _moved(self, place: QPointF) -> None:
+        self._mouse = place
         pixel = self.pixel_at(place)
         self.hovered.emit("" if pixel is None else self.describe(*pixel))
+
+    def _dragged(self, event: Any, axis: int | None = None) -> None:
+        if self.drag_taker is None or event.button() != Qt.MouseButton.LeftButton:
+            self._pan(event, axis=axis)
+            return
+        event.accept()
+        start, now = event.buttonDownScenePos(), event.scenePos()
+        self.drag_taker(self.box.mapSceneToView(start), self.box.mapSceneToView(now))
 
     def _mouse_clicked(self, event: Any) -> None:
         pixel = self.pixel_at(event.scenePos())

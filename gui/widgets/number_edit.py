@@ -95,20 +95,24 @@ class NumberEdit(QLineEdit):
         self._mark(why)
         self.refused.emit(why)
 
-    def submit(self) -> None:
-        """Take what was typed, or refuse it."""
+    def submit(self) -> bool:
+        """Take what was typed, or refuse it; returns whether the field holds a number that is in force.
+
+        To be called before what the number is for, too: not every key or click leaves the field.
+        """
         if not self.isModified():
-            return
+            return not self.property("refused")
         number, problem = self._read()
         if problem:
             self._mark(problem)
             self.refused.emit(problem)
-            return
+            return False
         changed = number != self._value
         self._value = number
         self._show()
         if changed and number is not None:
             self.submitted.emit(number)
+        return True
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
         """Step by Up and Down; give up what was typed by Ctrl+Z at its end as any field does."""

@@ -1,0 +1,151 @@
+"""What an operator's hands do to the live view: entries that were not submitted, drags, strange disks."""
+
+from __future__ import annotations
+
+import shutil
+from collections import namedtuple
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QSplitter
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.live import LivePanel
+from instrument.store import Run
+
+WAIT_MS = 20_000
+CTRL = Qt.KeyboardModifier.ControlModifier
+LEFT = Qt.MouseButton.LeftButton
+
+
+@pytest.fixture
+def live(qtbot: QtBot, window: MainWindow) -> LivePanel:
+    panel = window.show_panel("live")
+    assert isinstance(panel, LivePanel)
+    qtbot.waitUntil(lambda: panel._shown is not None and panel.form.state is not None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not window.session.jobs.jobs, timeout=WAIT_MS)
+    window.activateWindow()
+    return panel
+
+
+def _type_only(qtbot: QtBot, field: Any, text: str) -> None:
+    """Type without Enter, the keyboard left in the field."""
+    field.setFocus()
+    field.selectAll()
+    qtbot.keyClicks(field, text)
+
+
+def test_a_recording_takes_the_length_that_is_still_being_typed(qtbot: QtBot, live: LivePanel) -> None:
+    finished: list[Path] = []
+    live.session.run_finished.connect(finished.append)
+    _type_only(qtbot, live.record_bar.seconds, "0.2")
+    qtbot.keyClick(live.record_bar.seconds, Qt.Key.Key_R, CTRL)
+    qtbot.waitUntil(lambda: bool(finished), timeout=WAIT_MS)
+    assert live.record_bar.seconds.value == 0.2
+    run = Run.open(finished[0])
+    first, last = run.metadata(min(run.records)), run.metadata(max(run.records))
+    seconds = (last.device_time_ns - first.device_time_ns) / 1e9
+    assert seconds < 2, "the ten seconds of before"
+
+
+@pytest.mark.parametrize("by_mouse", [False, True])
+def test_a_wrong_length_is_refused_and_nothing_is_recorded(
+    qtbot: QtBot, live: LivePanel, by_mouse: bool
+) -> None:
+    _type_only(qtbot, live.record_bar.seconds, "-1")
+    if by_mouse:
+        qtbot.mouseClick(live.record_bar.button, LEFT)
+    else:
+        qtbot.keyClick(live.record_bar.seconds, Qt.Key.Key_R, CTRL)
+    assert live.record_bar.job is None
+    assert live.record_bar.seconds.property("refused")
+    assert "-1" in live._note.text()
+    qtbot.mouseClick(live.record_bar.button, LEFT)  # again: it is still wrong
+    assert live.record_bar.job is None
+
+
+def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: QtBot, live: LivePanel) -> None:
+    _type_only(qtbot, live.form.exposure, "7.5")
+    qtbot.keyClick(live.form.exposure, Qt.Key.Key_K, CTRL)
+    qtbot.waitUntil(lambda: live.photograph is not None, timeout=WAIT_MS)
+    assert live.session.bench.newest_frame is not None
+    assert live.session.bench.newest_frame.metadata.exposure_ms == 7.5
+    _type_only(qtbot, live.average, "0")
+    live.photograph = None
+    qtbot.keyClick(live.average, Qt.Key.Key_K, CTRL)
+    qtbot.mouseClick(live.snap_button, LEFT)
+    assert live.average.property("refused")
+    assert not live.session.jobs.is_busy("camera")
+    assert live.photograph is None
+
+
+def test_a_region_is_drawn_with_the_mouse(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
+    qtbot.mouseClick(live.region_button, LEFT)
+    before = live.view.box.viewRange()
+    graphics = live.view.graphics
+
+    def at(column: float, row: float) -> QPoint:
+        place = graphics.mapFromScene(live.view.box.mapViewToScene(QPointF(column, row)))
+        return graphics.viewport().mapTo(window, place)
+
+    handle = window.windowHandle()
+    start, end = (20.0, 30.0), (60.0, 50.0)  # begins outside of the box in the middle
+    QTest.mousePress(handle, LEFT, Qt.KeyboardModifier.NoModifier, at(*start))
+    for share in (0.3, 0.7, 1.0):
+        QTest.mouseMove(handle, at(*(a + share * (b - a) for a, b in zip(start, end, strict=True))))
+        qtbot.wait(30)
+    QTest.mouseRelease(handle, LEFT, Qt.KeyboardModifier.NoModifier, at(*end))
+    assert live.view.box.viewRange() == before, "the picture was moved instead"
+    rectangle = live.region_box.rectangle
+    assert rectangle is not None
+    assert rectangle == pytest.approx((20, 30, 40, 20), abs=1.0)
+    qtbot.mouseClick(live.region_button, LEFT)
+    assert live.view.drag_taker is None
+
+
+def test_a_long_line_of_figures_does_not_move_the_picture(qtbot: QtBot, live: LivePanel) -> None:
+    (split,) = live.body.findChildren(QSplitter)
+    before = split.sizes()
+    live.status.setText("figures " * 60)
+    qtbot.wait(50)
+    assert split.sizes() == before
+    assert live.minimumSizeHint().width() < 700
+
+
+def test_what_is_under_the_mouse_is_of_the_frame_that_is_shown(qtbot: QtBot, live: LivePanel) -> None:
+    live.under_mouse.setText("x 319  y 239  value 4095")  # the mouse has gone since
+    shown = live._shown
+    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    assert live.under_mouse.text() == ""
+
+
+def test_a_recording_does_not_begin_with_the_photograph_of_before(qtbot: QtBot, live: LivePanel) -> None:
+    qtbot.mouseClick(live.snap_button, LEFT)
+    qtbot.waitUntil(lambda: live.photograph is not None, timeout=WAIT_MS)
+    photograph = live.session.bench.newest_frame
+    assert photograph is not None
+    seen: list[object] = []
+    live.session.exclusive_job("a run", lambda _: seen.append(live.session.live.newest()))
+    qtbot.waitUntil(lambda: bool(seen), timeout=WAIT_MS)
+    assert seen == [None]
+
+
+_Usage = namedtuple("_Usage", "total used free")
+
+
+@pytest.mark.parametrize("answer", [_Usage(0, 0, 0), OSError(5, "Input/output error")])
+def test_a_disk_that_tells_no_size_takes_nothing_but_the_gauge(
+    live: LivePanel, monkeypatch: pytest.MonkeyPatch, answer: Any
+) -> None:
+    def usage(_: Path) -> _Usage:
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    live.record_bar._look_at_disk()
+    assert live.record_bar.gauge.format() == "disk not known"
