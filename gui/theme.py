@@ -116,7 +116,9 @@ QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; 
 QLineEdit, QPlainTextEdit, QTextEdit, QSpinBox, QDoubleSpinBox, QListView, QTreeView, QTableView {{
   background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; padding: 3px 5px;
   selection-background-color: {c.accent}; selection-color: {c.window}; }}
-QLineEdit:focus, QPlainTextEdit:focus, QListView:focus {{ border-color: {c.accent}; }}
+QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus {{ border-color: {c.accent}; }}
+QGraphicsView {{ border: 1px solid transparent; }}
+QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
 *[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
 QLabel#reason {{ color: {c.error}; font-size: 9pt; }}

@@ -22,6 +22,8 @@ from drivers.simulated.world import Rgb
 from recon.optics.sensor import FixedPattern, Readout, expose
 
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+_MOST_LATE_FRAMES = 4
+"""So many frames a camera holds back for a host that does not fetch them; what is later than that is lost."""
 
 
 class SimulatedCamera(SimulatedCameraSettings):
@@ -159,8 +161,9 @@ class SimulatedCamera(SimulatedCameraSettings):
                     self._ring.append(frame)
                     self._arrived.notify_all()
                 rate = self.options.frames_per_s or self._spec.frames_per_s
-                period = max(1 / rate, self._exposure_ms * 1e-3)
-                due = max(due + period * self.world.clock.time_scale, time.monotonic())
+                period = max(1 / rate, self._exposure_ms * 1e-3) * self.world.clock.time_scale
+                # A camera's clock does not wait for a busy host: what was late is made up for, up to a point.
+                due = max(due + period, time.monotonic() - _MOST_LATE_FRAMES * period)
                 self._abort.wait(due - time.monotonic())
         except StoppedError:
             return

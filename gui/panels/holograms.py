@@ -126,6 +126,10 @@ class HologramsPanel(Panel):
         self.progress.setRange(0, 1000)
         self.progress.setTextVisible(False)
         self.target = WeightsView()
+        self.target.graphics.setToolTip(
+            "A fovea is dragged, or moved by arrow keys (Alt with Up and Down: its radius). Painting: left "
+            "button or Space paints, right button or Backspace rubs out, arrow keys move the brush"
+        )
         self.seen, self.phase, self.captured = ImageView(), ImageView(), ImageView()
         self.metrics = FactsView()
         self.plot = plot_widget("iteration", "PSNR", y_unit="dB")
@@ -223,7 +227,7 @@ class HologramsPanel(Panel):
         self.srgb.toggled.connect(lambda _: self._picture_changed())
         self.weights_mode.currentTextChanged.connect(lambda _: self._show_mode())
         self.periphery.understood.connect(lambda: self.target.set_periphery(self.periphery.value()))
-        self.brush.understood.connect(lambda: setattr(self.target, "brush_radius", self.brush.value()))
+        self.brush.understood.connect(lambda: self.target.set_brush_radius(self.brush.value()))
         self.clear.clicked.connect(self.target.clear_strokes)
         self.preview_button.clicked.connect(lambda: self.compute(preview=True))
         self.compute_button.clicked.connect(lambda: self.compute())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pyqtgraph as pg
@@ -43,6 +44,17 @@ class CrossHair(QObject):
             height, width = self._view.image.shape[:2]
             self.move_to(width // 2, height // 2)
 
+    def step(self, across: float, down: float) -> None:
+        """Move it by so many pixels, at least one, and not out of the image."""
+        if self.pixel is None or self._view.image is None:
+            return
+        height, width = self._view.image.shape[:2]
+        column, row = (
+            place + (int(math.copysign(max(1, round(abs(by))), by)) if by else 0)
+            for place, by in zip(self.pixel, (across, down), strict=True)
+        )
+        self.move_to(min(max(column, 0), width - 1), min(max(row, 0), height - 1))
+
     def move_to(self, column: int, row: int) -> None:
         """Move it to a pixel."""
         if self.enabled:
@@ -50,6 +62,11 @@ class CrossHair(QObject):
             self._lines[0].setValue(column + 0.5)
             self._lines[1].setValue(row + 0.5)
             self.moved.emit(column, row)
+
+
+_STEP_PX = 10.0
+"""A step of the arrow keys for lines and regions; Ctrl makes it a pixel. The cross-hair goes by pixels."""
+_LEAST_PX = 2.0
 
 
 class ProfileLine:
@@ -69,6 +86,19 @@ class ProfileLine:
         elif not enabled and self.item is not None:
             self._view.box.removeItem(self.item)
             self.item = None
+
+    def step(self, across: float, down: float, *, end_only: bool) -> None:
+        """Move the line by steps of the arrow keys, or only its second end."""
+        if self.item is None:
+            return
+        ends = [
+            self.item.mapToParent(self.item.mapFromItem(handle["item"], 0, 0)) for handle in self.item.handles
+        ]
+        for end in ends[1:] if end_only else ends:
+            end.setX(end.x() + _STEP_PX * across)
+            end.setY(end.y() + _STEP_PX * down)
+        for handle, end in zip(self.item.handles, ends, strict=True):
+            self.item.movePoint(handle["item"], end)
 
     @property
     def ends(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -115,6 +145,17 @@ class RegionBox:
         if right - left >= 1 and bottom - top >= 1:
             self.item.setPos((left, top))
             self.item.setSize((right - left, bottom - top))
+
+    def step(self, across: float, down: float, *, size_only: bool) -> None:
+        """Move the rectangle by steps of the arrow keys, or its lower right corner."""
+        if self.item is None:
+            return
+        dx, dy = _STEP_PX * across, _STEP_PX * down
+        if size_only:
+            width, height = self.item.size()
+            self.item.setSize((max(_LEAST_PX, width + dx), max(_LEAST_PX, height + dy)))
+        else:
+            self.item.setPos(self.item.pos() + pg.Point(dx, dy))
 
     @property
     def rectangle(self) -> tuple[float, float, float, float] | None:

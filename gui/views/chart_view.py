@@ -57,7 +57,7 @@ class ChartView(QWidget):
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
         self.table.setToolTip("Settings by their best score; one that is chosen is drawn bold")
-        self.table.itemSelectionChanged.connect(self._draw_curves)
+        self.table.itemSelectionChanged.connect(self._setting_chosen)
         self.place = QLabel("The bold line is the front: no setting is both quicker and better.")
         self.place.setProperty("role", "dim")
         self.place.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
@@ -128,6 +128,16 @@ class ChartView(QWidget):
         self.table.blockSignals(False)
         self.plot.setLabel("left", words)
         self._draw_curves()
+
+    def _setting_chosen(self) -> None:
+        """Draw the chosen setting bold, and tell of its best point."""
+        self._draw_curves()
+        chosen = self.table.selectedItems()
+        if chosen:
+            name = chosen[0].data(Qt.ItemDataRole.UserRole)
+            mine = [p for p in self._known() if p["setting"] == name]
+            key, more = self.key, MEASURES[self.key][1]
+            self.place.setText(describe((max if more else min)(mine, key=lambda p: p[key])))
 
     def _draw_curves(self) -> None:
         self.plot.clear()

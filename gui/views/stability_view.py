@@ -12,6 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from gui.theme import colours
+from gui.widgets.arrow_keys import ArrowKeys
 from gui.widgets.plot import curve_pen, plot_widget, restyle
 from recon.stability.failure import Failure
 
@@ -37,7 +38,8 @@ class StabilityView(QWidget):
         self.question.setWordWrap(True)
         self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.place = QLabel(
-            "Green works, red fails, dark is the boundary; numbers are errors. Point at a cell for more."
+            "Green works, red fails, dark is the boundary; numbers are errors. Point at a cell, "
+            "or go there by arrow keys, for more."
         )
         self.place.setProperty("role", "dim")
         self.place.setWordWrap(True)
@@ -47,6 +49,15 @@ class StabilityView(QWidget):
         self.plot.setMouseEnabled(x=False, y=False)
         self.image: Any = pg.ImageItem()
         self.plot.scene().sigMouseMoved.connect(self._moved)
+        self.cell = (0, 0)
+        """Column and row of the cell that was told of last, from the lower left."""
+        self.keys = ArrowKeys(self.plot)
+        self.keys.entered.connect(lambda: self._step(0, 0))
+        self.keys.moved.connect(self._step)
+        self._cursor: Any = pg.QtWidgets.QGraphicsRectItem()
+        self._cursor.setZValue(3)
+        self._cursor.hide()
+        self.keys.left.connect(self._cursor.hide)
         self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
         row = QHBoxLayout()
         row.addWidget(self.map, 2)
@@ -102,6 +113,8 @@ class StabilityView(QWidget):
         self.image.setImage(_coloured(level), levels=(0, 255))
         self.image.setRect(-0.5, -0.5, severity.shape[1], severity.shape[0])
         self.plot.addItem(self.image)
+        self._cursor.setPen(pg.mkPen(colours().text, width=2))
+        self.plot.addItem(self._cursor, ignoreBounds=True)
         self._write_errors(_grid(method["error"]))
         for number, (other, found) in enumerate(record["methods"].items()):
             self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
@@ -149,6 +162,19 @@ class StabilityView(QWidget):
     def _moved(self, place: Any) -> None:
         point = self.plot.getPlotItem().vb.mapSceneToView(place)
         self.place.setText(self.describe(round(point.x()), round(point.y())))
+
+    def _step(self, across: float, down: float) -> None:
+        """Tell of the next cell in the direction of an arrow key."""
+        record = self.record
+        if record is None:
+            return
+        steps = [0 if not by else (1 if by > 0 else -1) for by in (across, -down)]
+        sizes = len(record["x"]["values"]), len(record["y"]["values"])
+        ix, iy = (min(max(c + s, 0), n - 1) for c, s, n in zip(self.cell, steps, sizes, strict=True))
+        self.cell = ix, iy
+        self._cursor.setRect(ix - 0.5, iy - 0.5, 1, 1)
+        self._cursor.show()
+        self.place.setText(self.describe(ix, iy))
 
     def describe(self, ix: int, iy: int) -> str:
         """Return a cell in words; empty outside of the map."""

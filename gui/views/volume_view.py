@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -84,6 +86,9 @@ class VolumeView(QWidget):
         self.front.clicked.connect(lambda column, row: self.go_to(self.point[0], row, column))
         self.side.clicked.connect(lambda column, row: self.go_to(column, row, self.point[2]))
         self.top.clicked.connect(lambda column, row: self.go_to(row, self.point[1], column))
+        self._step_by_keys(self.front, lambda across, down: (0, down, across))
+        self._step_by_keys(self.side, lambda across, down: (across, down, 0))
+        self._step_by_keys(self.top, lambda across, down: (down, 0, across))
         for view in (self.front, self.side, self.top, self.coloured):
             view.setMinimumSize(70, 50)
             view.hovered.connect(self.hovered)
@@ -93,7 +98,9 @@ class VolumeView(QWidget):
         self.brightest_button.setToolTip("The brightest voxels along each axis (Ctrl+B)")
         self.brightest_button.setShortcut("Ctrl+B")
         self.slices_button = QPushButton("Slices")
-        self.slices_button.setToolTip("Slices through one point; click into a view to move it (Ctrl+J)")
+        self.slices_button.setToolTip(
+            "Slices through one point: a click or arrows in a view move it (Ctrl+J)"
+        )
         self.slices_button.setShortcut("Ctrl+J")
         group = QButtonGroup(self)
         for button in (self.brightest_button, self.slices_button):
@@ -203,6 +210,8 @@ class VolumeView(QWidget):
         self.mode = mode
         (self.brightest_button if mode == "brightest" else self.slices_button).setChecked(True)
         slices = mode == "slices"
+        for view in (self.front, self.side, self.top):
+            view.arrows_pan = not slices
         self.slider.setVisible(slices)
         self.plane_label.setVisible(slices)
         self.profile.setVisible(slices)
@@ -230,6 +239,16 @@ class VolumeView(QWidget):
         self._place_lines()
         if self.mode == "slices":
             self._show_profile()
+
+    def _step_by_keys(self, view: StretchedImage, step: Callable[[int, int], tuple[int, int, int]]) -> None:
+        """Let the arrow keys in a view move the point by voxels; among projections they pan."""
+
+        def moved(across: float, down: float) -> None:
+            if self.mode == "slices":
+                plane, row, column = step(_voxels(across), _voxels(down))
+                self.go_to(self.point[0] + plane, self.point[1] + row, self.point[2] + column)
+
+        view.keys.moved.connect(moved)
 
     @property
     def images(self) -> dict[str, Plane]:
@@ -360,6 +379,11 @@ class VolumeView(QWidget):
 
     def _depth_words(self, plane: int) -> str:
         return "" if self._planes is None else f", {self._planes[0][plane] / 1000:.4g} mm"
+
+
+def _voxels(steps: float) -> int:
+    """Return whole voxels for a step by keys: at least one."""
+    return int(math.copysign(max(1, round(abs(steps))), steps)) if steps else 0
 
 
 def _line(view: StretchedImage, angle: int) -> Any:

@@ -1,4 +1,7 @@
-"""The target of a hologram with what counts in it: a fovea to be dragged, or weights painted on it."""
+"""The target of a hologram with what counts in it: a fovea to be dragged, or weights painted on it.
+
+Arrow keys do both as well: they move the fovea (Alt with Up and Down: its radius), or a brush for Space.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,9 @@ WEIGHTS_SHAPE = (256, 256)
 _STEP = 0.3
 """A stroke is a row of discs this part of their radius apart."""
 _DIGITS = 3
+_KEY_STEP = 0.02
+"""Of the arrow keys, a fraction of the field; Shift and Ctrl as everywhere."""
+_RADII = (0.02, 1.0)
 
 
 class WeightsView(StretchedImage):
@@ -53,11 +59,26 @@ class WeightsView(StretchedImage):
         self.fovea.hide()
         self._painting = False
         self.graphics.viewport().installEventFilter(self)
+        self.brush_at = (0.5, 0.5)
+        """Where the keyboard's brush is, (y, x) in fractions of the field."""
+        self._brush: Any = pg.QtWidgets.QGraphicsEllipseItem()
+        self._brush.setPen(pg.mkPen(colours().accent, width=2))
+        self._brush.setZValue(3)
+        self._brush.hide()
+        self.box.addItem(self._brush)
+        self.arrows_pan = False
+        self.keys.moved.connect(self._by_keys)
+        self.keys.resized.connect(lambda _, down: self._resize(-down))
+        self.keys.acted.connect(self._act)
+        self.keys.entered.connect(self._place_brush)
+        self.keys.left.connect(self._brush.hide)
 
     # What counts ---------------------------------------------------------------------------------
     def set_mode(self, mode: WeightsMode) -> None:
         """Let everything count alike, a fovea more, or what was painted."""
         self.mode = mode
+        self.arrows_pan = mode == "uniform"
+        self._place_brush()
         self.fovea.setVisible(mode == "fovea")
         self.box.setMouseEnabled(x=mode != "painted", y=mode != "painted")
         self._show_shade()
@@ -79,6 +100,11 @@ class WeightsView(StretchedImage):
         size = self._size
         self.fovea.setPos(((centre[1] - radius) * size, (centre[0] - radius) * size), update=False)
         self.fovea.setSize((2 * radius * size, 2 * radius * size))
+
+    def set_brush_radius(self, radius: float) -> None:
+        """Set the brush's radius, a fraction of the field."""
+        self.brush_radius = radius
+        self._place_brush()
 
     def weights(self) -> npt.NDArray[np.float64] | None:
         """Return the weights over the field, or None where everything counts alike.
@@ -115,6 +141,7 @@ class WeightsView(StretchedImage):
         self._size = max(image.shape)
         self.show_over(image, (self._size, self._size), (0.0, 1.0))
         self.set_fovea(centre, radius)
+        self._place_brush()
         self._show_shade()
 
     def _show_shade(self) -> None:
@@ -136,6 +163,34 @@ class WeightsView(StretchedImage):
         if self.mode == "fovea":
             self._show_shade()
             self.changed.emit()
+
+    # Keys ----------------------------------------------------------------------------------------
+    def _by_keys(self, across: float, down: float) -> None:
+        """Move the fovea or the brush by steps of the arrow keys."""
+        by = _KEY_STEP * down, _KEY_STEP * across
+        if self.mode == "fovea":
+            self.set_fovea(_inside(self.centre, by), self.radius)
+        elif self.mode == "painted":
+            self.brush_at = _inside(self.brush_at, by)
+            self._place_brush()
+
+    def _resize(self, steps: float) -> None:
+        if self.mode == "fovea":
+            least, most = _RADII
+            self.set_fovea(self.centre, min(max(self.radius + _KEY_STEP * steps, least), most))
+
+    def _act(self, paint: bool) -> None:
+        """Paint where the brush is, or rub out."""
+        if self.mode == "painted" and self.image is not None:
+            self._erasing = not paint
+            y, x = self.brush_at
+            self._dab(QPointF(x * self._size, y * self._size))
+            self.changed.emit()
+
+    def _place_brush(self) -> None:
+        (y, x), r, size = self.brush_at, self.brush_radius, self._size
+        self._brush.setRect((x - r) * size, (y - r) * size, 2 * r * size, 2 * r * size)
+        self._brush.setVisible(self.mode == "painted" and self.graphics.hasFocus())
 
     # Painting ------------------------------------------------------------------------------------
     def eventFilter(self, watched: Any, event: Any) -> bool:  # noqa: N802 - Qt's name
@@ -169,3 +224,9 @@ class WeightsView(StretchedImage):
         if -self.brush_radius < y < 1 + self.brush_radius and -self.brush_radius < x < 1 + self.brush_radius:
             self.strokes.append(stroke)
             self._show_shade()
+
+
+def _inside(place: tuple[float, float], by: tuple[float, float]) -> tuple[float, float]:
+    """Return a place moved, but not out of the field."""
+    y, x = (round(min(max(p + d, 0.0), 1.0), _DIGITS) for p, d in zip(place, by, strict=True))
+    return y, x

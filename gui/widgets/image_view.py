@@ -1,4 +1,4 @@
-"""An image to look at: colour map, levels, zoom by wheel, pan by dragging, values under the mouse."""
+"""An image to look at: colour map, levels, zoom, pan, values under the mouse; by mouse and by keys."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from PySide6.QtCore import QPointF, QRectF, Qt, Signal
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from gui.theme import colours
+from gui.widgets.arrow_keys import ArrowKeys
 from gui.widgets.colour_maps import table
 from instrument.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 
 _SIGNAL = SATURATED - 1
+_PAN = 0.05
+"""An arrow key moves what is shown by this part of it, where arrows mean nothing else."""
 
 
 class ImageView(QWidget):
@@ -33,6 +36,13 @@ class ImageView(QWidget):
         Place and value under the mouse in words; empty outside.
     clicked : int, int
         Column and row of the pixel that was clicked.
+
+    Attributes
+    ----------
+    keys : ArrowKeys
+        While the view has the keyboard: ``+``, ``-`` and ``0`` zoom.
+    arrows_pan : bool
+        Whether arrow keys move what is shown; False where they mean something else.
 
     Parameters
     ----------
@@ -71,6 +81,11 @@ class ImageView(QWidget):
         scene.sigMouseMoved.connect(self._moved)
         scene.sigMouseClicked.connect(self._mouse_clicked)
         self.setMinimumSize(160, 120)
+        self.setFocusProxy(self.graphics)
+        self.keys = ArrowKeys(self.graphics)
+        self.arrows_pan = True
+        self.keys.zoomed.connect(self._zoom)
+        self.keys.moved.connect(self._pan)
 
     @property
     def colour_map(self) -> str:
@@ -148,6 +163,18 @@ class ImageView(QWidget):
         scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(_SIGNAL / span)
         np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
         self._indices[...] = scaled
+
+    # Keys ----------------------------------------------------------------------------------------
+    def _zoom(self, factor: float) -> None:
+        if factor == 0:
+            self.whole()
+        else:
+            self.box.scaleBy((1 / factor, 1 / factor))
+
+    def _pan(self, across: float, down: float) -> None:
+        if self.arrows_pan:
+            (left, right), (top, bottom) = self.box.viewRange()
+            self.box.translateBy((_PAN * across * (right - left), _PAN * down * (bottom - top)))
 
     # The mouse -----------------------------------------------------------------------------------
     def pixel_at(self, place: QPointF) -> tuple[int, int] | None:

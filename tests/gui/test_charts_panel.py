@@ -96,6 +96,21 @@ def test_boundaries_colours_and_words_are_those_of_the_file(
     assert len(np.unique(view.image.image.reshape(-1, 3), axis=0)) == 1
 
 
+def test_cells_by_arrow_keys(qtbot: QtBot, panel: ChartsPanel) -> None:
+    view = panel.stability
+    view.plot.setFocus()
+    assert view.cell == (0, 0)
+    assert view.place.text() == view.describe(0, 0)
+    qtbot.keyClick(view.plot, Qt.Key.Key_Right)
+    qtbot.keyClick(view.plot, Qt.Key.Key_Up)
+    qtbot.keyClick(view.plot, Qt.Key.Key_Up)
+    assert view.cell == (1, 2)
+    assert view.place.text() == view.describe(1, 2)
+    for _ in range(30):
+        qtbot.keyClick(view.plot, Qt.Key.Key_Left)
+    assert view.cell == (0, 2)
+
+
 def test_copied_lines_draw_the_map_and_a_wrong_file_is_told(
     qtbot: QtBot, panel: ChartsPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

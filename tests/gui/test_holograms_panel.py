@@ -195,6 +195,32 @@ def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:
     assert (target.weights() == 0.1).all()
 
 
+def test_fovea_and_brush_by_keys_alone(qtbot: QtBot, panel: HologramsPanel) -> None:
+    target = panel.target
+    picture = target.graphics
+    panel.weights_mode.setCurrentText("a fovea, dragged")
+    (y, x), radius = target.centre, target.radius
+    shift, alt = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.AltModifier
+    qtbot.keyClick(picture, Qt.Key.Key_Down)
+    qtbot.keyClick(picture, Qt.Key.Key_Left, shift)
+    qtbot.keyClick(picture, Qt.Key.Key_Up, alt)
+    assert target.centre == pytest.approx((y + 0.02, x - 0.2), abs=2e-3)
+    assert target.radius == pytest.approx(radius + 0.02, abs=2e-3)
+    panel.weights_mode.setCurrentText("painted")
+    picture.setFocus()
+    for _ in range(3):
+        qtbot.keyClick(picture, Qt.Key.Key_Right)
+    qtbot.keyClick(picture, Qt.Key.Key_Space)
+    assert target.strokes == [(0.5, 0.56, target.brush_radius, 1.0)]
+    weights = target.weights()
+    assert weights is not None
+    assert weights[128, 143] > 0.9
+    qtbot.keyClick(picture, Qt.Key.Key_Backspace)
+    rubbed = target.weights()
+    assert rubbed is not None
+    assert rubbed[128, 143] < 0.05
+
+
 @pytest.mark.parametrize("counts", ["all alike", "a fovea, dragged", "painted"])
 def test_the_copied_lines_make_the_same_pattern(
     qtbot: QtBot, panel: HologramsPanel, tmp_path: Path, counts: str

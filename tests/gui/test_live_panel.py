@@ -96,6 +96,53 @@ def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -
     assert live.session.is_open("camera")
 
 
+def test_a_region_a_line_and_the_cross_hair_by_keys_alone(qtbot: QtBot, live: LivePanel) -> None:
+    picture, box = live.view.graphics, live.region_box
+    alt, shift = Qt.KeyboardModifier.AltModifier, Qt.KeyboardModifier.ShiftModifier
+    qtbot.keyClick(live.region_button, Qt.Key.Key_Space)
+    assert picture.hasFocus()
+    before = box.rectangle
+    assert before is not None
+    qtbot.keyClick(picture, Qt.Key.Key_Left)
+    qtbot.keyClick(picture, Qt.Key.Key_Down)
+    qtbot.keyClick(picture, Qt.Key.Key_Right, alt)
+    left, top, width, height = before
+    assert box.rectangle == pytest.approx((left - 10, top + 10, width + 10, height))
+    qtbot.keyClick(picture, Qt.Key.Key_Return)
+    camera = live.session.bench.camera
+    qtbot.waitUntil(lambda: camera.roi.width < 320, timeout=WAIT_MS)
+    sent = (camera.roi.left, camera.roi.top, camera.roi.width, camera.roi.height)
+    assert sent == pytest.approx((left - 10, top + 10, width + 10, height), abs=8)  # the sensor's steps
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
+    qtbot.keyClick(live.profile_button, Qt.Key.Key_Space)
+    first = live.profile_line.ends
+    assert first is not None
+    qtbot.keyClick(picture, Qt.Key.Key_Down)
+    qtbot.keyClick(picture, Qt.Key.Key_Left, alt)
+    moved = live.profile_line.ends
+    assert moved is not None
+    assert np.subtract(moved, first) == pytest.approx(np.array([(0, 10), (-10, 10)]), abs=1e-6)
+    qtbot.keyClick(live.profile_button, Qt.Key.Key_Space)
+    qtbot.keyClick(live.cross_button, Qt.Key.Key_Space)
+    assert live.cross_hair.pixel is not None
+    column, row = live.cross_hair.pixel
+    qtbot.keyClick(picture, Qt.Key.Key_Up)
+    qtbot.keyClick(picture, Qt.Key.Key_Right, shift)
+    assert live.cross_hair.pixel == (column + 10, row - 1)
+
+
+def test_zoom_and_pan_by_keys(qtbot: QtBot, live: LivePanel) -> None:
+    picture, box = live.view.graphics, live.view.box
+    whole = box.viewRange()
+    qtbot.keyClick(picture, Qt.Key.Key_Plus)
+    zoomed = box.viewRange()
+    assert np.ptp(zoomed[0]) == pytest.approx(np.ptp(whole[0]) / 1.25)
+    qtbot.keyClick(picture, Qt.Key.Key_Right)
+    assert box.viewRange()[0][0] > zoomed[0][0]
+    qtbot.keyClick(picture, Qt.Key.Key_0)
+    np.testing.assert_allclose(box.viewRange(), whole)
+
+
 def test_a_photograph_by_its_key(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
     folder = live.session.runs_folder / "photographs"
     qtbot.keyClick(window, Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)

@@ -111,6 +111,11 @@ def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: Reconstructi
     for _ in range(int(brightest[0])):
         qtbot.keyClick(view.slider, Qt.Key.Key_Right)
     assert view.point == tuple(brightest)
+    qtbot.keyClick(view.front.graphics, Qt.Key.Key_Up)
+    qtbot.keyClick(view.side.graphics, Qt.Key.Key_Down)
+    qtbot.keyClick(view.front.graphics, Qt.Key.Key_Left)
+    qtbot.keyClick(view.top.graphics, Qt.Key.Key_Right)
+    assert view.point == tuple(brightest)
     qtbot.waitUntil(
         lambda: {a: s.index for a, s in view.slices.items()} == dict(zip("zyx", brightest, strict=True)),
         timeout=WAIT_MS,
