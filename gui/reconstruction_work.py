@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gui.jobs import JobCancelledError, JobContext
+from gui.python_lines import expression
+from instrument.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction_file import Outputs, write_reconstruction
 from instrument.reconstruction_job import Job as Prepared
 from instrument.reconstruction_request import PictureRequest, VolumeRequest
@@ -47,18 +49,42 @@ class SoFar:
     history: tuple[IterationRecord, ...] = ()
 
 
-def reconstruct_job(request: PictureRequest | VolumeRequest, outputs: Outputs, context: JobContext) -> Path:
-    """Do a reconstruction as the command line does; cancelled, what there is so far is written.
+@dataclass(frozen=True, slots=True)
+class ReconstructionWork:
+    """All that a reconstruction is asked for.
 
-    Returns
-    -------
-    Path
-        The image's or volume's file.
+    Attributes
+    ----------
+    request : PictureRequest or VolumeRequest
+    outputs : Outputs
+    kept_in : Path or None
+        The checkpoint's folder.
+    rotate_deg : int
+        A picture is turned by so much, counter-clockwise, when it is written.
     """
+
+    request: PictureRequest | VolumeRequest
+    outputs: Outputs
+    kept_in: Path | None = None
+    rotate_deg: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The file that was written, and what became of the checkpoint, by headings."""
+
+    path: Path
+    told: dict[str, str]
+
+
+def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
+    """Do a reconstruction as the command line does; cancelled, what there is so far is written."""
+    request, outputs = work.request, work.outputs
     outputs.check(0)
     prepared = request.prepare()
     n_planes = len(prepared.calibration.psfs) if isinstance(request, VolumeRequest) else 1
     outputs.check(n_planes * prepared.measurement.size)
+    keeper = checkpoint_for(work.kept_in, prepared, request)
     context.report(SoFar(0.0, "Solving …", prepared))
     history: list[IterationRecord] = []
     shown_s, cost_s = time.monotonic(), 0.0
@@ -81,7 +107,44 @@ def reconstruct_job(request: PictureRequest | VolumeRequest, outputs: Outputs, c
         cost_s = shown_s - now_s
 
     if isinstance(request, VolumeRequest):
-        write_volume(outputs, request.solve(prepared, watch=watch, cancel=context.cancel), prepared)
+        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        told = settle_checkpoint(keeper, volume.stop_reasons)
+        write_volume(outputs, volume, prepared)
     else:
-        write_reconstruction(outputs, request.solve(prepared, watch=watch, cancel=context.cancel), prepared)
-    return outputs.image
+        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        told = settle_checkpoint(keeper, [picture.stop_reason])
+        write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
+    return Written(outputs.image, told)
+
+
+def lines_of(work: ReconstructionWork) -> str:
+    """Return the Python that does a reconstruction."""
+    request, settings = work.request, work.request.settings
+    volume = isinstance(request, VolumeRequest)
+    imports = {f"from instrument.reconstruction_request import {type(request).__name__}, Settings"}
+    if volume:
+        imports.add("from instrument.volume_file import write_volume")
+        imports.add("from instrument.reconstruction_file import Outputs")
+    else:
+        imports.add("from instrument.reconstruction_file import Outputs, write_reconstruction")
+    if settings.crop is not None:
+        imports.add("from instrument.preparation import Crop")
+    if type(settings.noise).__name__ == "NoiseModel":
+        imports.add("from recon.noise import NoiseModel")
+    if settings.wishes is not None:
+        imports.add("from recon.auto import Wishes")
+    named = f"Outputs.named({expression(work.outputs.image)}{', volume=True' if volume else ''})"
+    lines = [f"request = {expression(request)}", "job = request.prepare()"]
+    if work.kept_in is None:
+        lines.append("result = request.solve(job)")
+    else:
+        imports.add("from instrument.kept_request import checkpoint_for, settle_checkpoint")
+        reasons = "result.stop_reasons" if volume else "[result.stop_reason]"
+        lines += [
+            f"keeper = checkpoint_for({expression(work.kept_in)}, job, request)",
+            "result = request.solve(job, keeper=keeper)",
+            f"settle_checkpoint(keeper, {reasons})",
+        ]
+    turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
+    lines.append(f"{'write_volume' if volume else 'write_reconstruction'}({named}, result, job{turned})")
+    return "\n".join(["from pathlib import Path", "", *sorted(imports), "", *lines, ""])

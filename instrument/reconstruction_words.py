@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from instrument.erasures import Choice
 from instrument.errors import BenchError
 from instrument.reconstruction_job import DarkChoice, NoiseChoice
+from recon.auto import Wishes
+from recon.errors import InputError
 from recon.noise import NoiseModel
 
 
@@ -78,3 +81,29 @@ def parse_noise(text: str | None) -> NoiseChoice:
             "in counts and counts per electron (2.1,0.13), or estimate."
         )
     return values[0] if len(values) == 1 else NoiseModel(*values)
+
+
+def parse_wishes(model: str, texts: Sequence[str]) -> Wishes | None:
+    """Read ``NAME=VALUE`` each; None where there are none.
+
+    Raises
+    ------
+    BenchError
+        When one is not understood, or the camera model is not left to the program.
+    """
+    if not texts:
+        return None
+    if model != "auto":
+        raise BenchError(
+            f"--choose overrules what --model auto chooses; it does not go with --model {model}."
+        )
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise BenchError(f"--choose {text!r} is not understood; write NAME=VALUE, say binning=1.")
+        pairs[name.strip()] = value.strip()
+    try:
+        return Wishes.parse(pairs)
+    except InputError as error:
+        raise BenchError(f"--choose: {error}") from error

@@ -37,9 +37,9 @@ from instrument.snapshot import Light, check_target, led_pattern, light_of, phot
 
 _LOOK_MS = 8
 """Between two looks whether there is another frame: a look costs next to nothing."""
-_LEAST_GAP_S = 0.028
-"""Between two frames on the screen. Below the 33 ms of a camera at 30 frames a second: a frame that comes a
-little early must not be held back until the next is there."""
+_LEAST_GAP_S = 0.020
+"""Between two frames on the screen. Well below the 33 ms of a camera at 30 frames a second: one that comes
+early, after one that was late, must not be held back until the next is there."""
 _STATISTICS_MS = 333
 _RATE_WINDOW_S = 2.0
 _PATIENCE_S = 1.5

@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.python_lines import expression
-from gui.reconstruction_work import SoFar, reconstruct_job
+from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
 from gui.views.convergence import ConvergenceView
 from gui.views.facts import FactsView
@@ -300,19 +300,19 @@ class ReconstructionsPanel(Panel):
     def reconstruct(self) -> Job | None:
         """Do what the form asks for; the picture so far is shown as it comes."""
         try:
-            request, outputs = self.form.request(), self.form.outputs()
+            work = self.form.work()
         except BenchError as error:
             self.refused(None, str(error))
             return None
         self.accepted()
-
+        request, outputs = work.request, work.outputs
         if outputs.image == self._suggested:
             outputs.image.parent.mkdir(parents=True, exist_ok=True)
         volume = isinstance(request, VolumeRequest)
         job = self.tells(
             self.jobs.compute(
                 f"Reconstructing {request.image.name}",
-                lambda context: reconstruct_job(request, outputs, context),
+                lambda context: reconstruct_job(work, context),
             )
         )
         self.job = job
@@ -388,8 +388,11 @@ class ReconstructionsPanel(Panel):
             self.picture.show_picture(so_far.image, keep_levels=keep)
         self.convergence.show_histories((so_far.history,), None)
 
-    def _reconstructed(self, path: Path) -> None:
+    def _reconstructed(self, written: Written) -> None:
+        path = written.path
         self.form.show_progress(1.0, f"Wrote {path.name}")
+        for name, text in written.told.items():
+            self.session.log("info", f"{name} {text}")
         self.session.log("info", f"Reconstructed: {path}")
         self._suggest_out()
         self.open(path)

@@ -18,7 +18,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from gui.python_lines import expression
+from gui.reconstruction_work import ReconstructionWork, lines_of
+from gui.views.advanced_fields import AdvancedFields
 from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
 from instrument.errors import BenchError
 from instrument.preparation import Crop
@@ -119,6 +120,7 @@ class ReconstructForm(QWidget):
         self.background.setToolTip(
             "Estimate a smooth background as well: stray light that no model explains ends up as haze"
         )
+        self.advanced = AdvancedFields()
         self.out = Entry(self._understand_out, tip="Where the result is written; .png and .json go beside it")
         self.start = QPushButton("Reconstruct")
         self.start.setObjectName("primary")
@@ -176,6 +178,7 @@ class ReconstructForm(QWidget):
             ("Result", PathEntry(self.out, "save", "Results (*.tif *.ome.zarr)")),
         ):
             self._rows.addRow(name, widget)
+        self._rows.addRow(self.advanced)
         inside = QWidget()
         inside.setLayout(self._rows)
         scroll = QScrollArea()
@@ -219,20 +222,30 @@ class ReconstructForm(QWidget):
         image, psfs = self.image.value(), self.psfs.value()
         kind = self.kind.currentText()
         if kind == VOLUME:
-            return VolumeRequest(
-                image=image,
-                psfs=psfs,
-                estimate_background=BACKGROUNDS[self.background.currentText()],
-                settings=settings,
+            return self.advanced.apply(
+                VolumeRequest(
+                    image=image,
+                    psfs=psfs,
+                    estimate_background=BACKGROUNDS[self.background.currentText()],
+                    settings=settings,
+                )
             )
         z_mm = self.z_mm.value()
-        return PictureRequest(
-            image=image,
-            psf=psfs if kind == PSF else None,
-            calibration=psfs if kind == CALIBRATION else None,
-            z_um=None if z_mm is None else 1e3 * z_mm,
-            method=self.method.currentText(),
-            settings=settings,
+        return self.advanced.apply(
+            PictureRequest(
+                image=image,
+                psf=psfs if kind == PSF else None,
+                calibration=psfs if kind == CALIBRATION else None,
+                z_um=None if z_mm is None else 1e3 * z_mm,
+                method=self.method.currentText(),
+                settings=settings,
+            )
+        )
+
+    def work(self) -> ReconstructionWork:
+        """Return all that the fields ask for: what, whereto, kept where; errors as the parts."""
+        return ReconstructionWork(
+            self.request(), self.outputs(), self.advanced.kept_in, self.advanced.rotate_deg
         )
 
     def outputs(self) -> Outputs:
@@ -247,42 +260,8 @@ class ReconstructForm(QWidget):
         return outputs
 
     def as_python(self) -> str:
-        """Return lines that make this reconstruction.
-
-        Raises
-        ------
-        BenchError
-            When a field is not understood.
-        """
-        request, outputs = self.request(), self.outputs()
-        volume = isinstance(request, VolumeRequest)
-        module, write = (
-            ("volume_file", "write_volume") if volume else ("reconstruction_file", "write_reconstruction")
-        )
-        imports = {
-            "from instrument.reconstruction_file import Outputs" + ("" if volume else f", {write}"),
-            f"from instrument.reconstruction_request import {type(request).__name__}, Settings",
-        }
-        if volume:
-            imports.add(f"from instrument.{module} import {write}")
-        if request.settings.crop is not None:
-            imports.add("from instrument.preparation import Crop")
-        if type(request.settings.noise).__name__ == "NoiseModel":
-            imports.add("from recon.noise import NoiseModel")
-        named = f"Outputs.named({expression(outputs.image)}{', volume=True' if volume else ''})"
-        return "\n".join(
-            [
-                "from pathlib import Path",
-                "",
-                *sorted(imports),
-                "",
-                f"request = {expression(request)}",
-                "job = request.prepare()",
-                "result = request.solve(job)",
-                f"{write}({named}, result, job)",
-                "",
-            ]
-        )
+        """Return lines that make this reconstruction; errors as :meth:`work`."""
+        return lines_of(self.work())
 
     # While it runs -------------------------------------------------------------------------------
     def set_running(self, running: bool) -> None:
@@ -317,6 +296,7 @@ class ReconstructForm(QWidget):
             self.binning,
             self.erasures,
             self.out,
+            *self.advanced.entries,
         ]
 
     def _understand_out(self, text: str) -> Outputs:
@@ -345,6 +325,7 @@ class ReconstructForm(QWidget):
             (self.background, volume),
         ):
             self._rows.setRowVisible(widget, shown)
+        self.advanced.show_for(volume=volume, psf=kind == PSF)
         self._method_changed()
 
     def _method_changed(self, _text: str = "") -> None:
@@ -355,6 +336,7 @@ class ReconstructForm(QWidget):
         """Refuse the first field that is not understood, else ask for the work."""
         for entry in self._entries():
             if self._applies(entry) and not entry.check():
+                self.advanced.reveal(entry)
                 entry.setFocus()
                 return
         signal.emit()

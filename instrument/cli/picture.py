@@ -8,9 +8,9 @@ import typer
 
 from instrument.checkpoint import CheckpointFolder
 from instrument.cli.app import saying_what_is_left
-from instrument.cli.checkpoint_option import checkpoint_for, say_what_is_kept
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
+from instrument.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction_file import Outputs, write_reconstruction
 from instrument.reconstruction_job import Job
 from instrument.reconstruction_request import PICTURE_ITERATIONS, PictureRequest
@@ -44,7 +44,8 @@ def reconstruct_to_picture(
             typer.echo(f"Warning: {warning}", err=True)
         keeper = checkpoint_for(checkpoint, job, request)
         result = _solve(job, request, keeper)
-        say_what_is_kept(keeper, [result.stop_reason])
+        for name, text in settle_checkpoint(keeper, [result.stop_reason]).items():
+            typer.echo(f"{name:<12}{text}")
         _tell(result)
         _write(outputs, result, job, rotate_deg)
     if result.stop_reason is StopReason.CANCELLED:

@@ -8,13 +8,16 @@ from typing import Annotated
 
 import typer
 
-from instrument.errors import BenchError
 from instrument.mosaic import mosaic_named
 from instrument.preparation import Crop
 from instrument.reconstruction_request import PICTURE_ITERATIONS, Settings, known_model
-from instrument.reconstruction_words import parse_binning, parse_dark, parse_erasures, parse_noise
-from recon.auto import Wishes
-from recon.errors import InputError
+from instrument.reconstruction_words import (
+    parse_binning,
+    parse_dark,
+    parse_erasures,
+    parse_noise,
+    parse_wishes,
+)
 
 
 class Method(enum.StrEnum):
@@ -387,24 +390,5 @@ def parse_settings(
         tolerance=tolerance,
         stop_at_noise=stop_at_noise,
         mosaic=mosaic_named(bayer),
-        wishes=_wishes(model, choices),
+        wishes=parse_wishes(model, choices or []),
     )
-
-
-def _wishes(model: str, choices: list[str] | None) -> Wishes | None:
-    if not choices:
-        return None
-    if model != "auto":
-        raise BenchError(
-            f"--choose overrules what --model auto chooses; it does not go with --model {model}."
-        )
-    pairs = {}
-    for text in choices:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise BenchError(f"--choose {text!r} is not understood; write NAME=VALUE, say binning=1.")
-        pairs[name.strip()] = value.strip()
-    try:
-        return Wishes.parse(pairs)
-    except InputError as error:
-        raise BenchError(f"--choose: {error}") from error

@@ -7,10 +7,10 @@ from pathlib import Path
 import typer
 
 from instrument.cli.app import saying_what_is_left
-from instrument.cli.checkpoint_option import checkpoint_for, say_what_is_kept
 from instrument.cli.picture import tell_choice
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
+from instrument.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_request import VOLUME_ITERATIONS, VolumeRequest
 from instrument.volume_file import write_volume
@@ -46,7 +46,8 @@ def reconstruct_to_volume(
                 bar.update(task, completed=record.iteration, note=f"residual {record.data_residual:.3g}")
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
-        say_what_is_kept(keeper, result.stop_reasons)
+        for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
+            typer.echo(f"{name:<12}{text}")
         if result.choice is not None:
             for line in result.choice.brief():
                 typer.echo(line)

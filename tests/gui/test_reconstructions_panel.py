@@ -19,8 +19,10 @@ from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.views.reconstruct_form import PSF, VOLUME
 from instrument.images import read_image, write_image
+from instrument.reconstruction_request import VolumeRequest
 from instrument.stored_result import open_result
 from instrument.volume_source import VolumeSource
+from recon.auto import Wishes
 
 WAIT_MS = 20_000
 SIZE, DEPTHS = 32, 4
@@ -210,6 +212,72 @@ def test_the_copied_lines_make_the_same_result(
     exec(panel.as_python(), names)
     assert names["result"].path == tmp_path / "by-mouse.tif"
     names["result"].close()
+
+
+def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path
+) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    form, advanced = panel.form, panel.form.advanced
+    assert not advanced.mosaic.isVisible()
+    advanced.fold.setFocus()
+    qtbot.keyClick(advanced.fold, Qt.Key.Key_Space)
+    assert advanced.mosaic.isVisible()
+    assert not advanced.positive.isVisible()  # of volumes
+    advanced.mosaic.setCurrentText("none")
+    advanced.turn.setCurrentText("by 90°")
+    advanced.tolerance.setText("1e-9")
+    qtbot.keyClick(advanced.saturated, Qt.Key.Key_Space)
+    advanced.checkpoint.setText(str(tmp_path / "kept"))
+    form.out.setText(str(tmp_path / "plain.tif"))
+    request = form.request()
+    assert request.allow_saturated
+    assert request.settings.mosaic is None
+    assert request.settings.tolerance == 1e-9
+    run(qtbot, panel)
+    assert list((tmp_path / "kept").iterdir())  # five iterations are not its end
+    advanced.checkpoint.setText(str(tmp_path / "kept-by-script"))
+    form.out.setText(str(tmp_path / "by-script.tif"))
+    qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
+    exec(QApplication.clipboard().text(), {})
+    by_script, by_window = (tifffile.imread(tmp_path / f"{name}.tif") for name in ("by-script", "plain"))
+    np.testing.assert_allclose(by_script, by_window, rtol=1e-4)
+    advanced.turn.setCurrentText("as on the sensor")
+    advanced.checkpoint.clear()
+    form.out.setText(str(tmp_path / "not-turned.tif"))
+    exec(form.as_python(), {})
+    np.testing.assert_allclose(
+        np.rot90(tifffile.imread(tmp_path / "not-turned.tif")), by_window, rtol=1e-3, atol=1e-3
+    )
+
+
+def test_choices_of_a_volume_are_those_of_the_command_line(
+    qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path
+) -> None:
+    fill(panel, VOLUME, files, "psfs")
+    form, advanced = panel.form, panel.form.advanced
+    advanced.fold.click()
+    advanced.choose.setText("binning=1 planes=all")
+    advanced.positive.click()
+    advanced.at_noise.click()
+    request = form.request()
+    assert isinstance(request, VolumeRequest)
+    assert request.settings.wishes == Wishes(binning=1, planes="all")
+    assert request.positive_background
+    assert request.settings.stop_at_noise
+    names: dict = {}
+    exec(form.as_python().split("job = ")[0], names)
+    assert names["request"] == request
+    advanced.checkpoint.setText(str(tmp_path / "kept"))
+    qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
+    assert panel.job is None
+    assert "--checkpoint" in panel._note.toolTip()
+    advanced.fold.click()
+    advanced.choose.setText("size=3")
+    qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
+    assert panel.job is None
+    assert "no choice 'size'" in panel._note.toolTip()
+    assert advanced.choose.isVisible()  # where it was refused
 
 
 def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:

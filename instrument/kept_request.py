@@ -1,4 +1,4 @@
-"""The option ``--checkpoint``: a reconstruction kept while it runs, and gone on with."""
+"""A reconstruction that is kept while it runs, and gone on with: the folder that fits a request."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-
-import typer
 
 from instrument.checkpoint import CheckpointFolder, digest
 from instrument.errors import BenchError
@@ -21,6 +19,22 @@ _WHEN_TO_STOP = ("iterations", "time_s", "tolerance", "stop_at_noise")
 _WITHOUT_BEARING = ("allow_saturated", "allow_mixed_depth", "memory_gib", "scratch", "settings")
 
 
+def require_kept(request: PictureRequest | VolumeRequest) -> None:
+    """Refuse to keep what has no iterations, or what is chosen only while it is solved.
+
+    Raises
+    ------
+    BenchError
+    """
+    if isinstance(request, PictureRequest) and request.method == "wiener":
+        raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
+    if request.settings.wishes is not None:
+        raise BenchError(
+            "--choose is about everything that --model auto chooses, which it does not with --checkpoint. "
+            "Leave one of the two out."
+        )
+
+
 def checkpoint_for(
     folder: Path | None, job: Job, request: PictureRequest | VolumeRequest
 ) -> CheckpointFolder | None:
@@ -31,14 +45,13 @@ def checkpoint_for(
     Raises
     ------
     BenchError
-        For a method without iterations.
+        As :func:`require_kept`.
     FileError
         When the folder keeps something else.
     """
     if folder is None:
         return None
-    if isinstance(request, PictureRequest) and request.method == "wiener":
-        raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
+    require_kept(request)
     given = asdict(request)
     given |= given["settings"]
     apart = {*_SEEN_IN_JOB, *_WHEN_TO_STOP, *_WITHOUT_BEARING}
@@ -55,14 +68,18 @@ def checkpoint_for(
     return CheckpointFolder(folder, problem)
 
 
-def say_what_is_kept(keeper: CheckpointFolder | None, reasons: Sequence[StopReason | None]) -> None:
-    """Tell where the work went on from; remove it where it has come to its end."""
+def settle_checkpoint(
+    keeper: CheckpointFolder | None, reasons: Sequence[StopReason | None]
+) -> dict[str, str]:
+    """Remove a checkpoint whose work has come to its end; return what is to be told of it, by headings."""
+    told: dict[str, str] = {}
     if keeper is None:
-        return
+        return told
     if keeper.resumed_from:
-        typer.echo(f"{'Went on':<12}from iteration {keeper.resumed_from} in {keeper.folder}")
+        told["Went on"] = f"from iteration {keeper.resumed_from} in {keeper.folder}"
     if all(reason in _FINISHED for reason in reasons):
         keeper.remove()
-        typer.echo(f"{'Checkpoint':<12}removed: the work has come to its end")
+        told["Checkpoint"] = "removed: the work has come to its end"
     else:
-        typer.echo(f"{'Checkpoint':<12}{keeper.folder}: the same command, with more time, goes on from it")
+        told["Checkpoint"] = f"{keeper.folder}: the same again, with more time, goes on from it"
+    return told
