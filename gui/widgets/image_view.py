@@ -85,7 +85,7 @@ class ImageView(QWidget):
         self.keys = ArrowKeys(self.graphics)
         self.arrows_pan = True
         self.keys.zoomed.connect(self._zoom)
-        self.keys.moved.connect(self._pan)
+        self.keys.moved.connect(self._pan_by_keys)
 
     @property
     def colour_map(self) -> str:
@@ -171,7 +171,7 @@ class ImageView(QWidget):
         else:
             self.box.scaleBy((1 / factor, 1 / factor))
 
-    def _pan(self, across: float, down: float) -> None:
+    def _pan_by_keys(self, across: float, down: float) -> None:
         if self.arrows_pan:
             (left, right), (top, bottom) = self.box.viewRange()
             self.box.translateBy((_PAN * across * (right - left), _PAN * down * (bottom - top)))
