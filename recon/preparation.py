@@ -156,10 +156,16 @@ def data_of(
     warnings = []
     # As it came: once a background is off, saturated pixels no longer share a value.
     for channel, (values, kept) in enumerate(zip(counts, valid, strict=True)):
-        if share := saturated_share(values[kept]):
+        lowest, highest = float(values[kept].min()), float(values[kept].max())
+        if lowest == highest and values[kept].size > 1:
+            warnings.append(
+                f"The measurement's channel {channel} is constant ({highest:g} everywhere): there is nothing "
+                "in it to reconstruct. Was the scene lit, and the exposure long enough?"
+            )
+        elif share := saturated_share(values[kept]):
             warnings.append(
                 f"The measurement's channel {channel} looks saturated: {share:.2%} of its pixels are at "
-                f"exactly its maximum {values[kept].max():g}. "
+                f"exactly its maximum {highest:g}. "
                 "Leave them out with erasures, or expose shorter."
             )
     return data, valid, warnings

@@ -357,7 +357,7 @@ def _with_options(
 
 
 def _background(dark: CoarsePass, lit: CoarsePass, kind: str, wishes: Wishes, *, given: bool) -> Decision:
-    ratio = dark.misfit / max(lit.misfit, 1e-6)
+    ratio = max(dark.misfit, 1e-6) / max(lit.misfit, 1e-6)
     numbers = {"misfit_without": dark.misfit, "misfit_with": lit.misfit, "needed": BACKGROUND_GAIN[kind]}
     asked = wishes.background is not None
     picture = kind == "tv" and dark.light.shape[1] == 1

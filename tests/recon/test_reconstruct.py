@@ -256,4 +256,6 @@ def test_tiny_measurements_work():
 
 
 def test_a_dark_measurement_gives_a_dark_picture():
-    assert not reconstruct(np.zeros((12, 14)), GOOD).image.any()
+    result = reconstruct(np.zeros((12, 14)), GOOD)
+    assert not result.image.any()
+    assert any("channel 0 is constant (0 everywhere)" in text for text in result.warnings)

@@ -306,6 +306,13 @@ def test_psfs_of_another_size_are_refused_and_saturation_is_warned_of():
     assert any("looks saturated" in text for text in result.warnings)
 
 
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_a_dark_measurement_gives_a_dark_volume(prior):
+    result = reconstruct_volume(np.zeros((SIZE, SIZE)), calibration(), prior=prior, iterations=3)
+    assert not result.volume.any()
+    assert any("channel 0 is constant (0 everywhere)" in text for text in result.warnings)
+
+
 @pytest.mark.parametrize("wrong", [{"tau": np.inf}, {"iterations": 0}, {"time_s": 0.0}, {"tolerance": -1.0}])
 def test_settings_without_a_meaning_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):

@@ -212,6 +212,22 @@ def test_result_without_kept_state_is_the_same(kind):
     np.testing.assert_array_equal(make(keep_state=False).run(rules).solution, make().run(rules).solution)
 
 
+def test_total_variation_leaves_what_is_empty_at_zero():
+    operator, data = problem()
+    solver = LeanTotalVariation(operator, data, tau(operator, data, 0.02))
+    found = solver.run(StoppingRules(iterations=40, tolerance=0)).solution
+    assert found.max() > 0.5
+    # Not the x of the data term, which is nowhere exactly zero.
+    assert 0.3 < np.mean(found == 0) < 1
+
+
+def test_total_variation_begins_at_its_start():
+    operator, data = problem()
+    start = np.random.default_rng(5).standard_normal(operator.domain_shape)
+    solver = LeanTotalVariation(operator, data, 1.0, initial=start)
+    np.testing.assert_array_equal(solver.solution, np.maximum(start, 0))
+
+
 def test_residual_is_that_of_the_solution():
     operator, data = problem()
     solver = DouglasRachford(operator, data, tau(operator, data, 0.01))
