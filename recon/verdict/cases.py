@@ -1,10 +1,16 @@
-"""What the shipped stability maps saw: one case a reconstruction, its evidence and whether it failed."""
+"""What is known of reconstructions with a truth: one case each, its evidence and whether it failed.
+
+Cases come from the shipped stability maps, and from scenes that mix what the maps keep apart: several
+stresses at once, all diffusers, all families (``mixed.json``, made by ``benchmarks/verdicts.py --cases``).
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +30,7 @@ FEATURES = (
     "erased",
     "saturated",
     "unsettled",
+    "ambiguity",
     "grain",
 )
 """Evidence by which cases are alike; ``grain`` is that of edges over lit voxels."""
@@ -41,8 +48,12 @@ FLOOR = {
 NOTHING = 1e-3
 INVISIBLE = ("shift",)
 """Maps whose failures leave no trace in the data: a shifted diffuser gives a good picture elsewhere."""
-WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5}
+WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5, "ambiguity": 2.0}
 """How much a feature's difference counts, relative to a ratio of ``e`` in the others."""
+
+RANDOM_LENSLETS = 0.25
+"""``ambiguity`` of entries from before it was kept: those maps have random lenslets, 0.17 to 0.33."""
+MIXED = Path(__file__).with_name("mixed.json")
 
 GROUPS = {
     "picture tv": ("admm tv", "admm-sensor tv", "fista tv"),
@@ -68,20 +79,32 @@ class Cases:
     places : ndarray, (n, n_features)
         In the space in which distances tell how alike they are.
     severities : ndarray, (n,)
+    scenes : ndarray of int, (n,)
+        Numbers of the mixed scenes that they come from; -1 for those of maps.
     maps : tuple of str
         The maps that they come from.
     """
 
     places: Floats
     severities: Floats
+    scenes: npt.NDArray[np.int_]
     maps: tuple[str, ...]
+
+    def without(self, scene: int) -> Cases:
+        """Return the cases but for those of a mixed scene, to judge that scene by the others."""
+        kept = self.scenes != scene
+        return Cases(self.places[kept], self.severities[kept], self.scenes[kept], self.maps)
 
 
 def place_of(evidence: Mapping[str, Any]) -> Floats:
     """Return where evidence lies in the space of :class:`Cases`."""
     coordinates = []
     # Surfaces have fewer edges than lit voxels, points more: priors fail on them in different ways.
-    numbers = {**evidence, "grain": (evidence["edges"] + NOTHING) / (evidence["lit"] + NOTHING)}
+    numbers = {
+        "ambiguity": RANDOM_LENSLETS,
+        **evidence,
+        "grain": (evidence["edges"] + NOTHING) / (evidence["lit"] + NOTHING),
+    }
     for name in FEATURES:
         value = float(numbers[name])
         if name in FLOOR:
@@ -91,9 +114,15 @@ def place_of(evidence: Mapping[str, Any]) -> Floats:
 
 
 @cache
+def mixed_scenes() -> tuple[Mapping[str, Any], ...]:
+    """Return the entries of ``mixed.json``: ``scene``, ``method``, ``severity`` and ``evidence``."""
+    return tuple(json.loads(MIXED.read_text(encoding="utf-8"))["cases"])
+
+
+@cache
 def cases_of(group: str) -> Cases:
-    """Return the shipped maps' cases of a group."""
-    places, severities, names = [], [], []
+    """Return the cases of a group: the shipped maps' and those of mixed scenes."""
+    places, severities, scenes, names = [], [], [], []
     for name, stress in shipped_maps().items():
         if name in INVISIBLE:
             continue
@@ -104,7 +133,16 @@ def cases_of(group: str) -> Cases:
             for entry in result["evidence"]:
                 places.append(place_of(entry))
                 severities.append(float(entry["severity"]))
+                scenes.append(-1)
                 names.append(name)
+    for entry in mixed_scenes():
+        if entry["method"] in GROUPS[group]:
+            places.append(place_of(entry["evidence"]))
+            severities.append(float(entry["severity"]))
+            scenes.append(int(entry["scene"]))
     return Cases(
-        np.array(places).reshape(-1, len(FEATURES)), np.array(severities), tuple(dict.fromkeys(names))
+        np.array(places).reshape(-1, len(FEATURES)),
+        np.array(severities),
+        np.array(scenes, int),
+        tuple(dict.fromkeys(names)),
     )

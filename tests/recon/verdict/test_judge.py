@@ -41,6 +41,7 @@ def planted(monkeypatch: pytest.MonkeyPatch) -> None:
     maps = {"planted": {"methods": {"admm tv, left out": {"evidence": entries}}}}
     cases.cases_of.cache_clear()
     monkeypatch.setattr(cases, "shipped_maps", lambda: maps)
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: ())
     yield
     cases.cases_of.cache_clear()
 
@@ -73,10 +74,30 @@ def test_what_no_map_saw_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
 
 
-def test_a_psf_that_repeats_itself_is_never_called_reliable() -> None:
+def test_a_psf_that_repeats_itself_is_judged_by_those_that_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = evidence(30, 0.03, ambiguity=0.82).as_json()
+    lost = [
+        {"scene": k, "method": "admm tv", "severity": 3.0, "evidence": {**numbers, "signal": 25.0 + k}}
+        for k in range(12)
+    ]
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(lost))
+    cases.cases_of.cache_clear()
     regular = judge.verdict_on(evidence(30, 0.03, ambiguity=0.82), "admm tv")
-    assert regular.region is Region.NEAR
+    assert regular.region is Region.OUTSIDE
     assert regular.findings[0].stress == "ambiguity"
+    assert "repeats itself" in " ".join(regular.sentences)
+    assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.INSIDE
+
+
+def test_a_scene_can_be_judged_without_its_own_cases(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = evidence(30, 0.03).as_json()
+    entry = {"scene": 7, "method": "admm tv", "severity": 3.0, "evidence": own}
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: (entry,) * 12)
+    cases.cases_of.cache_clear()
+    known = cases.cases_of("picture tv")
+    assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.OUTSIDE
+    assert judge.verdict_on(evidence(30, 0.03), "admm tv", known.without(7)).region is Region.INSIDE
+    assert len(known.without(8).severities) == len(known.severities) == 12 + 225
 
 
 def test_a_verdict_is_a_record() -> None:
