@@ -30,7 +30,6 @@ class RunEndedError(CalibrationError):
 
     def __init__(self, what: str, run: Run, remedy: str = "") -> None:
         self.run = run
-        super().__init__(
-            f"{what} ended early ({run.condition}); what was taken is in {run.path}."
-            + (f" {remedy}" if remedy else "")
-        )
+        self.words = f"{what} ended early ({run.condition}); what was taken is in {run.path}."
+        """Without the remedy, which is not the same on the command line and in a window."""
+        super().__init__(self.words + (f" {remedy}" if remedy else ""))

@@ -139,10 +139,20 @@ class Procedure(Protocol):
         """
 
 
-def outlook_of(bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = ()) -> Outlook:
-    """Return the outlook of a plan that was checked."""
+def outlook_of(
+    bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = (), *, homes: bool = False
+) -> Outlook:
+    """Return the outlook of a plan that was checked.
+
+    Where it moves a stage, the reasons say whether that is homed first: always (``homes``), or where it has
+    no reference yet.
+    """
     abilities = abilities_of(bench, folder or bench.config.data_folder)
-    return Outlook(tuple(reasons), plan, estimate(plan, abilities), abilities.free_bytes, path_of(plan))
+    path = path_of(plan)
+    told = list(reasons)
+    if path and bench.stage is not None and (homes or not bench.stage.is_homed):
+        told.append("The stage is homed first, every axis to its reference: its way must be free.")
+    return Outlook(tuple(told), plan, estimate(plan, abilities), abilities.free_bytes, path)
 
 
 def path_of(plan: Plan) -> tuple[dict[str, float], ...]:

@@ -177,16 +177,17 @@ def sweep_plan(sweep: Sweep, exposures_ms: Sequence[float]) -> Plan:
     exposures_ms : sequence of float
         One a point.
     """
-    if len(exposures_ms) != len(sweep.points_um):
-        raise ValueError(f"{len(sweep.points_um)} points need as many exposures, not {len(exposures_ms)}.")
+    points_um = sweep.points_um  # once: an axial sweep computes them anew each time
+    if len(exposures_ms) != len(points_um):
+        raise ValueError(f"{len(points_um)} points need as many exposures, not {len(exposures_ms)}.")
     reference = reference_point(sweep)
     parts = []
-    for start in range(0, len(sweep.points_um), sweep.reference_every or len(sweep.points_um)):
-        stop = start + (sweep.reference_every or len(sweep.points_um))
+    for start in range(0, len(points_um), sweep.reference_every or len(points_um)):
+        stop = start + (sweep.reference_every or len(points_um))
         if reference is not None:
-            exposure_ms = exposures_ms[sweep.points_um.index(reference)]
+            exposure_ms = exposures_ms[points_um.index(reference)]
             parts.append(_point(sweep, REFERENCE, reference, exposure_ms))
-        points = zip(sweep.points_um[start:stop], exposures_ms[start:stop], strict=True)
+        points = zip(points_um[start:stop], exposures_ms[start:stop], strict=True)
         parts += [_point(sweep, PSF, point, exposure_ms) for point, exposure_ms in points]
     if reference is not None:
         parts.append(parts[0])

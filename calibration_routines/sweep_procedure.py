@@ -26,7 +26,7 @@ class SweepProcedure:
         """Plan the sweep and hold it against the bench's limits and the disk."""
         planned = self.request.plan(bench)
         plan = check_sweep(bench, planned.sweep, folder or bench.config.data_folder)
-        return outlook_of(bench, plan, folder, planned.reasons)
+        return outlook_of(bench, plan, folder, planned.reasons, homes=not planned.sweep.by_hand)
 
     def carry_out(
         self,

@@ -149,6 +149,8 @@ class Job(QObject):
         """Whether it goes on until it is cancelled."""
         self.state = JobState.WAITING
         self.error: BaseException | None = None
+        self.became = "done"
+        """What is told of one that succeeded; set before it has ended."""
         self._work: Work | None = work
         self._context = context
 

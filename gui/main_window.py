@@ -296,7 +296,7 @@ class MainWindow(QMainWindow):
         if running:
             self.job_label.setText(f"{running[0].title} …")
         elif job.state.value == "succeeded":
-            self.job_label.setText(f"{job.title}: done")
+            self.job_label.setText(f"{job.title}: {job.became}")
 
     def _told_jobs(self) -> list[Job]:
         """Return what runs and would be missed: runs, moves, photographs, computations."""

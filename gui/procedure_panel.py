@@ -36,6 +36,8 @@ from instrument.words import count, duration, size
 
 _CHECK_MS = 250
 """Rest after a key before what was typed is checked."""
+_SLOW_MS = 700
+"""A check that takes longer than this is shown to go on: what was said of other values must not stay."""
 _FORM_WIDTH_PX = 400
 
 
@@ -91,6 +93,11 @@ class ProcedurePanel(Panel):
         self.use_button.hide()
         self.use_button.clicked.connect(self._use)
         self._result: Path | None = None
+        self.go_on_button = QPushButton("Go on with it…")
+        self.go_on_button.setToolTip("Open the run that ended early among the runs, where it is resumed")
+        self.go_on_button.hide()
+        self.go_on_button.clicked.connect(self._go_on)
+        self._unfinished: Path | None = None
         left = QWidget()
         column = QVBoxLayout(left)
         column.setContentsMargins(0, 0, 6, 0)
@@ -101,6 +108,7 @@ class ProcedurePanel(Panel):
         column.addWidget(self.verdict)
         column.addWidget(self.run_bar)
         column.addWidget(self.use_button)
+        column.addWidget(self.go_on_button)
         self.right = QWidget()
         """For the subclass."""
         split = QSplitter()
@@ -122,6 +130,10 @@ class ProcedurePanel(Panel):
         self._rest.setSingleShot(True)
         self._rest.setInterval(_CHECK_MS)
         self._rest.timeout.connect(self.check)
+        self._slow = QTimer(self)
+        self._slow.setSingleShot(True)
+        self._slow.setInterval(_SLOW_MS)
+        self._slow.timeout.connect(lambda: self._say("This is being checked …", wrong=False))
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)
         self.run_bar.pause.connect(self.run.pause)
@@ -201,6 +213,7 @@ class ProcedurePanel(Panel):
             self.run_bar.set_startable(str(error))
             self._unchecked = True
             return
+        self._slow.start()
         self._check_job.succeeded.connect(self._checked)
         self._check_job.failed.connect(self._check_failed)
         self._check_job.ended.connect(self._check_ended)
@@ -243,6 +256,8 @@ class ProcedurePanel(Panel):
             return
         self.accepted()
         self.use_button.hide()
+        self.go_on_button.hide()
+        self._say(f"{title} goes on.", wrong=False)
         self.run_bar.set_running(True)
         self.stack.setEnabled(False)
         self.choice.setEnabled(False)
@@ -260,6 +275,7 @@ class ProcedurePanel(Panel):
     def shutdown(self) -> None:
         """End the timers."""
         self._rest.stop()
+        self._slow.stop()
         self.run.shutdown()
 
     # Inside --------------------------------------------------------------------------------------
@@ -295,6 +311,7 @@ class ProcedurePanel(Panel):
 
     def _check_ended(self) -> None:
         self._check_job = None
+        self._slow.stop()
         if self._again:
             self._again = False
             self.check()
@@ -310,6 +327,9 @@ class ProcedurePanel(Panel):
     def _use(self) -> None:
         self.session.handed_on.emit(self.handed_to, self._result)
 
+    def _go_on(self) -> None:
+        self.session.handed_on.emit("runs", self._unfinished)
+
     def _succeeded(self, outcome: Outcome) -> None:
         where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
         self._say("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
@@ -323,6 +343,8 @@ class ProcedurePanel(Panel):
 
     def _ended_early(self, ended: Ended) -> None:
         self._say(ended.words, wrong=True)
+        self._unfinished = ended.run
+        self.go_on_button.setVisible(ended.run is not None)
         self.session.log("warning", ended.words)
         self.run_bar.show_end("Ended early; nothing moves, light off", complete=False)
 

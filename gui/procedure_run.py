@@ -204,7 +204,7 @@ class ProcedureRun(QObject):
             try:
                 return procedure.carry_out(bench, control=control, listener=heard)
             except RunEndedError as error:
-                return Ended(str(error), error.run.path)
+                return Ended(f"{error.words} It can go on: the panel Runs resumes it.", error.run.path)
             except EndedEarlyError as error:
                 return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
 
@@ -252,6 +252,8 @@ class ProcedureRun(QObject):
     def _succeeded(self, result: Outcome | Ended) -> None:
         self._look()
         if isinstance(result, Ended):
+            if self._job is not None:
+                self._job.became = "ended early"
             self.ended_early.emit(result)
             if result.run is not None:
                 self._session.run_finished.emit(result.run)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from instrument.bench import Bench
 from instrument.camera_settings import camera_settings
+from instrument.errors import FileError
 from instrument.plan import BenchAbilities, Plan, check
 from instrument.run_control import RunControl
 from instrument.runner import Progress, Runner
@@ -110,8 +112,18 @@ def record_of(bench: Bench) -> BenchRecord:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free space of the disk that ``folder`` is or will be on."""
-    folder = folder.absolute()
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
+    """Return the free space of the disk that ``folder`` is or will be on.
+
+    Raises
+    ------
+    FileError
+        When nothing can be kept there: its path leads through a file, or may not be written to.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
+    if not os.access(there, os.W_OK):
+        raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
+    return shutil.disk_usage(there).free

@@ -379,7 +379,9 @@ class ReconstructionsPanel(Panel):
                 list(prepared.notes.items()), prepared.warnings, simulated=prepared.simulated
             )
             return
-        keep, self._first_picture = not self._first_picture, False
+        keep = not self._first_picture
+        # The first ones may be empty yet: no levels for those that follow.
+        self._first_picture = self._first_picture and not np.any(so_far.image > 0)
         if volume:
             self.viewers.setCurrentWidget(self.volume)
             self.volume.show_front(so_far.image, keep_levels=keep)

@@ -11,6 +11,7 @@ from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.widgets.number_edit import NumberEdit
 from instrument.acquire import free_bytes
+from instrument.errors import FileError
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.recorder import Recorder, RecordingStatus
 from instrument.recording import prepare_recording
@@ -139,11 +140,11 @@ class RecordBar(QWidget):
 
         self.gauge.setRange(0, 1000)
         try:
-            usage, free = shutil.disk_usage(folder), free_bytes(folder)
-        except OSError as error:  # a drive that was taken away, a server that does not answer
+            usage, free = shutil.disk_usage(folder), free_bytes(self._session.runs_folder)
+        except (OSError, FileError) as error:  # no such place, a drive taken away, a server that is silent
             self.gauge.setValue(0)
             self.gauge.setFormat("disk not known")
-            self.gauge.setToolTip(f"{folder}: {error.strerror or error}")
+            self.gauge.setToolTip(f"{folder}: {error.strerror}" if isinstance(error, OSError) else str(error))
             return
         # Some file systems of servers and user space tell no size.
         self.gauge.setValue(round(1000 * (1 - usage.free / usage.total)) if usage.total else 0)

@@ -200,6 +200,11 @@ class RunsPanel(Panel):
         self.bar.set_running(True)
         self.table.setEnabled(False)
 
+    def take(self, path: Path) -> None:
+        """Show a run that another panel hands on, and mark it in the list as soon as that is read."""
+        self._wanted = path
+        self.read_folder()
+
     def shutdown(self) -> None:
         """End the timers."""
         self._rest.stop()
@@ -213,6 +218,8 @@ class RunsPanel(Panel):
         self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
         self.table.setTabKeyNavigation(False)
+        # What tells runs of a day apart stands at the end of their names.
+        self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.setToolTip("Click a run to open it")
         self.table.verticalHeader().hide()
         self.table.verticalHeader().setDefaultSectionSize(26)
@@ -301,7 +308,7 @@ class RunsPanel(Panel):
                 item = QTableWidgetItem(text)
                 if found.condition is not RunCondition.COMPLETED and column == 1:
                     item.setForeground(QColor(colours().warning))
-                item.setToolTip(found.problem or text)
+                item.setToolTip(found.problem or (str(found.path) if column == 0 else text))
                 self.table.setItem(row, column, item)
             if found.path == wanted:
                 chosen = row
@@ -403,7 +410,7 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
         f"{metadata.exposure_ms:.4g} ms",
         metadata.led_pattern or "",
     ]
-    place = ", ".join(f"{axis} {value:g}" for axis, value in (metadata.stage_position or {}).items())
+    place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return _Picture(
         image,
         float(low),
@@ -411,6 +418,12 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
         (1 << metadata.significant_bits) - 1,
         ", ".join(word for word in (*words, place) if word),
     )
+
+
+def _axis_words(axis: str, value: float) -> str:
+    """Return an axis' name without its unit, and its value with it: ``x 100 µm``."""
+    name, _, unit = axis.rpartition("_")
+    return f"{name} {value:g} {unit.replace('um', 'µm')}" if name else f"{axis} {value:g}"
 
 
 def _about(run: Run) -> list[str]:

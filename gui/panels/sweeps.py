@@ -20,12 +20,14 @@ from gui.procedure_run import Situation
 from gui.psf_pictures import PsfPictures
 from gui.session import BenchSession
 from gui.widgets.image_view import ImageView
+from gui.widgets.message import elided
 from gui.widgets.path_plot import PathPlot
 from gui.widgets.picture import Picture
 from gui.widgets.psf_table import PsfTable
 from instrument.errors import BenchError, FileError
 from instrument.photograph import Snapshot
 from instrument.plan.file import load_plan, plan_toml
+from instrument.words import count
 
 Image = npt.NDArray[Any]
 _LEVELS = (0.1, 99.9)
@@ -139,8 +141,9 @@ class SweepsPanel(ProcedurePanel):
         self._show_image(newest.image, full_scale)
         words = [f"Last frame: {metadata.exposure_ms:.4g} ms", f"light {metadata.led_pattern or 'unknown'}"]
         if metadata.saturated_fraction:
-            words.append(f"SATURATED {metadata.saturated_fraction:.2%}")
-        self.frame_words.setText(", ".join(words))
+            pixels = round(metadata.saturated_fraction * newest.image.size)
+            words.append(f"SATURATED: {count(max(pixels, 1), 'pixel')}")
+        elided(self.frame_words, ", ".join(words))
 
     def _show_image(self, image: Image, full_scale: int | None = None) -> None:
         low, high = np.percentile(image[::4, ::4], _LEVELS)

@@ -11,6 +11,7 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtWidgets import QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
+from calibration_routines.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
@@ -88,6 +89,7 @@ def test_a_form_begins_with_depths_that_the_stage_reaches_and_draws_them(
     assert panel.outlook.cost is not None
     words = panel.verdict.toPlainText()
     assert f"{panel.outlook.cost.frames} frames" in words
+    assert "homed first" in words
     enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4")
     assert panel.outlook is not None
     assert {place["z_um"] for place in panel.path.places} >= {60e3, 150e3}
@@ -203,7 +205,19 @@ def test_abort_keeps_what_was_taken(qtbot: QtBot, window: MainWindow, panel: Swe
         pass
     run = run_of(window.session.runs_folder)
     assert run.condition is RunCondition.ABORTED
-    assert "diffuserbench resume" in panel.verdict.toPlainText()
+    words = panel.verdict.toPlainText()
+    assert str(run.path) in words
+    assert "diffuserbench resume" not in words, "the operator has no terminal"
+    qtbot.waitUntil(lambda: window.job_label.text() != "Axial sweep …", timeout=WAIT_MS)
+    assert window.job_label.text() == "Axial sweep: ended early"
+    press(qtbot, panel.go_on_button)
+    runs = window.show_panel("runs")
+    assert isinstance(runs, RunsPanel)
+    qtbot.waitUntil(lambda: runs.opened is not None and runs.opened.path == run.path, timeout=WAIT_MS)
+    assert runs.table.currentRow() == 0
+    assert runs.bar.start_button.isEnabled()
+    qtbot.waitUntil(lambda: "µm" in runs.frame_words.text(), timeout=WAIT_MS)
+    assert "_um" not in runs.frame_words.text()
 
 
 def answer(question: QMessageBox | None, words: str) -> Any:
@@ -316,3 +330,40 @@ def test_a_run_is_read_outside_the_windows_thread_and_a_damaged_one_told(
     qtbot.waitUntil(lambda: "is damaged" in runs.about.toPlainText(), timeout=WAIT_MS)
     assert threads[0] is not threading.main_thread()
     assert runs.opened is None
+
+
+def test_what_was_said_of_other_values_does_not_stay_while_a_check_takes_its_time(
+    qtbot: QtBot, panel: SweepsPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="0")
+    assert "number of planes is 0" in panel.verdict.toPlainText()
+    gate = threading.Event()
+    real = SweepProcedure.outlook
+
+    def slowly(*given: Any) -> Any:
+        gate.wait(WAIT_MS / 1000)
+        return real(*given)
+
+    monkeypatch.setattr(SweepProcedure, "outlook", slowly)
+    field: Any = panel.view.widgets["planes"]
+    field.selectAll()
+    qtbot.keyClicks(field, "4")
+    qtbot.waitUntil(lambda: "being checked" in panel.verdict.toPlainText(), timeout=WAIT_MS)
+    assert not panel.verdict.property("refused")
+    gate.set()
+    wait_for_check(qtbot, panel)
+    assert panel.outlook is not None
+
+
+def test_a_folder_in_which_nothing_can_be_kept_is_told_before_anything_moves(
+    qtbot: QtBot, window: MainWindow, panel: SweepsPanel
+) -> None:
+    folder = window.session.runs_folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.write_text("a file where the runs' folder should be")
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="4")
+    assert "is a file, not a folder" in panel.verdict.toPlainText()
+    assert not panel.run_bar.start_button.isEnabled()
+    folder.unlink()
+    enter(qtbot, panel, planes="3")
+    assert panel.run_bar.start_button.isEnabled()
