@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo test lint format types clean
+.PHONY: help demo charts test lint format types clean
 
 help: ## what one can make
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -21,6 +21,9 @@ $(STAMP): pyproject.toml
 
 demo: $(STAMP) ## the main job on the simulated bench: calibrate, photograph, reconstruct, figure
 	$(BIN)/diffuserbench demo
+
+charts: $(STAMP) ## draw the charts of README and docs/benchmarks/charts.md anew (most of an hour; goes on where it stopped)
+	$(BIN)/python benchmarks/charts.py
 
 test: $(STAMP) lint types ## every check and every test
 	$(BIN)/python -m pytest -n 2

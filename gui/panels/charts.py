@@ -15,6 +15,7 @@ from gui.views.chart_view import ChartView
 from gui.views.stability_view import StabilityView
 from gui.widgets.question import choose_path
 from instrument.chart.reader import read_chart
+from instrument.chart.words import subject_of
 from instrument.errors import FileError
 from instrument.stability_file import read_stability
 from recon.stability.shipped import shipped_file
@@ -74,16 +75,13 @@ class ChartsPanel(Panel):
         else:
             self.chart_path = path
             about = record["about"]
-            what = about.get("scene") or (about.get("inputs", {}).get("image") or {}).get(
-                "path", "a photograph"
-            )
-            said = f"{Path(str(what)).name}{' (SIMULATED)' if about.get('simulated') else ''}"
+            said = f"{subject_of(record['kind'], about)}{' (SIMULATED)' if about.get('simulated') else ''}"
             left_out = [f"{name}: {why}" for name, why in record.get("failed", {}).items()]
             left_out += [f"{name}: no time" for name in record.get("missing", ())]
             if left_out:
                 said += f"; {len(left_out)} settings could not be run or had no time"
             self._headings[self.chart] = (said, "\n".join([str(path), *left_out]))
-            self.chart.show_points(record["points"])
+            self.chart.show_points(record["points"], record["kind"])
             self.tabs.setCurrentWidget(self.chart)
         self._show_heading()
 

@@ -72,12 +72,12 @@ class ChartData:
             for f in fields(Point)
             if any(is_known(p, f.name) and getattr(p, f.name) != "" for p in self.points)
         ]
-        front = {(p.setting, p.iterations) for p in self.front()}
+        front = {(p.group, p.setting, p.iterations) for p in self.front()}
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([*names, "pareto"])
         for p in self.points:
             values = [getattr(p, n) for n in names]
             shown = ["" if v != v else f"{v:.6g}" if isinstance(v, float) else v for v in values]
-            writer.writerow([*shown, int((p.setting, p.iterations) in front)])
+            writer.writerow([*shown, int((p.group, p.setting, p.iterations) in front)])
         return text.getvalue()

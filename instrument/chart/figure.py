@@ -110,17 +110,19 @@ def _draw(
     # Each setting is named at its best point on the front.
     named = sorted({p.setting: p for p in front}.values(), key=lambda p: _x(p, cost))
     named = named[-_MOST_NAMES:]
+    up = 1 if score.more_is_better else -1
     for number, point in enumerate(named, start=1):
         axes.annotate(
             str(number),
             (_x(point, cost), getattr(point, score.key)),
-            # To the front's outer side, in turns nearer and farther: neighbours do not cover each other.
-            xytext=(-8, (7 if number % 2 else 15) * (1 if score.more_is_better else -1)),
+            # In turns on the front's outer and inner side: neighbours do not cover each other.
+            xytext=(-9, 9 * up) if number % 2 else (10, -9 * up),
             textcoords="offset points",
             fontsize=8,
             fontweight="bold",
             ha="center",
             va="center",
+            bbox={"boxstyle": "round,pad=0.1", "color": "white", "alpha": 0.8},
             arrowprops={"arrowstyle": "-", "lw": 0.5, "shrinkA": 0, "shrinkB": 2},
         )
     return named

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from instrument.chart.data import ChartData
 from recon.chart.scored import Point
@@ -24,12 +26,20 @@ def in_words(point: Point) -> str:
 
 def title_of(data: ChartData) -> str:
     """Return what was charted, of what."""
-    about = data.about
-    pixels = " x ".join(str(n) for n in about.get("pixels", ()))
-    if data.kind_name == "hologram":
-        names = ", ".join(Path(str(p)).name for p in about.get("pictures", ()))
-        return f"Holograms, time against quality: {names}, SLM of {pixels} pixels"
-    if data.kind_name == "calibration":
-        return f"Calibrations, photographs against the error of what is reconstructed: {pixels} pixels"
-    what = about.get("scene") or (about.get("inputs") or {}).get("image", {}).get("path", "photograph")
-    return f"Reconstructions, speed against accuracy: {Path(str(what)).name}, {pixels} pixels"
+    what = {
+        "reconstruction": "Reconstructions, speed against accuracy",
+        "hologram": "Holograms, time against quality",
+        "calibration": "Calibrations, photographs against the error of what is reconstructed",
+    }[data.kind_name]
+    pixels = " x ".join(str(n) for n in data.about.get("pixels", ()))
+    return f"{what}: {subject_of(data.kind_name, data.about)}, {pixels} pixels"
+
+
+def subject_of(kind: str, about: Mapping[str, Any]) -> str:
+    """Return the scene, picture, photograph or bench that was charted."""
+    if kind == "hologram":
+        return ", ".join(Path(str(p)).name for p in about.get("pictures", ())) + " on the SLM"
+    if kind == "calibration":
+        return "the simulated microscope"
+    inputs = about.get("inputs") or {}
+    return Path(str(about.get("scene") or (inputs.get("image") or {}).get("path", "photograph"))).name

@@ -10,13 +10,23 @@ import typer
 from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
 from instrument.cli.etendue import parse_size
 from instrument.cli.progress import progress_bar
+from instrument.cli.reconstruct_options import (
+    BinningOption,
+    CropOption,
+    DarkOption,
+    PsfOption,
+)
 from instrument.errors import BenchError
+from instrument.reconstruction_words import parse_binning, parse_dark
 
 if TYPE_CHECKING:
     from instrument.chart.data import ChartData
+    from instrument.reconstruction_job import Job
     from recon.chart.scored import Named, Problem
 
 app = command_app()
+
+_OWN = "--calibration (or --psf) and --image"
 
 
 @app.command(
@@ -24,8 +34,10 @@ app = command_app()
         "diffuserbench chart --scene sparse-picture",
         "diffuserbench chart --scene beads --size 40 --budget 120 --out beads-chart",
         "diffuserbench chart --calibration demo/calibration --image photo.tif --z-mm 30",
+        "diffuserbench chart --psf psf.tif --image photo.tif --bin 8",
         "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
         "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
+        "diffuserbench chart --calibrations --out calibration-chart",
         "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
     )
 )
@@ -42,12 +54,22 @@ def chart(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", "-c", metavar="FOLDER", help="Your calibration.", show_default=False),
+        typer.Option(
+            "--calibration",
+            "-c",
+            metavar="FOLDER",
+            help="Your calibration; with --volume PSF images of several depths will do.",
+            show_default=False,
+        ),
     ] = None,
+    psf: PsfOption = None,
     image: Annotated[
         Path | None,
         typer.Option("--image", "-i", metavar="FILE", help="Your photograph.", show_default=False),
     ] = None,
+    dark: DarkOption = "auto",
+    crop: CropOption = None,
+    binning: BinningOption = "auto",
     hologram: Annotated[
         list[str] | None,
         typer.Option(
@@ -58,6 +80,13 @@ def chart(
             show_default=False,
         ),
     ] = None,
+    calibrations: Annotated[
+        bool,
+        typer.Option(
+            "--calibrations",
+            help="Calibrations of a simulated microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
+        ),
+    ] = False,
     z_mm: Annotated[
         list[float] | None,
         typer.Option(
@@ -98,7 +127,16 @@ def chart(
         ),
     ] = None,
     bench: BenchOption = None,
-    size: Annotated[int, typer.Option("--size", min=16, metavar="N", help="Pixels of a scene's side.")] = 48,
+    size: Annotated[
+        int | None,
+        typer.Option(
+            "--size",
+            min=16,
+            metavar="N",
+            help="Pixels of the side of a scene (default 48) or of the microscope's sensor (about; 90).",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the scene.")] = 0,
     budget_s: Annotated[
         float, typer.Option("--budget", min=1.0, metavar="S", help="Time for all settings together, seconds.")
@@ -110,35 +148,41 @@ def chart(
 ) -> None:
     """Chart what every setting costs against how good it is, each in a process of its own, quick ones first.
 
-    Reconstructions (of --scene, or --calibration and --image): method, model, prior, iterations, binning and
-    precision. With a ground truth the error is PSNR, SSIM and NRMSE; without one the error on 5 % of the
-    pixels, which are held out and predicted from the rest. Holograms (--hologram): loss, method, expansion,
-    frames and iterations. Run the same command again to go on where it stopped.
+    Reconstructions (of --scene, or of --image with --calibration or --psf): method, model, prior, iterations,
+    binning and precision. With a ground truth the error is PSNR, SSIM and NRMSE; without one the error on 5 %
+    of the pixels, which are held out and predicted from the rest. Holograms (--hologram): loss, method,
+    expansion, frames and iterations. Calibrations (--calibrations): the number of photographs against the
+    error of what is reconstructed with them. Run the same command again to go on where it stopped.
     """
     subject = _only(
         {
             "--scene": scene is not None,
-            "--calibration and --image": calibration is not None or image is not None,
+            _OWN: any(path is not None for path in (calibration, psf, image)),
             "--hologram": bool(hologram),
+            "--calibrations": calibrations,
         }
     )
     _refuse(
         subject,
         {
-            "--volume": (volume, ("--calibration and --image",)),
-            "--z-mm": (bool(z_mm), ("--calibration and --image", "--hologram")),
+            "--volume": (volume, (_OWN,)),
+            "--dark": (dark != "auto", (_OWN,)),
+            "--crop": (crop is not None, (_OWN,)),
+            "--bin": (binning != "auto", (_OWN,)),
+            "--z-mm": (bool(z_mm), (_OWN, "--hologram")),
             "--expansion": (bool(expansion), ("--hologram",)),
             "--frames": (bool(frames), ("--hologram",)),
             "--slm": (slm is not None, ("--hologram",)),
+            "--size": (size is not None, ("--scene", "--calibrations")),
             "--bench": (bench is not None, ("--hologram",)),
         },
     )
     from instrument.chart.figure import write_charts
-    from instrument.chart.problems import problem_of_pictures, problem_of_scene
+    from instrument.chart.problems import problem_of_job, problem_of_pictures, problem_of_scene
 
     problem: Problem
     if scene is not None:
-        problem, about = problem_of_scene(scene, size, seed)
+        problem, about = problem_of_scene(scene, size or 48, seed)
     elif hologram:
         problem, about = problem_of_pictures(
             load_and_say(bench),
@@ -148,8 +192,15 @@ def chart(
             frames or (1, 2, 3),
             None if slm is None else parse_size(slm),
         )
+    elif calibrations:
+        problem, about = _calibrations(size or 90, out)
     else:
-        problem, about = _photograph(calibration, image, z_mm or [], volume=volume)
+        job = _job(calibration, psf, image, dark, crop, binning, volume=volume)
+        for name, text in job.notes.items():
+            typer.echo(f"{name:<12}{text}")
+        if len(z_mm or ()) > 1 or (z_mm and volume):
+            raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
+        problem, about = problem_of_job(job, 1e3 * z_mm[0] if z_mm else None, volume=volume)
     if about.get("simulated"):
         typer.echo("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
@@ -169,7 +220,7 @@ def _only(given: dict[str, bool]) -> str:
     if len(chosen) != 1:
         found = f"; {' and '.join(chosen)} exclude each other" if chosen else ""
         raise BenchError(
-            f"Give --scene NAME, your own --calibration FOLDER and --image FILE, or --hologram TARGET{found}."
+            f"Give one of --scene NAME, --hologram TARGET, --calibrations, or your own {_OWN}{found}."
         )
     return chosen[0]
 
@@ -180,20 +231,43 @@ def _refuse(subject: str, options: dict[str, tuple[bool, tuple[str, ...]]]) -> N
             raise BenchError(f"{name} goes with {' or '.join(subjects)}, not with {subject}.")
 
 
-def _photograph(
-    calibration: Path | None, image: Path | None, z_mm: list[float], *, volume: bool
-) -> tuple[Problem, dict[str, Any]]:
-    if calibration is None or image is None:
-        raise BenchError("Your own chart needs both --calibration FOLDER and --image FILE.")
-    if len(z_mm) > 1 or (z_mm and volume):
-        raise BenchError("--z-mm is the one distance of a flat scene: give it once, and without --volume.")
-    from instrument.chart.problems import problem_of_job
-    from instrument.reconstruction_job import job_from_calibration
+def _job(
+    calibration: Path | None,
+    psf: Path | None,
+    image: Path | None,
+    dark: str,
+    crop: str | None,
+    binning: str,
+    *,
+    volume: bool,
+) -> Job:
+    if image is None or (calibration is None) == (psf is None):
+        raise BenchError("Your own chart needs --image FILE, and either --calibration FOLDER or --psf FILE.")
+    if psf is not None and volume:
+        raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
+    from instrument.preparation import Crop
+    from instrument.reconstruction_job import job_from_calibration, job_from_files
+    from instrument.volume_job import volume_job
 
-    job = job_from_calibration(calibration, image)
-    for name, text in job.notes.items():
-        typer.echo(f"{name:<12}{text}")
-    return problem_of_job(job, 1e3 * z_mm[0] if z_mm else None, volume=volume)
+    window = None if crop is None else Crop.parse(crop)
+    level, factor = parse_dark(dark), parse_binning(binning)
+    if psf is not None:
+        return job_from_files(psf, image, dark=level, crop=window, binning=factor)
+    assert calibration is not None
+    prepared = volume_job if volume else job_from_calibration
+    return prepared(calibration, image, dark=level, crop=window, binning=factor)
+
+
+def _calibrations(size: int, out: Path) -> tuple[Problem, dict[str, Any]]:
+    from instrument.chart.bench_photographs import photographs
+    from recon.chart.calibration import CalibrationProblem
+
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "photographs.npz"
+    with saying_what_is_left(path), progress_bar() as bar:
+        task = bar.add_task("photographs", total=None, note="")
+        taken = photographs(size, path, lambda done, total: bar.update(task, completed=done, total=total))
+    return CalibrationProblem(taken), {"bench": "simulated microscope", "simulated": True}
 
 
 def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float) -> ChartData:

@@ -127,17 +127,20 @@ def test_another_scene_does_not_mix_with_a_chart(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "Give --scene"),
+        ((), "Give one of --scene"),
         (("--scene", "bead"), "not known"),
-        (("--image", "x.tif"), "both"),
+        (("--image", "x.tif"), "either --calibration FOLDER or --psf FILE"),
         (("--scene", "beads", "--hologram", "leaves"), "exclude each other"),
+        (("--calibrations", "--seed", 1, "--volume"), "--volume goes with"),
+        (("--hologram", "leaves", "--size", 40), "--size goes with"),
         (("--scene", "beads", "--frames", 2), "--frames goes with --hologram"),
         (("--hologram", "leaves", "--volume"), "--volume goes with"),
         (("--hologram", "levaes"), "no such file, and no such sample picture"),
         (("--hologram", "leaves", "--hologram", "clouds"), "--z-mm once for each"),
         (("--hologram", "leaves", "--hologram", "clouds", "--z-mm", 1, "--z-mm", 1), "a depth of its own"),
         (("--hologram", "leaves", "-q", 5), "must be a square"),
-        (("--calibration", "c", "--image", "i", "--z-mm", 1, "--z-mm", 2), "give it once"),
+        (("--psf", "p", "--image", "i", "--volume"), "--volume needs --calibration"),
+        (("--scene", "beads", "--bin", 2), "--bin goes with"),
     ],
 )
 def test_mistakes_are_named(arguments, said, tmp_path):
