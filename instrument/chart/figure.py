@@ -23,6 +23,10 @@ _MOST_NAMES = 12
 """Names of a front that fit beside a panel; of more, the cheapest are left out."""
 
 
+_SAME_PLACE = (0.02, 0.03)
+"""Parts of a panel's width and height within which two labels would cover each other."""
+
+
 def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
     """Write chart.png, chart.html and chart.csv into a folder; return their paths."""
     picture, page, table = (folder / f"chart.{kind}" for kind in ("png", "html", "csv"))
@@ -84,7 +88,7 @@ def _draw(
                 [_x(p, cost) for p in run],
                 [getattr(p, score.key) for p in run],
                 "o-",
-                ms=3,
+                ms=3 if len(run) > 1 else 5,
                 lw=0.6,
                 alpha=0.6,
                 color=colour,
@@ -108,15 +112,15 @@ def _draw(
     axes.grid(alpha=0.25)
     axes.margins(0.07, 0.1)
     # Each setting is named at its best point on the front.
-    named = sorted({p.setting: p for p in front}.values(), key=lambda p: _x(p, cost))
-    named = named[-_MOST_NAMES:]
+    named = sorted({p.setting: p for p in front}.values(), key=lambda p: _x(p, cost))[-_MOST_NAMES:]
+    places = [(_x(p, cost), float(getattr(p, score.key))) for p in named]
     up = 1 if score.more_is_better else -1
-    for number, point in enumerate(named, start=1):
+    for turn, (first, last) in enumerate(_together(axes, places)):
         axes.annotate(
-            str(number),
-            (_x(point, cost), getattr(point, score.key)),
+            str(first + 1) if first == last else f"{first + 1}-{last + 1}",
+            places[last],
             # In turns on the front's outer and inner side: neighbours do not cover each other.
-            xytext=(-9, 9 * up) if number % 2 else (10, -9 * up),
+            xytext=(10, -9 * up) if turn % 2 else (-9, 9 * up),
             textcoords="offset points",
             fontsize=8,
             fontweight="bold",
@@ -126,6 +130,20 @@ def _draw(
             arrowprops={"arrowstyle": "-", "lw": 0.5, "shrinkA": 0, "shrinkB": 2},
         )
     return named
+
+
+def _together(axes: Axes, places: Sequence[tuple[float, float]]) -> list[tuple[int, int]]:
+    """Return the first and last of neighbours for which one label must do: they lie on top of each other."""
+    runs: list[tuple[int, int]] = []
+    before = None
+    for number, place in enumerate(places):
+        at = axes.transLimits.transform(axes.transScale.transform(place))  # in fractions of the panel
+        if before is not None and all(abs(at - before) < _SAME_PLACE):
+            runs[-1] = (runs[-1][0], number)
+        else:
+            runs.append((number, number))
+        before = at
+    return runs
 
 
 def _x(point: Point, cost: Axis) -> float:

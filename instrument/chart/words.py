@@ -9,7 +9,7 @@ from typing import Any
 from instrument.chart.data import ChartData
 from recon.chart.scored import Point
 
-COLOURS = ("#00798c", "#d1495b", "#d98e04", "#4f8a5b", "#5b6ee1", "#8d6a9f", "#7a5c3e", "#e0559a")
+COLOURS = ("#00798c", "#d1495b", "#d98e04", "#4f8a5b", "#5b6ee1", "#b04fc4", "#7a5c3e", "#e0559a")
 """Told apart on white and on black."""
 
 

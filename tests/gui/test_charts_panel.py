@@ -176,12 +176,47 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     assert [p["seconds"] for p in view.front] == [0.01, 0.1, 0.4]
     view.table.selectRow(1)
     assert describe(view.front[1]) == (
-        "admm tv, 0.1 s, 10 iterations, PSNR (dB) 20, error on pixels held out (noise = 1) 10, memory 9 MiB"
+        "admm tv, 0.1 s, 10 iterations, PSNR (dB) 20, error on held-out pixels (noise = 1) 10, memory 9 MiB"
     )
     qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
     names: dict = {}
     exec(QApplication.clipboard().text(), names)
     assert names["ranked"][0]["psnr_db"] == 26.0
+
+
+def test_a_chart_of_calibrations_is_drawn_against_photographs_scene_by_scene(
+    qtbot: QtBot, panel: ChartsPanel, tmp_path: Path
+) -> None:
+    rows = [
+        ("one PSF", 1, "flat picture", 18.0), ("3 x 3", 9, "flat picture", 22.0),
+        ("5 x 5", 25, "flat picture", 21.0), ("one PSF", 1, "beads", 20.0), ("axial", 5, "beads", 27.0),
+    ]  # fmt: skip
+    points = [
+        {"setting": s, "iterations": 40, "seconds": 0.5, "psnr_db": p, "images": n, "group": g, "family": s}
+        for s, n, g, p in rows
+    ]
+    record = {
+        "schema": 2, "kind": "calibration", "about": {"simulated": True}, "points": points,
+        "pareto": [], "failed": {}, "missing": [],
+    }  # fmt: skip
+    path = tmp_path / "chart.json"
+    path.write_text(json.dumps(record))
+    panel.open(path)
+    view = panel.chart
+    qtbot.waitUntil(lambda: bool(view.front), timeout=WAIT_MS)
+    assert panel.heading.text() == "the simulated microscope (SIMULATED)"
+    assert view.cost_key == "images"
+    assert [p["setting"] for p in view.front] == ["one PSF", "3 x 3"]
+    assert view.table.rowCount() == 3
+    view.group.setCurrentText("beads")
+    assert [p["setting"] for p in view.front] == ["one PSF", "axial"]
+    assert view.table.rowCount() == 2
+    view.table.selectRow(0)
+    assert view.place.text() == (
+        "axial, 0.5 s, 40 iterations, 5 photographs, PSNR of the reconstruction (dB) 27"
+    )
+    view.cost.setCurrentIndex(view.cost.findData("seconds"))
+    assert [p["setting"] for p in view.front] == ["axial"]
 
 
 def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel, tmp_path: Path) -> None:
