@@ -201,7 +201,7 @@ def report(args: argparse.Namespace, curves: dict, truth, best) -> None:
             f"{name:28s} {1000 * pace:5.0f} ms/iteration  within 0.1 dB: {settled}  "
             f"objective within 1 %: {near}  end {c[-1, 2]:.2f} dB at {c[-1, 1]:.0f} s"
         )
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5))
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
     for name, c in curves.items():
         axes[0].semilogx(c[:, 1], c[:, 2], label=name)
     axes[0].axhline(converged - 0.1, color="0.7", lw=0.8)
@@ -210,7 +210,6 @@ def report(args: argparse.Namespace, curves: dict, truth, best) -> None:
     for axis, (title, image) in zip(axes[1:], (("truth", truth), ("reconstruction", best)), strict=True):
         axis.imshow(image, cmap="gray", vmax=np.percentile(truth, 99.5), vmin=0)
         axis.set(title=title, xticks=(), yticks=())
-    figure.tight_layout()
     figure.savefig(args.out / "dense-2d.png", dpi=100)
     print(f"curves and picture in {args.out}")
 

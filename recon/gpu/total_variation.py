@@ -53,7 +53,7 @@ class PlainTotalVariation(PlainSolver):
         isotropic: bool = False,
         initial: npt.NDArray[Any] | None = None,
         kappa: float = 1.0,
-        relaxation: float = 1.7,
+        relaxation: float = 1.8,
     ) -> None:
         super().__init__()
         self.camera, self.weight, self.isotropic = camera, float(weight), isotropic

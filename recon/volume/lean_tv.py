@@ -89,7 +89,7 @@ class LeanTotalVariation(VolumeSplitting):
         initial: Array | None = None,
         penalty: float | None = None,
         kappa: float = 1.0,
-        relaxation: float = 1.7,
+        relaxation: float = 1.8,
         balance: bool = True,
         keep_state: bool = True,
         storage: Storage | None = None,

@@ -401,7 +401,7 @@ def _depths_um(calibration: Calibration) -> npt.NDArray[np.float64]:
 def _uncertified(empty: list[EmptyPlanes]) -> list[str]:
     return [
         f"Stopped before it was certain that {len(e.planes)} depth planes are empty: on one of them the "
-        f"residual's correlation is {e.worst:.2f} tau. Let it run longer, or give drop_empty=False."
+        f"residual's correlation is {e.worst:.2f} tau. Let it run longer (or, in Python, drop_empty=False)."
         for e in empty
         if not e.certified
     ]
