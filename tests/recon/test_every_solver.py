@@ -166,7 +166,7 @@ def test_goes_on_exactly_from_what_was_kept(case):
     solver().run(StoppingRules(iterations=31, tolerance=0), keeper=kept)
     assert kept.ends == 1
     rest = solver().run(rules, keeper=Kept(kept.state, kept.history))
-    # To rounding: sums depend on where in memory arrays happen to lie.
+    # Bit for bit here, wherever in memory arrays were put; a BLAS may sum otherwise elsewhere.
     assert rest.solution == pytest.approx(whole.solution, abs=1e-8 * float(np.abs(whole.solution).max()))
     assert [r.objective for r in rest.history] == pytest.approx(
         [r.objective for r in whole.history], rel=1e-8
