@@ -28,6 +28,8 @@ class Colours:
     """For plots, in turn."""
     colour_map: str
     """The images' colour map to begin with: a name of ``gui.widgets.colour_maps``."""
+    red_light_only: bool = False
+    """Whether hues cannot tell things apart: brightness has to."""
 
 
 DARK = Colours(
@@ -61,6 +63,7 @@ RED = Colours(
     stop_text="#000000",
     curves=("#ff4a3d", "#a82a22", "#ff8074", "#7a1a14", "#d83a30", "#ff2a1c"),
     colour_map="red",
+    red_light_only=True,
 )
 """Only red light: no channel but red above a few levels."""
 THEMES = {"dark": DARK, "red": RED}
@@ -110,6 +113,7 @@ def apply_theme(app: QApplication, name: str) -> None:
 
 def _style(c: Colours) -> str:
     faint = QColor(c.dim).darker(150).name()
+    filled = QColor(c.accent).darker(220).name()  # text over it stays readable
     return f"""
 QWidget {{ font-size: 10pt; }}
 QToolTip {{ background: {c.field}; color: {c.text}; border: 1px solid {c.line}; padding: 3px; }}
@@ -120,7 +124,7 @@ QLineEdit:focus, QPlainTextEdit:focus, QListView:focus, QTableView:focus {{ bord
 QGraphicsView {{ border: 1px solid transparent; }}
 QGraphicsView:focus {{ border: 1px solid {c.accent}; }}
 QLineEdit:read-only {{ background: {c.panel}; }}
-*[refused="true"] {{ border: 1px solid {c.error}; color: {c.error}; }}
+*[refused="true"] {{ border: 2px solid {c.error}; color: {c.error}; font-weight: 700; }}
 QLabel#reason {{ color: {c.error}; font-size: 9pt; }}
 QLabel#refusal {{ color: {c.warning}; }}
 QLabel#dim, QLabel[role="dim"] {{ color: {c.dim}; }}
@@ -157,12 +161,14 @@ QDockWidget::title {{ background: {c.panel}; padding: 4px 8px; }}
 QMainWindow::separator {{ background: {c.line}; width: 3px; height: 3px; }}
 QSplitter::handle {{ background: {c.line}; }}
 QProgressBar {{ background: {c.field}; border: 1px solid {c.line}; border-radius: 4px; text-align: center; }}
-QProgressBar::chunk {{ background: {c.accent}; border-radius: 3px; }}
+QProgressBar::chunk {{ background: {filled}; border-radius: 3px; }}
 QScrollBar:vertical {{ background: {c.window}; width: 10px; }}
 QScrollBar:horizontal {{ background: {c.window}; height: 10px; }}
 QScrollBar::handle {{ background: {c.line}; border-radius: 4px; min-height: 24px; min-width: 24px; }}
 QScrollBar::add-line, QScrollBar::sub-line {{ width: 0; height: 0; }}
 QStatusBar {{ background: {c.panel}; color: {c.dim}; }}
+QToolBar {{ border: none; border-bottom: 1px solid {c.line}; }}
+QMenuBar {{ border: none; }}
 QMenuBar, QMenu {{ background: {c.panel}; }}
 QMenu::item:selected, QMenuBar::item:selected {{ background: {c.accent}; color: {c.window}; }}
 """

@@ -175,7 +175,7 @@ class LedPanel(Panel):
             y=places[:, 1],
             size=0.8 * _spacing(places),
             brush=brushes,
-            pen=pg.mkPen(now.line),
+            pen=pg.mkPen(now.dim),
             data=np.arange(len(places)),
             hoverable=True,
             tip=lambda x, y, data: f"LED {data}: {x:.1f}, {y:.1f} mm",
@@ -258,9 +258,11 @@ class LedPanel(Panel):
 
 
 def _brush(rgb: Rgb) -> Any:
-    """Return an LED's colour as drawn: its hue, never too dark to be seen."""
+    """Return an LED's colour as drawn: its hue where the theme has hues, never too dark to be seen."""
     top = max(rgb)
     shown = _DIMMEST + (255 - _DIMMEST) * top / 255
+    if colours().red_light_only:
+        return pg.mkBrush(round(shown), 0, 0)
     return pg.mkBrush(*(round(shown * level / top) for level in rgb))
 
 

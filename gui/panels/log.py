@@ -82,6 +82,10 @@ class LogPanel(Panel):
             "logging.basicConfig(level=logging.INFO, format=line)\n"
         )
 
+    def theme_changed(self) -> None:
+        """Write the lines anew: their colours say what they are."""
+        self._show_all()
+
     def _is_shown(self, line: _Line) -> bool:
         level = LEVELS.index(line.level) if line.level in LEVELS else 1
         return level >= self.level.currentIndex() and self.words.text().lower() in line.text.lower()

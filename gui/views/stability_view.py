@@ -20,6 +20,8 @@ _SPAN = 1.0
 """The colours reach from a tenth of the severity at the boundary to ten times of it."""
 _STRENGTH = 0.75
 """Of the colours: figures are read on them."""
+_BRIGHT = 0.3
+"""Lightness of a cell from which on its figure is written dark."""
 
 
 class StabilityView(QWidget):
@@ -37,10 +39,7 @@ class StabilityView(QWidget):
         self.question = QLabel()
         self.question.setWordWrap(True)
         self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.place = QLabel(
-            "Green works, red fails, dark is the boundary; numbers are errors. Point at a cell, "
-            "or go there by arrow keys, for more."
-        )
+        self.place = QLabel(_hint())
         self.place.setProperty("role", "dim")
         self.place.setWordWrap(True)
         self.legend = QLabel()
@@ -89,6 +88,7 @@ class StabilityView(QWidget):
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
         restyle(self.plot)
+        self.place.setText(_hint())
         self._draw()
 
     def _choose_map(self) -> None:
@@ -110,12 +110,13 @@ class StabilityView(QWidget):
         method = record["methods"][name]
         severity = _grid(method["severity"])
         level = np.log10(np.maximum(severity, 1e-2))
-        self.image.setImage(_coloured(level), levels=(0, 255))
+        cells = _coloured(level)
+        self.image.setImage(cells, levels=(0, 255))
         self.image.setRect(-0.5, -0.5, severity.shape[1], severity.shape[0])
         self.plot.addItem(self.image)
         self._cursor.setPen(pg.mkPen(colours().text, width=2))
         self.plot.addItem(self._cursor, ignoreBounds=True)
-        self._write_errors(_grid(method["error"]))
+        self._write_errors(_grid(method["error"]), cells)
         for number, (other, found) in enumerate(record["methods"].items()):
             self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
         self.legend.setText(
@@ -137,10 +138,12 @@ class StabilityView(QWidget):
         self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
         self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
 
-    def _write_errors(self, errors: npt.NDArray[np.float64]) -> None:
+    def _write_errors(self, errors: npt.NDArray[np.float64], cells: npt.NDArray[np.uint8]) -> None:
         for (iy, ix), error in np.ndenumerate(errors):
             if np.isfinite(error):
-                text = pg.TextItem(f"{error:.2g}", color=colours().text, anchor=(0.5, 0.5))
+                ground = pg.mkColor(*(int(c) for c in cells[iy, ix]))
+                colour = colours().window if ground.lightnessF() > _BRIGHT else colours().text
+                text = pg.TextItem(f"{error:.2g}", color=colour, anchor=(0.5, 0.5))
                 text.setPos(ix, iy)
                 self.plot.addItem(text)
 
@@ -201,14 +204,22 @@ def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
     return np.array([[np.nan if v is None else v for v in row] for row in rows], float)
 
 
+def _hint() -> str:
+    fails, works = ("Bright", "dim") if colours().red_light_only else ("Red", "green")
+    return (
+        f"{fails} fails, {works} works, dark is the boundary; numbers are errors. Point at a cell for more."
+    )
+
+
 def _colour(number: int) -> str:
     return colours().curves[number % len(colours().curves)]
 
 
 def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
-    """Return (rows, columns, 3): green works, red fails, dark at the boundary."""
+    """Return (rows, columns, 3): green or dim works, red or bright fails, dark at the boundary."""
     now = colours()
-    works, middle, fails = (pg.mkColor(c).getRgb()[:3] for c in (now.ok, now.window, now.error))
+    good = now.line if now.red_light_only else now.ok
+    works, middle, fails = (pg.mkColor(c).getRgb()[:3] for c in (good, now.window, now.error))
     share = np.clip(np.nan_to_num(level) / _SPAN, -1, 1)[..., None]
     end = np.where(share < 0, np.array(works, float), np.array(fails, float))
     shown = np.array(middle, float) + np.abs(share) * _STRENGTH * (end - np.array(middle, float))

@@ -15,6 +15,8 @@ from gui.widgets.plot import curve_pen, plot_widget, restyle
 from instrument.frame_view import grouped
 
 BINS = 256
+_SHADE = 18
+"""Opacity of the counts between the levels, of 255."""
 
 
 class HistogramPlot(QWidget):
@@ -40,12 +42,13 @@ class HistogramPlot(QWidget):
         self.plot.disableAutoRange()
         self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0)
         self._fill()
-        self.region: Any = pg.LinearRegionItem(brush=(255, 255, 255, 18))
+        self.region: Any = pg.LinearRegionItem()
         self.region.sigRegionChanged.connect(self._dragged)
         self.plot.addItem(self.region)
-        self.full_scale: Any = pg.InfiniteLine(angle=90, pen=pg.mkPen(colours().error, width=1.5))
+        self.full_scale: Any = pg.InfiniteLine(angle=90)
         self.full_scale.setToolTip("full scale of the sensor")
         self.plot.addItem(self.full_scale)
+        self._style_lines()
         self._quiet = False
         self._ranges = (0, 0.0)
         self.setToolTip("Histogram of the raw data. Drag the borders to choose levels; red: full scale")
@@ -75,6 +78,17 @@ class HistogramPlot(QWidget):
         restyle(self.plot)
         self.curve.setPen(curve_pen(0))
         self._fill()
+        self._style_lines()
+
+    def _style_lines(self) -> None:
+        now = colours()
+        shade = pg.mkColor(now.text)
+        shade.setAlpha(_SHADE)
+        self.region.setBrush(shade)
+        for line in self.region.lines:
+            line.setPen(pg.mkPen(now.warning))
+            line.setHoverPen(pg.mkPen(now.text))
+        self.full_scale.setPen(pg.mkPen(now.error, width=1.5))
 
     def _fill(self) -> None:
         colour = pg.mkColor(colours().accent)

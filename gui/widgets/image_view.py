@@ -98,6 +98,11 @@ class ImageView(QWidget):
         if self.image is not None:
             self.item.setLookupTable(table(name))
 
+    def restyle(self) -> None:
+        """Take over the background and the colour map of the theme in use."""
+        self.graphics.setBackground(colours().window)
+        self.set_colour_map(colours().colour_map)
+
     def show_image(self, image: Image, low: float, high: float, full_scale: int | None = None) -> None:
         """Show an image.
 

@@ -1,0 +1,80 @@
+"""The theme for the dark room: no light but red, anywhere, and what is written before keeps its meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QImage
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels import PANELS
+from gui.panels.log import LogPanel
+from gui.theme import DARK, RED, colours
+from gui.widgets.image_view import ImageView
+
+WAIT_MS = 20_000
+_MOST_OTHER = 130
+"""Levels of green and blue that antialiased, pale red marks may have: the mark of saturation has 120."""
+
+
+def _not_red(window: MainWindow) -> float:
+    """Return the share of the window's pixels that shine in green or blue."""
+    picture = window.grab().toImage().convertToFormat(QImage.Format.Format_RGB888)
+    width, height = picture.width(), picture.height()
+    rows = np.frombuffer(picture.constBits(), np.uint8).reshape(height, picture.bytesPerLine())
+    pixels = rows[:, : 3 * width].reshape(height, width, 3)
+    return float((pixels[..., 1:].max(axis=2) > _MOST_OTHER).mean())
+
+
+@pytest.fixture
+def red_window(qtbot: QtBot, window: MainWindow) -> Iterator[MainWindow]:
+    window.resize(1280, 900)
+    qtbot.waitUntil(lambda: window.session.live.newest() is not None, timeout=WAIT_MS)
+    for name in PANELS:
+        window.show_panel(name)
+        qtbot.wait(30)
+    for view in window.findChildren(ImageView):  # white pictures, made under the other theme
+        view.show_image(np.full((40, 60), 200, np.uint8), 0, 200)
+    qtbot.keyClick(
+        window, Qt.Key.Key_2, Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
+    )
+    assert colours() is RED
+    yield window
+    window.set_theme("dark")
+
+
+def test_every_panel_is_red_also_what_was_there_before(qtbot: QtBot, red_window: MainWindow) -> None:
+    views = red_window.findChildren(ImageView)
+    assert len(views) >= 8
+    assert {view.colour_map for view in views} == {"red"}
+    for name in PANELS:
+        red_window.show_panel(name)
+        qtbot.wait(30)
+        assert _not_red(red_window) < 2e-3, name
+
+
+def test_a_line_of_the_log_keeps_what_its_colour_says(window: MainWindow) -> None:
+    log = window.panel("log")
+    assert isinstance(log, LogPanel)
+    window.session.log("info", "a line of before")
+    window.session.log("error", "a mistake of before")
+    window.set_theme("red")
+
+    def colour(text: str) -> QColor:
+        block = log.view.document().begin()
+        while block.isValid():
+            if text in block.text():
+                fragments = [f.fragment() for f in block]
+                return fragments[-1].charFormat().foreground().color()
+            block = block.next()
+        raise AssertionError(text)
+
+    assert colour("a line of before") == QColor(RED.text)
+    assert colour("a mistake of before") == QColor(RED.error)
+    window.set_theme("dark")
+    assert colour("a line of before") == QColor(DARK.text)
+    assert {view.colour_map for view in window.findChildren(ImageView)} == {"grey"}
