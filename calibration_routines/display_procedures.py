@@ -146,7 +146,7 @@ class AlignmentProcedure:
         return Outlook(
             (
                 f"Mask of {display.mask.shape[0]} x {display.mask.shape[1]} pixels, searched for within "
-                f"+-{self.settings.reach:g} of its pixels and +-{self.settings.depth_um:g} um",
+                f"±{self.settings.reach:g} of its pixels and ±{self.settings.depth_um:g} µm",
                 f"{self.settings.max_frames} frames at most; "
                 + (f"the stage moves {moves} times at most" if moves and bench.stage else "nothing moves"),
             )

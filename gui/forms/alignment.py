@@ -31,7 +31,7 @@ ALIGNMENT = Form(
     "Finds the scattering mask by spots on the camera, moves its stage, and keeps what is left",
     (
         field_of(AlignmentSettings, "reach", "Reach", "Largest shift to look for", unit="mask px"),
-        field_of(AlignmentSettings, "depth_um", "Depth", "Largest distance to look for", unit="um"),
+        field_of(AlignmentSettings, "depth_um", "Depth", "Largest distance to look for", unit="µm"),
         field_of(AlignmentSettings, "moves", "Stage moves", "At most; 0: nothing moves", "whole"),
         field_of(AlignmentSettings, "max_frames", "Frames", "Give up rather than take more", "whole"),
         Field("rows", "Section rows", "Of the SLM, measured one by one", "whole", _SECTIONS[0]),

@@ -102,7 +102,7 @@ def _planes(settings: type) -> tuple[Field, ...]:
             "lenslet_um",
             "Lenslet",
             "Diameter of a microlens diffuser's lenslets, for the number of planes (Kuo 2020, Eq. 5.10)",
-            unit="um",
+            unit="µm",
             optional="no lenslets",
             advanced=True,
         ),

@@ -276,7 +276,11 @@ class StagePanel(Panel):
             return
         if repeated and self.session.jobs.is_busy("stage"):
             return
-        step = self.steps[row.axis.unit].value or 0.0
+        field = self.steps[row.axis.unit]
+        if not field.submit():  # not by the step of before
+            field.setFocus()
+            return
+        step = field.value or 0.0
         name, delta = row.axis.name, steps * step
         self._start(f"Jog {letter} by {delta:g} {_words(row.axis.unit)}", {name: delta}, relative=True)
 
@@ -285,9 +289,12 @@ class StagePanel(Panel):
 
     def _move_to(self, name: str, value: float) -> None:
         row = self.rows[name]
-        job = self._start(f"Move {name} to {value:g}", {name: value}, relative=False)
+        words = f"Move {name.rpartition('_')[0] or name} to {value:g} {_words(row.axis.unit)}"
+        job = self._start(words, {name: value}, relative=False)
         if job is not None:
             job.failed.connect(row.target.refuse)
+            # Stopped on its way: the field shows where it is, and the same target can be entered again.
+            job.cancelled.connect(lambda _: row.target.set_value(None, overwrite=True))
 
     def _start(self, title: str, where: dict[str, float], *, relative: bool) -> Job | None:
         stage = self.session.bench.stage

@@ -168,9 +168,9 @@ class FormView(QWidget):
     def _make(self, field: Field) -> tuple[QWidget, QWidget]:
         """Return the widget that is edited, and what goes into the row."""
         if field.kind in ("number", "whole"):
-            number = NumberEdit(
-                field.unit, integer=field.kind == "whole", tip=field.tip, empty=field.optional
-            )
+            # An empty field shows no unit by itself.
+            empty = f"{field.optional} ({field.unit})" if field.optional and field.unit else field.optional
+            number = NumberEdit(field.unit, integer=field.kind == "whole", tip=field.tip, empty=empty)
             number.textEdited.connect(self._edited)
             number.submitted.connect(self._edited)
             return number, number

@@ -8,9 +8,23 @@ from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QFocusEvent, QKeyEvent
 from PySide6.QtWidgets import QLineEdit, QWidget
 
+_LENGTHS_UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_TIMES_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
+_LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
+
+
+def _factor(typed: str, unit: str) -> float | None:
+    """Return what a number in a typed unit is multiplied with to be in another; None where that is none."""
+    for scale in (_LENGTHS_UM, _TIMES_MS):
+        if typed in scale and unit in scale:
+            return scale[typed] / scale[unit]
+    return None
+
 
 class NumberEdit(QLineEdit):
     """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
+
+    Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds.
 
     A value that is none, or outside the limits, is refused where it stands, with the reason as tool tip; what
     was typed stays to be corrected. Nothing is ever clipped.
@@ -142,31 +156,38 @@ class NumberEdit(QLineEdit):
         text = self.text().strip()
         if not text:
             return None, "" if self.placeholderText() else "A number is needed."
-        if self.unit and text.endswith(self.unit):
-            text = text.removesuffix(self.unit).strip()
+        digits = text.rstrip(_LETTERS).strip()
+        typed = text[len(digits) :].strip() if digits else ""
+        factor: float | None = 1.0 if typed in ("", self.unit) else _factor(typed, self.unit)
         try:
-            number = float(text.replace(",", "."))
+            number = float(digits.replace(",", "."))
         except ValueError:
+            factor = None
+        if factor is None:
             return None, f"{text!r} is no number{f' of {self.unit}' if self.unit else ''}."
+        # 2 cm are 20 mm, not 20.000000000000004.
+        number = float(f"{number * factor:.15g}")
         if not math.isfinite(number):
             return None, f"{text} is no finite number."
         if self._integer and number != int(number):
             return None, f"{number:g} is no whole number."
         if not self.minimum <= number <= self.maximum:
-            return None, f"{number:g} is outside {self._range()}."
+            unit = f" {self.unit}" if self.unit else ""
+            in_force = "" if self._value is None else f" In force: {self._text(self._value)}."
+            return None, f"{number:g}{unit} is outside what is allowed: {self._range()}.{in_force}"
         return number, ""
 
     def _range(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         if math.isinf(self.maximum):
-            return f"{self.minimum:g}{unit} and more"
+            return f"{self.minimum:g}{unit} or more"
         if math.isinf(self.minimum):
-            return f"{self.maximum:g}{unit} and less"
+            return f"{self.maximum:g}{unit} or less"
         return f"{self.minimum:g} to {self.maximum:g}{unit}"
 
     def _limits_tip(self) -> str:
         if math.isinf(self.minimum) and math.isinf(self.maximum):
-            return self._tip
+            return f"{self._tip}\nin {self.unit}".strip() if self.unit else self._tip
         return f"{self._tip}\n{self._range()}".strip()
 
     def _text(self, number: float) -> str:

@@ -1,0 +1,71 @@
+"""Numbers typed with units: the field's own, another of its kind, none of its kind."""
+
+from __future__ import annotations
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.widgets.number_edit import NumberEdit
+
+
+def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:
+    field = NumberEdit(unit, value, tip="What it is", **limits)  # type: ignore[arg-type]
+    qtbot.addWidget(field)
+    field.show()
+    return field
+
+
+def _type(qtbot: QtBot, field: NumberEdit, text: str) -> None:
+    field.selectAll()
+    qtbot.keyClicks(field, text)
+    qtbot.keyClick(field, Qt.Key.Key_Return)
+
+
+@pytest.mark.parametrize(
+    ("unit", "typed", "value"),
+    [
+        ("ms", "2.5", 2.5),
+        ("ms", "2,5 ms", 2.5),
+        ("ms", "0.002 s", 2.0),
+        ("ms", "300us", 0.3),
+        ("µm", "250 mm", 250e3),
+        ("µm", "7 um", 7.0),
+        ("mm", "2 cm", 20.0),
+        ("mm", "1e3 um", 1.0),
+        ("mask px", "12 mask px", 12.0),
+        ("×", "3×", 3.0),
+        ("", "1e2", 100.0),
+    ],
+)
+def test_a_number_may_carry_a_unit_of_the_same_kind(
+    qtbot: QtBot, unit: str, typed: str, value: float
+) -> None:
+    field = _field(qtbot, unit)
+    _type(qtbot, field, typed)
+    assert not field.property("refused"), field.toolTip()
+    assert field.value == value
+
+
+@pytest.mark.parametrize("typed", ["3 mm", "three", "1e", "", "ms", "nan", "inf ms", "1 2"])
+def test_what_is_no_number_of_the_unit_is_refused_with_the_reason(qtbot: QtBot, typed: str) -> None:
+    field = _field(qtbot)
+    field.selectAll()
+    qtbot.keyClick(field, Qt.Key.Key_Delete)
+    _type(qtbot, field, typed)
+    assert field.property("refused")
+    assert "number" in field.toolTip()
+    assert field.value == 10.0
+    assert not field.submit()
+
+
+def test_a_refused_number_is_told_with_the_limits_and_the_one_in_force(qtbot: QtBot) -> None:
+    field = _field(qtbot, minimum=0.05)
+    _type(qtbot, field, "-3")
+    assert field.toolTip() == "-3 ms is outside what is allowed: 0.05 ms or more. In force: 10 ms."
+    _type(qtbot, field, "10")
+    assert field.toolTip() == "What it is\n0.05 ms or more"
+
+
+def test_the_tip_tells_the_unit_where_there_are_no_limits(qtbot: QtBot) -> None:
+    assert _field(qtbot, "mm", None).toolTip() == "What it is\nin mm"

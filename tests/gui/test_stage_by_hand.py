@@ -1,0 +1,68 @@
+"""The stage in an operator's hands: steps that make no sense, and a target entered again after STOP."""
+
+from __future__ import annotations
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.stage import StagePanel
+
+WAIT_MS = 20_000
+LEFT = Qt.MouseButton.LeftButton
+
+
+@pytest.fixture
+def stage(qtbot: QtBot, window: MainWindow) -> StagePanel:
+    panel = window.show_panel("stage")
+    assert isinstance(panel, StagePanel)
+    device = window.session.bench.stage
+    assert device is not None
+    device.home()
+    qtbot.waitUntil(lambda: panel.state.text() == "At rest, homed", timeout=WAIT_MS)
+    return panel
+
+
+def _type(qtbot: QtBot, field: object, text: str) -> None:
+    field.setFocus()  # type: ignore[attr-defined]
+    field.selectAll()  # type: ignore[attr-defined]
+    qtbot.keyClicks(field, text)
+
+
+def test_a_step_that_makes_no_sense_moves_nothing(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    device = window.session.bench.stage
+    assert device is not None
+    before = device.position()
+    _type(qtbot, stage.steps["um"], "-5")
+    qtbot.mouseClick(stage.pad, LEFT)
+    qtbot.keyClick(stage.pad, Qt.Key.Key_Right)
+    assert stage.steps["um"].property("refused")
+    assert not window.session.jobs.is_busy("stage")
+    assert device.position() == before
+    _type(qtbot, stage.steps["um"], "0.2 mm")
+    qtbot.mouseClick(stage.pad, LEFT)
+    qtbot.keyClick(stage.pad, Qt.Key.Key_Right)
+    qtbot.waitUntil(lambda: device.position()["x_um"] == before["x_um"] + 200, timeout=WAIT_MS)
+
+
+def test_a_target_can_be_entered_again_after_stop(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    device = window.session.bench.stage
+    assert device is not None
+    target = stage.rows["z_um"].target
+    for _ in range(2):
+        _type(qtbot, target, "290000")
+        qtbot.keyClick(target, Qt.Key.Key_Return)
+        qtbot.waitUntil(lambda: device.is_moving, timeout=WAIT_MS)
+        assert "Move z to 290000 µm" in window.job_label.text()
+        with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+            qtbot.keyClick(target, Qt.Key.Key_Escape)
+        here = device.position()["z_um"]
+        assert here < 290_000
+        qtbot.waitUntil(
+            lambda here=here: target.value is not None and abs(target.value - here) < 1, timeout=WAIT_MS
+        )
