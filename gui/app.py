@@ -46,7 +46,7 @@ def run(config: BenchConfig) -> int:
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, end)
     try:
-        window = MainWindow(session, settings)
+        window = MainWindow(session, settings, app.primaryScreen().availableSize())
         window.show()
         if not session.is_closing:
             session.open()

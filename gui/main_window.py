@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from PySide6.QtCore import QEvent, QObject, QSettings, Qt
+from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
 from PySide6.QtWidgets import (
     QApplication,
@@ -27,6 +27,7 @@ from gui.panels import PANELS, PanelEntry
 from gui.session import BenchSession, OperatorRequest
 from gui.theme import THEMES, apply_theme
 from gui.widgets.device_chips import DeviceChips
+from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.panel_place import PanelPlace
 from gui.widgets.question import Question
@@ -38,6 +39,14 @@ _AREAS = {
 }
 
 
+_SIZE = QSize(1600, 980)
+_ROOMY = QSize(1500, 860)
+"""From here on the log and the panels at the right stand side by side with the live view."""
+
+_COMPACT_PX = 480
+"""Width of the panels at the right of a small screen."""
+
+
 class MainWindow(QMainWindow):
     """All panels, the devices' states, the running job, the log, and STOP.
 
@@ -47,10 +56,14 @@ class MainWindow(QMainWindow):
         Not yet open; the caller opens it.
     settings : QSettings
         Where the window's layout is kept.
+    room : QSize, optional
+        What the screen has for windows; on a small one there are fewer panels side by side at first.
     """
 
-    def __init__(self, session: BenchSession, settings: QSettings) -> None:
+    def __init__(self, session: BenchSession, settings: QSettings, room: QSize | None = None) -> None:
         super().__init__()
+        size = _SIZE if room is None else _SIZE.boundedTo(room)
+        self._compact = size.width() < _ROOMY.width() or size.height() < _ROOMY.height()
         self.session = session
         self._settings = settings
         self._panels: dict[str, Panel] = {}
@@ -81,7 +94,7 @@ class MainWindow(QMainWindow):
         session.closed.connect(self._close_now)
         session.jobs.job_started.connect(self._job_started)
         session.jobs.job_ended.connect(self._job_ended)
-        self.resize(1600, 980)
+        self.resize(size)
         self._restore_layout()
         self._show_simulated()
         self.panel("log")  # from the first line on
@@ -129,6 +142,12 @@ class MainWindow(QMainWindow):
             self._docks[name] = dock
         for dock in first.values():
             dock.raise_()
+        if self._compact:
+            for area in ("top right", "bottom"):
+                self.tabifyDockWidget(first["right"], first[area])
+            first["top right"].raise_()
+            self.resizeDocks([first["right"]], [_COMPACT_PX], Qt.Orientation.Horizontal)
+            return
         self.setCorner(Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
         if "top right" in first and "right" in first:
             self.resizeDocks([first["top right"], first["right"]], [430, 430], Qt.Orientation.Vertical)
@@ -246,6 +265,8 @@ class MainWindow(QMainWindow):
         self._settings.setValue("theme", name)
         for kind in self.session.kinds:
             self.chips.show_state(kind)
+        for view in self.findChildren(ImageView):  # of every panel: one white picture spoils a dark room
+            view.restyle()
         for panel in self._panels.values():
             panel.theme_changed()
 

@@ -1,0 +1,72 @@
+"""The window on a small screen: everything of the live view within reach, STOP in sight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from PySide6.QtCore import QPoint, QRect, QSettings, QSize
+from PySide6.QtWidgets import QScrollArea, QWidget
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.live import LivePanel
+from gui.session import BenchSession
+
+ROOM = QSize(1280, 720)
+
+
+@pytest.fixture
+def small(qtbot: QtBot, session: BenchSession, settings: QSettings) -> Iterator[MainWindow]:
+    window = MainWindow(session, settings, ROOM)
+    window.show()
+    with qtbot.waitExposed(window):
+        pass
+    yield window
+    for panel in window._panels.values():
+        panel.shutdown()
+    session.close()
+    window._may_close = True
+    window.close()
+
+
+def test_the_live_view_is_whole_on_a_small_screen(qtbot: QtBot, small: MainWindow) -> None:
+    assert small.size() == ROOM
+    live = small.show_panel("live")
+    assert isinstance(live, LivePanel)
+    qtbot.wait(100)
+    inside = QRect(QPoint(0, 0), ROOM)
+    shown: tuple[QWidget, ...] = (
+        small.stop_button,
+        live.live_button,
+        live.light_buttons.buttons()[-1],
+        live.form.exposure,
+        live.view,
+        live.record_bar.button,
+        live.record_bar.gauge,
+    )
+    scroll = _scroll_of(live)
+    assert scroll.horizontalScrollBar().maximum() == scroll.verticalScrollBar().maximum() == 0
+    for widget in shown:
+        place = QRect(widget.mapTo(small, QPoint(0, 0)), widget.size())
+        assert inside.contains(place), widget
+    assert live.view.width() > 400
+    assert live.view.height() > 250
+    for name in ("live_reconstruction", "stage", "led_array", "slm", "log"):
+        panel = small.show_panel(name)
+        assert panel.isVisible(), name
+
+
+def test_no_panel_at_the_side_needs_scrolling_along_its_width(qtbot: QtBot, small: MainWindow) -> None:
+    for name in ("live_reconstruction", "stage", "led_array", "slm", "log"):
+        panel = small.show_panel(name)
+        qtbot.wait(50)
+        assert _scroll_of(panel).horizontalScrollBar().maximum() == 0, name
+
+
+def _scroll_of(panel: QWidget) -> QScrollArea:
+    around = panel.parent()
+    while not isinstance(around, QScrollArea):
+        assert around is not None
+        around = around.parent()
+    return around
