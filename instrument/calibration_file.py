@@ -140,6 +140,31 @@ def is_calibration(folder: Path | str) -> bool:
     return (Path(folder) / _JSON).is_file()
 
 
+def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:
+    """Return the depths that a calibration holds PSFs of, nearest first, without reading the PSFs.
+
+    Empty where depths are not known.
+
+    Raises
+    ------
+    CalibrationFileError
+    """
+    path = Path(folder) / _JSON
+    try:
+        depths = {
+            float(place[2]) for place in _read_json(path)["source_positions_um"] if place[2] is not None
+        }
+    except (LookupError, TypeError, ValueError) as error:
+        raise CalibrationFileError(path, f"tells no source positions: {error!r}.") from None
+    return tuple(sorted(z for z in depths if math.isfinite(z)))
+
+
+def newest_calibration(runs: Path) -> Path | None:
+    """Return the folder of the calibration that was written last below a folder of runs."""
+    found = [file for pattern in (f"*/{_JSON}", f"*/*/{_JSON}") for file in runs.glob(pattern)]
+    return max(found, key=lambda file: file.stat().st_mtime).parent if found else None
+
+
 def _write(calibration: Calibration, folder: Path) -> None:
     pitch = calibration.geometry.pixel_pitch_um
     arrays = {_PSFS: np.ascontiguousarray(calibration.psfs.swapaxes(0, 1))}

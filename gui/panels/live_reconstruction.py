@@ -29,7 +29,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.question import choose_path
-from instrument.calibration_file import is_calibration, load_calibration
+from instrument.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.full_picture import full_picture
 from instrument.live import LiveResult
 from instrument.reconstruction_job import find_calibration
@@ -231,10 +231,9 @@ class LiveReconstructionPanel(Panel):
 
     def _find_newest(self) -> None:
         """Begin with the newest calibration among the runs, if there is one."""
-        patterns = ("*/calibration.json", "*/*/calibration.json")
-        files = [f for pattern in patterns for f in self.session.runs_folder.glob(pattern)]
-        if files:
-            self.file.setText(str(max(files, key=lambda f: f.stat().st_mtime).parent))
+        newest = newest_calibration(self.session.runs_folder)
+        if newest is not None:
+            self.file.setText(str(newest))
             self.load()
 
     def _run_finished(self, path: Path) -> None:

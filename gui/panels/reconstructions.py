@@ -23,6 +23,7 @@ from PySide6.QtWidgets import (
 )
 
 from gui.jobs import Job, JobContext
+from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.reconstruction_work import SoFar, Written, reconstruct_job
@@ -34,8 +35,10 @@ from gui.views.reconstruct_form import CALIBRATION, PSF, ReconstructForm
 from gui.views.volume_view import VolumeView
 from gui.widgets.colour_maps import table
 from gui.widgets.question import Question, choose_path
-from instrument.errors import BenchError
+from instrument.calibration_file import calibrated_depths_um, newest_calibration
+from instrument.errors import BenchError, FileError
 from instrument.images import write_image
+from instrument.reconstruction_job import find_calibration
 from instrument.reconstruction_request import VolumeRequest
 from instrument.result_export import export_result
 from instrument.result_list import find_results, free_name
@@ -99,6 +102,8 @@ class ReconstructionsPanel(Panel):
         session.run_finished.connect(lambda _: self.refresh())
         self._suggest_out()
         self.form.image.editingFinished.connect(self._suggest_out)
+        self.form.psfs.editingFinished.connect(self._look_at_psfs)
+        self._depths = NewestOnly(self.jobs, "Reading a calibration's depths")
         self.form.kind.currentTextChanged.connect(lambda _: self._suggest_out())
         self.refresh()
 
@@ -409,6 +414,19 @@ class ReconstructionsPanel(Panel):
         field = self.form.psfs if path.is_dir() else self.form.image
         field.setText(str(path))
         field.editingFinished.emit()
+        if field is self.form.image and not self.form.psfs.text() and self.form.kind.currentText() != PSF:
+            folder = self.session.runs_folder
+            self._depths.ask(lambda: newest_calibration(folder), self._offer_calibration)
+
+    def _offer_calibration(self, newest: Path | None) -> None:
+        """Begin with the newest calibration where none was named."""
+        if newest is not None and not self.form.psfs.text():
+            self.form.psfs.setText(str(newest))
+            self.form.psfs.editingFinished.emit()
+
+    def _look_at_psfs(self) -> None:
+        path = Path(self.form.psfs.text().strip()).expanduser()
+        self._depths.ask(lambda: _depths_of(path), self.form.show_depths)
 
     def as_python(self) -> str:
         """Return lines that make the reconstruction of the form, or open the result that is shown."""
@@ -446,3 +464,11 @@ def _age(record: Path) -> str:
         return datetime.fromtimestamp(record.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
     except OSError:
         return ""
+
+
+def _depths_of(path: Path) -> tuple[float, ...]:
+    """Return the depths of a calibration; none where there is no calibration, which the request says."""
+    try:
+        return calibrated_depths_um(find_calibration(path))
+    except FileError:
+        return ()

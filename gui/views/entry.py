@@ -68,12 +68,16 @@ class Entry(QLineEdit):
         try:
             self.value()
         except BenchError as error:
-            self._mark(str(error))
-            self.refused.emit(str(error))
+            self.refuse(str(error))
             return False
         self._mark("")
         self.understood.emit()
         return True
+
+    def refuse(self, why: str) -> None:
+        """Show why the text cannot be used."""
+        self._mark(why)
+        self.refused.emit(why)
 
     def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
         """Check when the field is left."""

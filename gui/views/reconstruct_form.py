@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtWidgets import (
     QComboBox,
+    QCompleter,
     QFormLayout,
     QHBoxLayout,
     QLabel,
@@ -41,6 +43,8 @@ from recon.volume.model import MODELS
 CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _AUTOMATIC = "automatic"
+_MOST_DEPTHS = 8
+"""More of them are told as a range."""
 BACKGROUNDS = {_AUTOMATIC: None, "estimated": True, "none": False}
 
 
@@ -66,6 +70,7 @@ class ReconstructForm(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
+        self._depths_mm: tuple[str, ...] = ()
         self.kind = QComboBox()
         self.kind.addItems([CALIBRATION, PSF, VOLUME])
         self.kind.setToolTip("What to reconstruct, and from what the PSFs come")
@@ -231,6 +236,10 @@ class ReconstructForm(QWidget):
                 )
             )
         z_mm = self.z_mm.value()
+        if kind == CALIBRATION and z_mm is None and len(self._depths_mm) > 1:
+            why = f"The calibration has PSFs of several depths: {self._depths_words()} mm. Which one is it?"
+            self.z_mm.refuse(why)
+            raise BenchError(why)
         return self.advanced.apply(
             PictureRequest(
                 image=image,
@@ -241,6 +250,22 @@ class ReconstructForm(QWidget):
                 settings=settings,
             )
         )
+
+    def show_depths(self, depths_um: Sequence[float]) -> None:
+        """Offer the depths that the calibration has PSFs of; none where there is one, or none is known."""
+        self._depths_mm = tuple(f"{z_um / 1e3:.5g}" for z_um in depths_um)
+        several = len(self._depths_mm) > 1
+        words = f"{self._depths_words()}: which one? (mm)" if several else "the calibrated one (mm)"
+        self.z_mm.setPlaceholderText(words)
+        offered = QCompleter(list(self._depths_mm) if several else [], self.z_mm)
+        offered.setCompletionMode(QCompleter.CompletionMode.UnfilteredPopupCompletion)
+        self.z_mm.setCompleter(offered)
+
+    def _depths_words(self) -> str:
+        shown = self._depths_mm
+        if len(shown) > _MOST_DEPTHS:
+            return f"{len(shown)} from {shown[0]} to {shown[-1]}"
+        return ", ".join(shown)
 
     def work(self) -> ReconstructionWork:
         """Return all that the fields ask for: what, whereto, kept where; errors as the parts."""

@@ -1,0 +1,107 @@
+"""From a photograph to its picture: the newest calibration is offered, and its depths are asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.panels.reconstructions import ReconstructionsPanel
+from gui.session import BenchSession
+from instrument.calibration_file import (
+    CalibrationFileError,
+    calibrated_depths_um,
+    newest_calibration,
+    save_calibration,
+)
+from recon.types import Calibration
+
+WAIT_MS = 20_000
+SIZE = 32
+
+
+def _calibration(folder: Path, depths_um: tuple[float, ...]) -> Path:
+    rng = np.random.default_rng(0)
+    psfs = np.zeros((len(depths_um), 1, SIZE, SIZE), np.float32)
+    for psf in psfs:
+        psf[0, rng.integers(8, 24, 9), rng.integers(8, 24, 9)] = 100
+    places = np.array([(0.0, 0.0, z) for z in depths_um])
+    return save_calibration(Calibration(psfs, places), folder)
+
+
+@pytest.fixture
+def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
+    session: BenchSession = make_session()
+    panel = ReconstructionsPanel(session)
+    panel.resize(1000, 800)
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    panel.show()
+    return panel
+
+
+@pytest.fixture
+def photograph(tmp_path: Path) -> Path:
+    file = tmp_path / "photo.tif"
+    tifffile.imwrite(file, np.random.default_rng(1).integers(100, 200, (SIZE, SIZE)).astype(np.uint16))
+    return file
+
+
+def test_the_depth_is_asked_for_at_its_field_and_one_is_chosen_by_keys(
+    qtbot: QtBot, panel: ReconstructionsPanel, photograph: Path
+) -> None:
+    runs = panel.session.runs_folder
+    calibration = _calibration(runs / "a-sweep" / "calibration", (80e3, 22e3, 38.9381e3))
+    panel.take(photograph)
+    form = panel.form
+    qtbot.waitUntil(lambda: "which one" in form.z_mm.placeholderText(), timeout=WAIT_MS)
+    assert form.psfs.text() == str(calibration)
+    qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
+    assert panel.job is None
+    assert form.z_mm.property("refused")
+    assert "22, 38.938, 80 mm" in form.z_mm.toolTip()
+    assert "z_um" not in form.z_mm.toolTip()
+    completer = form.z_mm.completer()
+    form.z_mm.setFocus()
+    completer.complete()
+    popup = completer.popup()
+    qtbot.keyClick(popup, Qt.Key.Key_Down)
+    qtbot.keyClick(popup, Qt.Key.Key_Down)
+    qtbot.keyClick(popup, Qt.Key.Key_Return)
+    assert form.z_mm.text() == "38.938"
+    form.z_mm.check()
+    assert not form.z_mm.property("refused")
+    assert form.request().z_um == pytest.approx(38938)
+
+
+def test_with_one_depth_nothing_is_asked_and_a_calibration_that_was_named_stays(
+    qtbot: QtBot, panel: ReconstructionsPanel, photograph: Path, tmp_path: Path
+) -> None:
+    _calibration(panel.session.runs_folder / "other" / "calibration", (22e3, 80e3))
+    mine = _calibration(tmp_path / "mine", (50e3,))
+    panel.take(mine)
+    panel.take(photograph)
+    qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
+    assert panel.form.psfs.text() == str(mine)
+    assert panel.form.request().z_um is None
+    panel.form.psfs.setText("/nowhere")
+    panel.form.psfs.editingFinished.emit()  # no calibration: no depths, and no mistake of their own
+    qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
+    assert "which one" not in panel.form.z_mm.placeholderText()
+
+
+def test_depths_of_a_calibration(tmp_path: Path) -> None:
+    assert newest_calibration(tmp_path) is None
+    path = _calibration(tmp_path / "run" / "calibration", (3e4, 1e4))
+    assert calibrated_depths_um(path) == (1e4, 3e4)
+    assert newest_calibration(tmp_path) == path
+    unknown = save_calibration(
+        Calibration(np.ones((1, 1, 8, 8), np.float32), np.full((1, 3), np.nan)), tmp_path / "unknown"
+    )
+    assert calibrated_depths_um(unknown) == ()
+    (path / "calibration.json").write_text('{"source_positions_um": 3}')
+    with pytest.raises(CalibrationFileError, match="tells no source positions"):
+        calibrated_depths_um(path)
