@@ -48,7 +48,7 @@ FLOOR = {
 NOTHING = 1e-3
 INVISIBLE = ("shift",)
 """Maps whose failures leave no trace in the data: a shifted diffuser gives a good picture elsewhere."""
-WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5, "ambiguity": 2.0}
+WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5, "ambiguity": 4.0}
 """How much a feature's difference counts, relative to a ratio of ``e`` in the others."""
 
 RANDOM_LENSLETS = 0.25
