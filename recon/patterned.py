@@ -8,6 +8,7 @@ picture ``x`` explains all frames; nothing of it may move meanwhile.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from recon.picture import LEAST_TAU, NOISE_WEIGHT, PRIORS
 from recon.preparation import channel_noise
 from recon.result import ImageGrid, Reconstruction
 from recon.solvers.fista import Fista
-from recon.solvers.stopping import StoppingRules
+from recon.solvers.stopping import IterationRecord, StoppingRules
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
@@ -87,6 +88,7 @@ def reconstruct_patterned(
     noise: NoiseModel | float | None = None,
     background: npt.ArrayLike | float = 0.0,
     iterations: int = ITERATIONS,
+    watch: Callable[[IterationRecord], object] | None = None,
     cancel: threading.Event | None = None,
 ) -> Reconstruction:
     """Reconstruct one grey picture from frames lit by known patterns.
@@ -105,6 +107,9 @@ def reconstruct_patterned(
     background : array or number
         Subtracted from each frame.
     iterations : int
+    watch : callable, optional
+        Called with the record of each iteration.
+    cancel : threading.Event, optional
 
     Raises
     ------
@@ -140,7 +145,11 @@ def reconstruct_patterned(
     peak = float(np.max(np.abs(camera.adjoint(scaled))))
     weight = max(NOISE_WEIGHT, LEAST_TAU * peak) if tau is None else tau * peak
     solver = Fista(camera, scaled, PRIORS[prior](weight))
-    outcome = solver.run(StoppingRules(iterations=iterations, tolerance=TOLERANCE), cancel=cancel)
+    outcome = solver.run(
+        StoppingRules(iterations=iterations, tolerance=TOLERANCE),
+        callback=None if watch is None else lambda _, record: watch(record),
+        cancel=cancel,
+    )
     image = outcome.solution[0][camera.window] * np.float32(deviation / energy)
     height, width = image.shape
     provenance: dict[str, Any] = {"patterns": len(lit), "noise_deviation": deviation, "psf_z_um": psf_z_um}

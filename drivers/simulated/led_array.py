@@ -12,6 +12,7 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.scene_light import Lamp, SceneLight
 from drivers.simulated.world import SimulatedWorld
 from recon.optics.spectrum import BANDS
 
@@ -28,7 +29,8 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     """A round, flat array of RGB LEDs on a square grid, the one with index 0 in its middle.
 
     It lights the pinhole that serves as point source from behind, each LED by the cosine fourth of the angle
-    under which the pinhole sees it, so that the middle one counts most.
+    under which the pinhole sees it, so that the middle one counts most. With ``led_light = "scene"`` of
+    ``[simulated]`` it lights the scene instead, each place by the same law from every LED.
     """
 
     kind = "led_array"
@@ -110,6 +112,19 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
         self._show(OFF)
 
     def _show(self, pattern: LedPattern) -> None:
+        if self.world.options.led_light == "scene":
+            self._pattern = pattern
+            lamps = tuple(
+                Lamp(
+                    1e3 * float(self._positions_mm[index, 0]),
+                    1e3 * float(self._positions_mm[index, 1]),
+                    (rgb[0] / 255, rgb[1] / 255, rgb[2] / 255),
+                )
+                for index, rgb in sorted(pattern.levels)
+                if any(rgb)
+            )
+            self.world.light_scene(SceneLight(lamps, 1e3 * self.options.distance_mm) if lamps else None)
+            return
         across_mm = np.hypot(self._positions_mm[:, 0], self._positions_mm[:, 1])
         weights = (1 + (across_mm / self.options.distance_mm) ** 2) ** -2
         levels = dict(pattern.levels)

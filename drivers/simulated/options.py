@@ -57,14 +57,14 @@ class WorldOptions(DriverOptions):
         (), description='For fall_off = "table": pairs of angle in degrees, ascending from 0, and response.'
     )
 
-    scene: Literal["none", "picture", "color_picture", "bars", "tilted_bars", "beads"] = Field(
-        "picture", description="What stands in front of the camera."
+    scene: Literal["none", "picture", "color_picture", "bars", "tilted_bars", "beads", "sheet"] = Field(
+        "picture", description="What stands in front of the camera; a sheet is plain, evenly white."
     )
     scene_distance_mm: Positive | None = Field(
         None, description="From the diffuser to it, or to its middle; left out: where the stage homes."
     )
     scene_height_mm: Positive | None = Field(
-        None, description="Its height; left out: half of what the sensor sees from there."
+        None, description="Its height; left out: half of what the sensor sees from there; of a sheet: twice."
     )
     scene_rgb: tuple[NotNegative, NotNegative, NotNegative] = Field(
         (1.0, 1.0, 1.0), description="Brightness of the scene's light in red, green, blue."
@@ -76,6 +76,10 @@ class WorldOptions(DriverOptions):
     beads: int = Field(40, ge=1, le=10_000, description="Number of beads.")
     bead_diameter_um: NotNegative = Field(15.0, description="Their diameter.")
 
+    led_light: Literal["source", "scene"] = Field(
+        "source",
+        description="What the LED array lights: the point source, or the scene, each LED the part behind it.",
+    )
     source_diameter_um: NotNegative | None = Field(
         None, description="Diameter of the point source; left out: the preset's."
     )

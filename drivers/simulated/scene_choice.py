@@ -13,6 +13,11 @@ from recon.optics.scene import Scene
 from recon.optics.scenes import bar_target, bead_volume, picture, tilted_target
 
 FIELD_SHARE = 0.5
+SHEET_SHARE = 2.0
+"""Of what the sensor sees: a sheet reaches beyond it on all sides."""
+
+SHEET_PIXELS = 128
+"""A side: fine enough for the light of single LEDs."""
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -31,6 +36,10 @@ def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Sce
         if options.scene == "picture":
             portrait = portrait @ LUMINANCE
         return picture(portrait, z_um, height_um * portrait.shape[1] / portrait.shape[0])
+    if options.scene == "sheet":
+        if options.scene_height_mm is None:
+            height_um *= SHEET_SHARE / FIELD_SHARE
+        return picture(np.ones((SHEET_PIXELS, SHEET_PIXELS)), z_um, height_um, name="sheet")
     if options.scene == "bars":
         return picture(bar_target(), z_um, height_um, name="bar target")
     if options.scene == "tilted_bars":

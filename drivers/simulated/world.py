@@ -15,6 +15,7 @@ from drivers.simulated.clock import Clock
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.presets import PRESETS, Preset
 from drivers.simulated.scene_choice import make_scene, make_slide
+from drivers.simulated.scene_light import SceneLight
 from drivers.simulated.surroundings import Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
@@ -78,6 +79,7 @@ class SimulatedWorld(Surroundings):
         """Whether the scene glows."""
         self._scene = make_scene(options, preset, self.distance_um)
         self._scene_number = 0
+        self._scene_light: SceneLight | None = None
 
     # What the devices do to the world ---
     def carry_source(self, carrier: Callable[[], Position]) -> None:
@@ -87,6 +89,10 @@ class SimulatedWorld(Surroundings):
     def set_emission(self, rgb: Rgb) -> None:
         """Light the point source; each band relative to one LED at its brightest right behind it."""
         self._emission = self._glow(rgb)
+
+    def light_scene(self, light: SceneLight | None) -> None:
+        """Light the scene by LEDs (None: by none); besides, it glows while ``scene_lit``."""
+        self._scene_light = light
 
     @property
     def source_position_um(self) -> Position:
@@ -183,6 +189,13 @@ class SimulatedWorld(Surroundings):
                 ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
             )
             light = picture if light is None else light + picture
+        leds = self._scene_light
+        if leds is not None and scene is not None:
+            seen = _product(self._glow(self.options.scene_rgb), weights)
+            picture = self._cached(
+                ("scene", number, seen, binning, leds), lambda: self._render(leds.on(scene), seen, binning)
+            )
+            light = picture if light is None else light + picture
         return light
 
     def _render(self, scene: Scene, weights: Rgb, binning: int) -> Image:
@@ -202,7 +215,8 @@ class SimulatedWorld(Surroundings):
         glow = self.emission
         x, y, z = self.source_position_um
         place = (round(x, 3), round(y, 3), round(z, 3)) if any(glow) else None
-        return (place, glow, self._scene_number if self.scene_lit else None)
+        key = (place, glow, self._scene_number if self.scene_lit else None)
+        return key if self._scene_light is None else (*key, self._scene_number, self._scene_light)
 
     # The scene and the truth about it ---
     @property

@@ -12,10 +12,11 @@ import typer
 from instrument.acquire import abilities_of
 from instrument.atomic import write_text
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.errors import FileError
+from instrument.errors import BenchError, FileError
 from instrument.plan import BenchAbilities, Plan, check, estimate
 from instrument.plan.drawing import draw_path
-from instrument.plan.file import load_plan
+from instrument.plan.file import load_plan, save_plan
+from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
 from instrument.words import duration, size
 
 app = command_app("Look at a plan before anything moves, or write one to start from.")
@@ -56,6 +57,62 @@ def new(
         raise FileError(file, "exists already and was left as it is.")
     write_text(file, (files("instrument.plan") / "example.toml").read_text())
     typer.echo(f"Wrote {file}. Look at it with: diffuserbench plan show {file}")
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench plan illumination --lattice 3 --exposure-ms 20 lit.toml",
+        'diffuserbench plan illumination --groups "0-3;4-7;8,9" --exposure-ms 20 lit.toml',
+    )
+)
+def illumination(
+    exposure_ms: Annotated[float, typer.Option("--exposure-ms", min=1e-3, help="Of every frame.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path(
+        "illumination.toml"
+    ),
+    groups: Annotated[
+        str | None,
+        typer.Option(
+            "--groups", metavar="LEDS", help="LEDs of each pattern: '0-3,8;4;5,6'.", show_default=False
+        ),
+    ] = None,
+    lattice: Annotated[
+        int | None,
+        typer.Option(
+            "--lattice",
+            metavar="N",
+            min=1,
+            help="The array's LEDs in N x N groups by place.",
+            show_default=False,
+        ),
+    ] = None,
+    level: Annotated[int, typer.Option("--level", min=1, max=255, help="Of every LED.")] = 255,
+    average: Annotated[int, typer.Option("--average", min=1, help="Exposures averaged into a frame.")] = 1,
+    bench: BenchOption = None,
+) -> None:
+    """Write a plan of active illumination: the scene lit by one group of LEDs after the other.
+
+    Run it twice, with the scene and with a plain white sheet in its place; then
+    diffuserbench reconstruct SCENE --patterned SHEET solves all frames together.
+    """
+    if (groups is None) == (lattice is None):
+        raise BenchError("Give the patterns either as --groups or as --lattice N (one of them).")
+    if file.suffix.lower() not in (".toml", ".json"):
+        raise FileError(file, "a plan's name ends in .toml or .json.")
+    if file.exists():
+        raise FileError(file, "exists already and was left as it is.")
+    if groups is not None:
+        chosen = groups_from_text(groups)
+    else:
+        with open_and_say(bench) as opened:
+            if opened.led_array is None:
+                raise BenchError(
+                    "--lattice needs the bench's LED array, and this bench has none. Give --groups."
+                )
+            chosen = lattice_groups(opened.led_array.led_positions_mm, lattice or 1)
+    plan = illumination_plan(chosen, exposure_ms=exposure_ms, level=level, average=average)
+    save_plan(plan, file)
+    typer.echo(f"Wrote {file}: {len(chosen)} patterns. Look at it with: diffuserbench plan show {file}")
 
 
 def _describe(plan: Plan, abilities: BenchAbilities) -> None:

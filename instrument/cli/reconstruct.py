@@ -34,6 +34,7 @@ from instrument.cli.reconstruct_options import (
     NoiseOption,
     OutOption,
     OverTimeOption,
+    PatternedOption,
     PositiveBackgroundOption,
     PriorOption,
     PsfOption,
@@ -71,6 +72,7 @@ app = command_app()
         "diffuserbench reconstruct --psf psf.tif --image raw.tif --bayer RGGB --bin 2",
         "diffuserbench reconstruct --calibration field/ --image photo.tif --model local",
         "diffuserbench reconstruct runs/2026-11-21-recording --video --calibration demo/calibration",
+        "diffuserbench reconstruct runs/scene --patterned runs/sheet --calibration demo/calibration",
         "diffuserbench reconstruct --volume field/ --image photo.tif --explain",
         "diffuserbench reconstruct --volume field/ --image photo.tif --choose planes=all",
     )
@@ -110,6 +112,7 @@ def reconstruct(
     force: ForceOption = False,
     allow_saturated: AllowSaturatedOption = False,
     mixed_depth: MixedDepthOption = False,
+    patterned: PatternedOption = None,
     video: VideoOption = False,
     warm: WarmOption = None,
     block: BlockOption = None,
@@ -123,6 +126,8 @@ def reconstruct(
 
     Both must come from the same camera with the same region of interest and binning, 8 to 16 bit or float,
     grey or colour. Ctrl-C ends the work and keeps the picture so far; a second Ctrl-C gives it up.
+
+    With --patterned, one picture of a scene photographed under one pattern of light after the other.
 
     With --video, every frame of a recording; an interrupted video is taken up again by the same command.
     """
@@ -151,6 +156,67 @@ def reconstruct(
             f"{'--explain' if explain else '--choose'} is about everything that --model auto chooses, which "
             "it does not with --checkpoint. Leave one of the two out."
         )
+    if patterned is not None:
+        not_patterned = {
+            "--video": video,
+            "--image": image is not None,
+            "--psf": psf is not None,
+            "--volume": volume is not None,
+            "--model": model != "auto",
+            "--explain": explain,
+            "--choose": bool(choices),
+            "--background/--no-background": background is not None,
+            "--positive-background": positive_background,
+            "--dark": dark != "auto",
+            "--crop": crop is not None,
+            "--erasures": erasures != "saturated",
+            "--bayer": bayer not in ("auto", "none"),
+            "--noise": noise is not None,
+            "--scratch": scratch is not None,
+            "--memory": memory_gib is not None,
+            "--method": method is not Method.ADMM,
+            "--time": time_s is not None,
+            "--tolerance": tolerance is not None,
+            "--stop-at-noise": stop_at_noise,
+            "--checkpoint": checkpoint is not None,
+            "--figure": figure is not None,
+            "--device": device != "cpu",
+            "--allow-saturated": allow_saturated,
+            "--mixed-depth": mixed_depth,
+            "--warm": warm is not None,
+            "--block": block is not None,
+            "--over-time": over_time is not None,
+            "--workers": workers is not None,
+            "--scheduler": scheduler is not None,
+            "--fps": fps is not None,
+            "--no-mp4": not film,
+        }
+        if given := [option for option, is_given in not_patterned.items() if is_given]:
+            raise BenchError(f"With --patterned these do not apply: {', '.join(given)}. Leave them out.")
+        if run is None or calibration is None:
+            raise BenchError(
+                "--patterned needs a run and a calibration: "
+                "diffuserbench reconstruct RUN --patterned SHEET --calibration FOLDER"
+            )
+        from instrument.cli.patterned import reconstruct_to_patterned
+        from instrument.patterned import PatternedRequest
+
+        reconstruct_to_patterned(
+            PatternedRequest(
+                run=run,
+                sheet=patterned,
+                calibration=calibration,
+                z_um=None if z_mm is None else 1e3 * z_mm,
+                binning=settings.binning or 1,
+                prior=prior,
+                tau=tau,
+                iterations=iterations,
+            ),
+            Outputs.named(out or Path("reconstruction.tif")),
+            rotate_deg=int(rotate),
+            force=force,
+        )
+        return
     videos_only = {
         "RUN": run is not None,
         "--warm": warm is not None,

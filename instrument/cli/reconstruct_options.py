@@ -52,7 +52,11 @@ class Rotation(enum.StrEnum):
 
 RunArgument = Annotated[
     Path | None,
-    typer.Argument(metavar="[RUN]", help="With --video: the recording's folder.", show_default=False),
+    typer.Argument(
+        metavar="[RUN]",
+        help="With --video: the recording's folder; with --patterned: the run's.",
+        show_default=False,
+    ),
 ]
 ImageOption = Annotated[
     Path | None,
@@ -60,6 +64,15 @@ ImageOption = Annotated[
 ]
 VideoOption = Annotated[
     bool, typer.Option("--video", help="Every frame of the recording RUN; --out NAME.ome.zarr.")
+]
+PatternedOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--patterned",
+        metavar="SHEET",
+        help="One picture of RUN, lit by patterns in turn; SHEET is the same plan's run of a plain sheet.",
+        show_default=False,
+    ),
 ]
 WarmOption = Annotated[
     int | None,

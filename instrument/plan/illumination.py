@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
 
 from instrument.errors import BenchError
 from instrument.plan.model import OFF, Light, Part, Plan
+
+DARK, PATTERN = "dark", "pattern"
+"""What the frames of such a plan are called."""
+
+MOST_NAMED = 8
+"""LEDs of a group that its description names."""
 
 
 def illumination_plan(
@@ -14,7 +24,7 @@ def illumination_plan(
     """Return a plan that photographs the scene lit by each group of LEDs in turn.
 
     The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
-    :func:`recon.patterned.reconstruct_patterned` takes.
+    :func:`recon.patterned.reconstruct_patterned` takes; :mod:`instrument.patterned` reads them from runs.
 
     Parameters
     ----------
@@ -38,7 +48,7 @@ def illumination_plan(
     lights = tuple(
         Light(
             kind="pattern",
-            description=f"group {number}: LEDs {', '.join(map(str, group))}",
+            description=f"group {number}: {_in_words(group)}",
             leds=tuple((led, level, level, level) for led in group),
         )
         for number, group in enumerate(groups)
@@ -47,7 +57,68 @@ def illumination_plan(
     return Plan(
         label="active illumination",
         parts=(
-            Part(label="dark", light=(OFF,), exposures_ms=exposures, average=average),
-            Part(label="pattern", light=lights, exposures_ms=exposures, average=average),
+            Part(label=DARK, light=(OFF,), exposures_ms=exposures, average=average),
+            Part(label=PATTERN, light=lights, exposures_ms=exposures, average=average),
         ),
     )
+
+
+def _in_words(group: Sequence[int]) -> str:
+    if len(group) > MOST_NAMED:
+        return f"{len(group)} LEDs"
+    return f"LEDs {', '.join(map(str, group))}"
+
+
+def groups_from_text(text: str) -> list[list[int]]:
+    """Return groups of LEDs written as ``"0-3,8;4;5,6"``: semicolons between groups, commas in them.
+
+    Raises
+    ------
+    BenchError
+        When it is something else.
+    """
+    groups = []
+    for group in text.split(";"):
+        numbers: list[int] = []
+        for item in filter(None, (word.strip() for word in group.split(","))):
+            span = re.fullmatch(r"(\d+)(?:\s*-\s*(\d+))?", item)
+            if span is None:
+                raise BenchError(
+                    f"--groups: {item!r} is neither an LED's number nor a span of them; write '0-3,8;4;5,6'."
+                )
+            first, last = int(span[1]), int(span[2] or span[1])
+            if last < first:
+                raise BenchError(f"--groups: the span {item!r} ends before it begins.")
+            numbers += range(first, last + 1)
+        if not numbers:
+            raise BenchError("--groups: a group is empty; write '0-3,8;4;5,6'.")
+        if len(set(numbers)) < len(numbers):
+            raise BenchError(f"--groups: a group names an LED twice: {group.strip()!r}.")
+        groups.append(numbers)
+    return groups
+
+
+def lattice_groups(positions_mm: npt.ArrayLike, side: int) -> list[list[int]]:
+    """Return the LEDs of an array in ``side x side`` square groups by place, row by row; empty ones left out.
+
+    Parameters
+    ----------
+    positions_mm : array, (n_leds, 2 or 3)
+    side : int
+        Groups along each axis.
+
+    Raises
+    ------
+    BenchError
+        When ``side`` is below 1.
+    """
+    if side < 1:
+        raise BenchError(f"--lattice takes 1 or more groups along each axis, not {side}.")
+    across = np.asarray(positions_mm, float)[:, :2]
+    low, high = across.min(axis=0), across.max(axis=0)
+    extent = np.where(high > low, high - low, 1.0)
+    cell = np.clip(((across - low) / extent * side).astype(int), 0, side - 1)
+    groups = [
+        np.flatnonzero((cell[:, 1] == row) & (cell[:, 0] == column)) for row, column in np.ndindex(side, side)
+    ]
+    return [[int(led) for led in group] for group in groups if len(group)]

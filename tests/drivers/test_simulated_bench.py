@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from drivers.camera import Roi
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.camera_settings import CameraOptions
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
@@ -472,3 +473,32 @@ def test_a_fall_off_table_is_what_the_pixels_do() -> None:
         bench.stage.move_to({"x_um": float(np.tan(np.deg2rad(10.0)) * Z_UM)})
     ratio = shaded.lit().sum() / plain.lit().sum()
     assert ratio == pytest.approx(0.6, abs=0.03)
+
+
+# LEDs on the scene ---
+def test_leds_light_the_scene_part_by_part_and_add_up() -> None:
+    leds = LedArrayOptions(leds=9, led_pitch_mm=5.0, distance_mm=4.0)
+    bench = Bench(led_light="scene", scene="sheet", scene_distance_mm=30.0)
+    bench.leds = SimulatedLedArray(leds, bench.world)
+    bench.leds.open()
+    bench.camera.set_exposure_ms(0.2)
+    assert bench.counts().max() <= 1
+
+    def lit(*numbers: int) -> npt.NDArray[np.float32]:
+        bench.leds.set_pattern(LedPattern("some", tuple((n, (255, 255, 255)) for n in numbers)))
+        light = bench.world.photons_per_s((1.0, 1.0, 1.0))
+        assert light is not None
+        return light
+
+    left, right = (int(i) for i in (np.argmin(leds_x(bench)), np.argmax(leds_x(bench))))
+    one, other = lit(left), lit(right)
+    np.testing.assert_allclose(lit(left, right), one + other, rtol=1e-4)
+    columns = np.arange(one.shape[1])
+    places = [float((frame.sum(axis=0) * columns).sum() / frame.sum()) for frame in (one, other)]
+    assert places[0] > places[1] + 10  # the picture stands upside down
+    bench.leds.off()
+    assert bench.counts().max() <= 1
+
+
+def leds_x(bench: Bench) -> npt.NDArray[np.float64]:
+    return bench.leds.led_positions_mm[:, 0]

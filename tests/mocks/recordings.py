@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.frame import FrameMetadata
+from instrument.plan import Plan
 from instrument.store import BenchRecord, FinishReason, FrameToStore, Gap, RunWriter
 
 BENCH = BenchRecord(
@@ -23,13 +24,22 @@ BENCH = BenchRecord(
 
 
 def write_recording(
-    parent: Path, frames: Mapping[int, np.ndarray], *, period_s: float = 0.04, led: str = "off"
+    parent: Path,
+    frames: Mapping[int, np.ndarray],
+    *,
+    period_s: float = 0.04,
+    led: str = "off",
+    plan: Plan | None = None,
+    saturated: float = 0.0,
 ) -> Path:
-    """Write frames, uint16, by their number; numbers left out are gaps. Returns the run's folder."""
-    with RunWriter.create(parent, label="recording", bench=BENCH) as writer:
+    """Write frames, uint16, by their number; numbers left out are gaps. Returns the run's folder.
+
+    With a plan they are the frames of its steps, and those left out are missing.
+    """
+    with RunWriter.create(parent, label="recording", bench=BENCH, plan=plan) as writer:
         expected = 0
         for index, image in frames.items():
-            if index > expected:
+            if index > expected and plan is None:
                 writer.gap(Gap(expected, index - expected, 0))
             expected = index + 1
             now_ns = 10**9 + int(index * period_s * 1e9)
@@ -46,6 +56,7 @@ def write_recording(
                 roi=(0, 0, *image.shape[:2]),
                 binning=1,
                 led_pattern=led,
+                saturated_fraction=saturated,
             )
             writer.write([FrameToStore(index, image.astype(np.uint16), metadata)])
         return writer.finish(FinishReason.COMPLETED).path

@@ -1,0 +1,210 @@
+"""Active illumination from runs to a picture: light cast by plain sums, patterns told by a plain sheet."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from instrument.calibration_file import save_calibration
+from instrument.cli import main
+from instrument.errors import BenchError, FileError
+from instrument.patterned import PatternedRequest, prepare_patterned
+from instrument.plan.file import load_plan
+from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
+from recon import Calibration
+from recon.metrics import psnr
+from tests.mocks.recordings import write_recording
+
+SHAPE = (24, 30)
+GROUPS = [[0, 1], [2], [3]]
+DARK_COUNTS = 40
+
+
+def psf() -> np.ndarray:
+    response = np.random.default_rng(0).random(SHAPE) ** 10
+    return (response / response.sum()).astype(np.float32)
+
+
+def lights() -> np.ndarray:
+    """Broad bands of light, unevenly bright."""
+    x = np.arange(SHAPE[1]) / SHAPE[1] * 3 - np.arange(3)[:, None] - 0.5
+    bands = np.exp(-(x**2) / 0.4) * np.array([1.0, 0.6, 0.9])[:, None]
+    return np.repeat(bands[:, None], SHAPE[0], axis=1)
+
+
+def cast(light: np.ndarray) -> np.ndarray:
+    """What light of the sensor's field casts, by plain shifts and sums."""
+    response, image = psf(), np.zeros(SHAPE)
+    for row, column in np.argwhere(light > 0):
+        dy, dx = row - SHAPE[0] // 2, column - SHAPE[1] // 2
+        there = np.s_[max(dy, 0) : SHAPE[0] + min(dy, 0), max(dx, 0) : SHAPE[1] + min(dx, 0)]
+        here = np.s_[max(-dy, 0) : SHAPE[0] + min(-dy, 0), max(-dx, 0) : SHAPE[1] + min(-dx, 0)]
+        image[there] += light[row, column] * response[here]
+    return image
+
+
+def scene() -> np.ndarray:
+    light = np.full(SHAPE, 0.1)
+    light[6:12, 5:9], light[14:18, 13:24] = 1.0, 0.7
+    return light
+
+
+def write_run(
+    folder: Path, reflects: np.ndarray, groups: list[list[int]] = GROUPS, **settings: object
+) -> Path:
+    rng = np.random.default_rng(3)
+    frames = {0: rng.normal(DARK_COUNTS, 1, SHAPE)}
+    for number, light in enumerate(lights(), start=1):
+        clean = 20000 * cast(reflects * light) + DARK_COUNTS
+        frames[number] = clean + rng.normal(0, 1, SHAPE)
+    frames = {index: np.clip(np.round(frame), 0, 65535) for index, frame in frames.items()}
+    plan = illumination_plan(groups, exposure_ms=10)
+    return write_recording(folder, frames, plan=plan, **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path, Path]:
+    calibration = Calibration(psf()[None, None], np.array([[0.0, 0.0, 30e3]]))
+    return (
+        write_run(tmp_path / "scene", scene()),
+        write_run(tmp_path / "sheet", np.ones(SHAPE)),
+        save_calibration(calibration, tmp_path / "calibration"),
+    )
+
+
+def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    run, sheet, calibration = files
+    out = tmp_path / "picture.tif"
+    status = main(
+        [
+            *("reconstruct", str(run), "--patterned", str(sheet), "--calibration", str(calibration)),
+            *("--out", str(out), "--iterations", "200"),
+        ]
+    )
+    assert status == 0
+    image = tifffile.imread(out)
+    truth = scene() * lights().sum(axis=0)  # as bright as all groups together make it
+    gain = float(np.vdot(image, truth) / np.vdot(image, image))
+    assert psnr(gain * image, truth) > 22
+    record = json.loads(out.with_suffix(".json").read_text())
+    assert record["simulated"]
+    assert record["inputs"]["sheet"] == str(sheet)
+    assert record["provenance"]["patterns"] == 3
+
+
+def test_patterns_are_the_shares_of_the_light(files: tuple[Path, Path, Path]) -> None:
+    run, sheet, calibration = files
+    told: list[tuple[int, int]] = []
+    request = PatternedRequest(run=run, sheet=sheet, calibration=calibration, z_um=30e3)
+    prepared = prepare_patterned(request, lambda done, total: told.append((done, total)))
+    assert told == [(n, 3) for n in range(4)]
+    truth = lights() / lights().sum(axis=0)
+    middle = np.s_[:, 5:-5, 5:-5]
+    assert np.abs(prepared.patterns - truth)[middle].mean() < 0.06
+    assert prepared.patterns.sum(axis=0)[5:-5, 5:-5] == pytest.approx(1, abs=1e-5)
+    assert abs(float(prepared.frames[0].mean()) - 20000 * float(cast(scene() * lights()[0]).mean())) < 5
+    binned = prepare_patterned(PatternedRequest(run=run, sheet=sheet, calibration=calibration, binning=2))
+    assert binned.frames.shape == binned.patterns.shape == (3, 12, 15)
+
+
+def test_patterns_may_come_from_a_file(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    run, _, calibration = files
+    np.save(tmp_path / "patterns.npy", lights())
+    request = PatternedRequest(run=run, sheet=tmp_path / "patterns.npy", calibration=calibration)
+    truth = lights() / lights().sum(axis=0)
+    np.testing.assert_allclose(prepare_patterned(request).patterns, truth, atol=1e-5)
+    np.save(tmp_path / "patterns.npy", lights()[:2])
+    with pytest.raises(FileError, match=r"\(3, 24, 30\)"):
+        prepare_patterned(request)
+    np.save(tmp_path / "patterns.npy", -lights())
+    with pytest.raises(FileError, match="negative"):
+        prepare_patterned(request)
+
+
+def test_what_does_not_belong_together_is_refused(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    run, sheet, calibration = files
+
+    def refused(sheet: Path, run: Path = run) -> str:
+        with pytest.raises((BenchError, FileError)) as caught:
+            prepare_patterned(PatternedRequest(run=run, sheet=sheet, calibration=calibration))
+        return str(caught.value)
+
+    other = write_run(tmp_path / "other", np.ones(SHAPE), groups=[[0], [2], [3]])
+    assert "same groups" in refused(other)
+    recording = write_recording(tmp_path / "recording", {0: np.ones(SHAPE)})
+    assert "no run of active illumination" in refused(sheet, recording)
+    dark = write_run(tmp_path / "dark", np.zeros(SHAPE))
+    assert refused(dark)
+    short = illumination_plan(GROUPS, exposure_ms=10)
+    missing = write_recording(tmp_path / "short", {0: np.ones(SHAPE)}, plan=short)
+    assert "lacks 3 frames" in refused(sheet, missing)
+    small = write_recording(
+        tmp_path / "small",
+        {n: np.ones((10, 10)) for n in range(4)},
+        plan=illumination_plan(GROUPS, exposure_ms=1),
+    )
+    assert "24 x 30" in refused(sheet, small)
+
+
+def test_saturated_frames_are_told(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    _, sheet, calibration = files
+    run = write_run(tmp_path / "bright", scene(), saturated=0.1)
+    prepared = prepare_patterned(PatternedRequest(run=run, sheet=sheet, calibration=calibration))
+    assert any("saturated" in warning for warning in prepared.job.warnings)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--video"],
+        ["--psf", "x.tif"],
+        ["--time", "3"],
+        ["--workers", "2"],
+        ["--dark", "3"],
+        ["--crop", "0,0,9,9"],
+    ],
+)
+def test_options_that_do_not_apply_are_named(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "run", "--patterned", "sheet", "--calibration", "c", *options]) == 2
+    assert options[0] in capsys.readouterr().err
+
+
+def test_a_run_and_a_calibration_are_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "--patterned", "sheet"]) == 2
+    assert "--patterned needs a run and a calibration" in capsys.readouterr().err
+
+
+# The plan -------------------------------------------------------------------------------------------
+def test_the_plan_command_writes_what_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "lit.toml"
+    command = ["plan", "illumination", str(file), "--groups", "0-2; 4,6 ;8", "--exposure-ms", "20"]
+    assert main(command) == 0
+    plan = load_plan(file)
+    assert [len(step.light.leds) for step in plan.steps()] == [0, 3, 2, 1]
+    assert main(command) == 2
+    assert "exists already" in capsys.readouterr().err
+    both = ["plan", "illumination", "--exposure-ms", "1", "--groups", "1", "--lattice", "2"]
+    assert main(both) == 2
+    assert "one of them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("1;;2", "empty"), ("a", "'a'"), ("5-3", "ends before"), ("1,1", "twice"), ("-1", "'-1'")],
+)
+def test_groups_that_are_none_are_refused(text: str, says: str) -> None:
+    with pytest.raises(BenchError, match=says):
+        groups_from_text(text)
+
+
+def test_a_lattice_groups_leds_by_place() -> None:
+    x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 1.0])
+    groups = lattice_groups(np.column_stack([x.ravel(), y.ravel()]), 2)
+    assert groups == [[0], [1, 2], [3], [4, 5]]
+    assert lattice_groups([[0, 0], [1, 0]], 1) == [[0, 1]]
+    with pytest.raises(BenchError, match="--lattice"):
+        lattice_groups([[0, 0]], 0)
