@@ -28,7 +28,7 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon import fft as project_fft
-from recon.activity import baseline, change, find_regions, motion
+from recon.activity import aligned, baseline, change, fading, find_regions, motion
 from recon.scenes.lenslets import LensletCamera, build_camera
 from recon.video import VideoSolver, video_camera
 from recon.video.solver import BLOCK
@@ -36,7 +36,15 @@ from recon.video.solver import BLOCK
 SHAPE = (128, 160)
 READ_NOISE = 2.0
 NEAR_PX = 3.0
-DEFAULT = {"photons": 3000.0, "neurons": 20, "tissue": 1.0, "warm": 6, "motion_px": 0.0, "bleached": 0.33}
+DEFAULT = {
+    "photons": 3000.0,
+    "neurons": 20,
+    "tissue": 1.0,
+    "warm": 6,
+    "motion_px": 0.0,
+    "bleached": 0.33,
+    "align": False,
+}
 SWEEPS = {
     "photons": (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0),
     "neurons": (5, 10, 20, 40, 80),
@@ -108,6 +116,7 @@ def neurons(
     warm: int,
     motion_px: float,
     bleached: float,
+    align: bool = False,
     seed: int = 0,
 ):
     """Simulate, reconstruct, search; return figures, pictures, dF/F, regions, traces and truth."""
@@ -132,13 +141,17 @@ def neurons(
             clean = np.maximum(ndimage.shift(clean, (0, way[t]), order=3, mode="nearest"), 0)
         raw.append(expose(clean, photons, rng))
     pictures = solve(psf, raw, warm)
-    dff = change(pictures, baseline(pictures, 100))
+    found_motion = motion(pictures)
+    if align:
+        pictures = aligned(pictures, found_motion)
+    fade = fading(pictures)
+    dff = change(pictures, baseline(pictures, 100, fade=fade))
     regions = find_regions(dff)
     centre = np.array(SHAPE) // 2
     traces = []
     for region in regions:
         light = region.trace(pictures)[:, None, None]
-        level = baseline(light, 100)
+        level = baseline(light, 100, fade=fade)
         traces.append(((light - level) / np.maximum(level, 1e-30))[:, 0, 0])
     distance = np.array([[np.hypot(*(np.array(r.centre) - centre - p)) for p in places] for r in regions])
     correlations = []
@@ -151,7 +164,7 @@ def neurons(
     at_place = []
     for (row, column), course in zip(inside, active, strict=True):
         light = pictures[:, row - 2 : row + 3, column - 2 : column + 3].mean(axis=(1, 2))[:, None, None]
-        level = baseline(light, 100)
+        level = baseline(light, 100, fade=fade)
         trace = ((light - level) / np.maximum(level, 1e-30))[:, 0, 0]
         at_place.append(float(np.corrcoef(trace, course)[0, 1]) if trace.std() > 0 else 0.0)
     figures = {
@@ -161,7 +174,7 @@ def neurons(
         "median_correlation": float(np.median(correlations)) if correlations else 0.0,
         "least_correlation": min(correlations, default=0.0),
         "median_at_true_places": float(np.median(at_place)),
-        "motion_found_px": motion(pictures).largest_px,
+        "motion_found_px": found_motion.largest_px,
     }
     return figures, pictures, dff, regions, traces, (places + centre, active)
 
@@ -264,35 +277,40 @@ def figure(path: Path, result, rows: list[dict]) -> None:
 
     figures, pictures, dff, regions, traces, (places, active) = result
     page = Figure(figsize=(13, 8), layout="constrained")
-    grid = page.add_gridspec(2, 4)
-    axes = page.add_subplot(grid[0, 0])
+    swept = [name for name in SWEEPS if any(row["swept"] == name for row in rows)]
+    top, bottom = page.subfigures(2, 1)
+    grid = top.add_gridspec(1, 4)
+    axes = top.add_subplot(grid[0, 0])
     axes.imshow(pictures.mean(axis=0), cmap="gray")
     axes.plot(places[:, 1], places[:, 0], "o", mfc="none", mec="c", ms=9)
     axes.plot([r.centre[1] for r in regions], [r.centre[0] for r in regions], "r+")
     axes.set_title("mean; neurons (o), regions (+)")
-    axes = page.add_subplot(grid[0, 1])
+    axes = top.add_subplot(grid[0, 1])
     axes.imshow(dff.max(axis=0), cmap="hot", vmax=float(np.percentile(dff.max(axis=0), 99.5)))
     axes.set_title("largest dF/F")
-    axes = page.add_subplot(grid[0, 2:])
+    axes = top.add_subplot(grid[0, 2:])
     for number, region in enumerate(regions[:6]):
         own = int(np.argmin(np.hypot(*(places - region.centre).T)))
         axes.plot(traces[number] + 1.2 * number, "r", lw=0.9)
         axes.plot(active[own] + 1.2 * number, "k", lw=0.7)
     axes.set_title(f"dF/F (red) and truth (black): median correlation {figures['median_correlation']:.3f}")
-    swept = [name for name in SWEEPS if any(row["swept"] == name for row in rows)][:4]
-    for place, name in enumerate(swept):
-        axes = page.add_subplot(grid[1, place])
-        mine = [row for row in rows if row["swept"] == name]
+    places = bottom.subplots(1, max(len(swept), 1), sharey=True, squeeze=False)[0]
+    for name, axes in zip(swept, places, strict=False):
+        mine = [row for row in rows if row["swept"] == name and not row["align"]]
         values = [row[name] for row in mine]
         for key, style in (("median_correlation", "o-"), ("median_at_true_places", "x:")):
             axes.plot(values, [row[key] for row in mine], style, label=key.replace("_", " "))
         axes.plot(values, [row["found"] / row["of"] for row in mine], "s--", label="share found")
+        moved = [row for row in rows if row["swept"] == name and row["align"]]
+        if moved:
+            axes.plot(
+                [r[name] for r in moved], [r["median_correlation"] for r in moved], "v-", label="aligned"
+            )
         axes.axhline(0.9, color="0.7", lw=0.8)
         axes.set_xscale("log" if name in ("photons", "neurons") else "linear")
         axes.set_ylim(0, 1.02)
         axes.set_xlabel(name)
-    if swept:
-        page.axes[-1].legend(fontsize=7)
+        axes.legend(fontsize=6, loc="lower left")
     page.savefig(path, dpi=90)
 
 
@@ -301,6 +319,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--sweeps", nargs="*", default=list(SWEEPS))
+    parser.add_argument("--no-beads", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("activity-benchmark"))
     options = parser.parse_args()
     options.out.mkdir(exist_ok=True)
@@ -314,11 +333,17 @@ def main() -> None:
             case = {**DEFAULT, name: value}
             figures = default[0] if case == DEFAULT else neurons(options.frames, **case)[0]
             rows.append({"swept": name, **case, **figures})
+            if name == "motion_px" and value > 0:
+                moved = neurons(options.frames, **{**case, "align": True})[0]
+                rows.append({"swept": name, **case, "align": True, **moved})
+                print("aligned", value, {k: round(v, 3) for k, v in moved.items()}, flush=True)
             print(name, value, {k: round(v, 3) for k, v in figures.items()}, flush=True)
-    beads = [flow(60, count, photons)[0] for count, photons in BEADS]
+    beads = [] if options.no_beads else [flow(60, count, photons)[0] for count, photons in BEADS]
     for row in beads:
         print("beads", {k: round(v, 3) for k, v in row.items()}, flush=True)
     for file_name, table in (("neurons.csv", rows), ("beads.csv", beads)):
+        if not table:
+            continue
         with (options.out / file_name).open("w", newline="") as file:
             writer = csv.DictWriter(file, list(table[0]))
             writer.writeheader()

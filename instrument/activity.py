@@ -17,7 +17,17 @@ from instrument.errors import BenchError, FileError
 from instrument.plain_json import plain
 from instrument.video.mp4 import DEFAULT_FPS, levels_of, write_mp4
 from instrument.video.output import VideoPictures, create_output
-from recon.activity import Motion, Region, aligned, baseline, change, find_regions, local_correlation, motion
+from recon.activity import (
+    Motion,
+    Region,
+    aligned,
+    baseline,
+    change,
+    fading,
+    find_regions,
+    local_correlation,
+    motion,
+)
 
 Floats = npt.NDArray[np.float32]
 
@@ -72,6 +82,8 @@ class Activity:
         dF/F of the regions' mean fluorescence.
     motion : Motion
         Before alignment.
+    faded : float
+        Share of the field's light that is lost by the end; negative where it grows.
     """
 
     indices: tuple[int, ...]
@@ -82,6 +94,7 @@ class Activity:
     regions: list[Region]
     traces: Floats
     motion: Motion
+    faded: float
 
 
 def find_activity(
@@ -122,13 +135,14 @@ def find_activity(
         frames = aligned(frames, found)
     period_s = video.period_s
     window = round(settings.window_s / (period_s or 0.1))
-    base = baseline(frames, max(window, 3), settings.percentile)
+    fade = fading(frames)
+    base = baseline(frames, max(window, 3), settings.percentile, fade)
     dff = change(frames, base)
     regions = find_regions(dff, least_correlation=settings.least_correlation, radius_px=settings.radius_px)
     traces = np.zeros((len(regions), len(indices)), np.float32)
     for trace, region in zip(traces, regions, strict=True):
         light = region.trace(frames)[:, None, None]
-        level = baseline(light, max(window, 3), settings.percentile)
+        level = baseline(light, max(window, 3), settings.percentile, fade)
         trace[...] = ((light - level) / np.maximum(level, np.finfo(np.float32).tiny))[:, 0, 0]
     return Activity(
         indices=tuple(indices),
@@ -139,6 +153,7 @@ def find_activity(
         regions=regions,
         traces=traces,
         motion=found,
+        faded=1 - float(fade[-1]),
     )
 
 
@@ -184,6 +199,7 @@ def write_activity(
                     "frames": len(activity.indices),
                     "regions": len(activity.regions),
                     "largest_motion_px": activity.motion.largest_px,
+                    "faded": activity.faded,
                     "software": origin.get("software"),
                 }
             ),

@@ -91,6 +91,9 @@ def activity(
             typer.echo(
                 "Warning: frames move by half a pixel or more: edges look active. Try --align.", err=True
             )
+        typer.echo(
+            f"{'Bleaching':<12}{100 * found.faded:.0f} % of the field's light by the end, taken out of F0"
+        )
         typer.echo(f"{'Regions':<12}{len(found.regions)}")
         if not found.regions:
             typer.echo("Warning: no region found; lower --correlation, or is nothing active?", err=True)

@@ -1,6 +1,6 @@
 """Activity in videos: baseline, relative change, regions and their courses."""
 
-from recon.activity.baseline import Motion, aligned, baseline, change, motion
+from recon.activity.baseline import Motion, aligned, baseline, change, fading, motion
 from recon.activity.regions import Region, find_regions, local_correlation
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "aligned",
     "baseline",
     "change",
+    "fading",
     "find_regions",
     "local_correlation",
     "motion",

@@ -93,7 +93,34 @@ def _shift(frame: Floats, window: Array, reference: Array) -> tuple[float, float
     return place[0], place[1]
 
 
-def baseline(frames: Floats, window: int, percentile: float = PERCENTILE) -> Floats:
+def fading(frames: Floats) -> npt.NDArray[np.float64]:
+    """Return how the whole field's light fades, relative to the first frame, (n_frames,): an exponential.
+
+    Its rate is the median slope between frames half the video apart (Sen 1968), of the logarithm of a frame's
+    light: activity, which comes and goes, does not tell on it. What bleaches otherwise than the whole is left
+    to the sliding baseline.
+
+    Parameters
+    ----------
+    frames : ndarray, (n_frames, height, width)
+    """
+    light = np.mean(frames, axis=(1, 2), dtype=np.float64)
+    half = len(frames) // 2
+    first, later = light[: len(light) - half], light[half:]
+    shines = (first > 0) & (later > 0)
+    if half == 0 or not shines.any():
+        return np.ones(len(frames))
+    slope = float(np.median(np.log(later[shines] / first[shines]))) / half
+    relative: npt.NDArray[np.float64] = np.exp(slope * np.arange(len(frames)))
+    return relative
+
+
+def baseline(
+    frames: Floats,
+    window: int,
+    percentile: float = PERCENTILE,
+    fade: npt.NDArray[np.float64] | None = None,
+) -> Floats:
     """Return each pixel's baseline F0: a sliding percentile, (n_frames, height, width), float32.
 
     The percentile is taken in windows centred on frames a quarter of a window apart and drawn linearly
@@ -104,8 +131,11 @@ def baseline(frames: Floats, window: int, percentile: float = PERCENTILE) -> Flo
     ----------
     frames : ndarray, (n_frames, height, width)
     window : int
-        Frames that a baseline looks at. Much longer than activity, shorter than bleaching.
+        Frames that a baseline looks at. Much longer than activity.
     percentile : float
+    fade : ndarray, (n_frames,), optional
+        As of :func:`fading`: taken out before the percentile and put back after. Without it, light that
+        fades within a window pulls its percentile down, and the ends of the video up.
     """
     count = len(frames)
     if not 0 <= percentile <= 100:
@@ -118,7 +148,10 @@ def baseline(frames: Floats, window: int, percentile: float = PERCENTILE) -> Flo
     levels = []
     for anchor in anchors:
         first = int(np.clip(anchor - window // 2, 0, count - window))
-        levels.append(np.percentile(frames[first : first + window], percentile, axis=0))
+        part = frames[first : first + window]
+        if fade is not None:
+            part = part / fade[first : first + window, None, None]
+        levels.append(np.percentile(part, percentile, axis=0))
     # Where the shifted windows of the ends are centred, the level is their own.
     centres = np.clip(anchors, window // 2, count - window + window // 2)
     _, kept = np.unique(centres, return_index=True)
@@ -132,6 +165,8 @@ def baseline(frames: Floats, window: int, percentile: float = PERCENTILE) -> Flo
         left = right - 1
         share = np.clip((index - where[left]) / (where[right] - where[left]), 0, 1)
         result[index] = (1 - share) * known[left] + share * known[right]
+    if fade is not None:
+        result *= fade.astype(np.float32)[:, None, None]
     return result
 
 

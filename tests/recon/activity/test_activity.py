@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.activity import aligned, baseline, change, find_regions, local_correlation, motion
+from recon.activity import aligned, baseline, change, fading, find_regions, local_correlation, motion
 
 SHAPE = (40, 48)
 PLACES = ((10, 12), (12, 34), (29, 20))
@@ -42,6 +42,28 @@ def test_baseline_is_the_percentile_where_it_is_anchored_and_follows_bleaching()
     bleached = (np.exp(-np.arange(400) / 200)[:, None, None] * np.ones((1, 2, 2))).astype(np.float32)
     assert np.abs(baseline(bleached, 40) / bleached - 1)[20:-20].max() < 0.08
     assert baseline(bleached[:2], 3).shape == (2, 2, 2)
+
+
+def test_fading_is_found_under_activity_and_taken_out_of_the_baseline() -> None:
+    frames, active = cells(noise=0.02)
+    fade = 0.2 ** (np.arange(len(frames)) / (len(frames) - 1))
+    found = fading((frames * fade[:, None, None]).astype(np.float32))
+    assert found[0] == 1
+    assert found[-1] == pytest.approx(0.2, rel=0.1)
+    assert fading(frames)[-1] == pytest.approx(1, abs=0.1)
+    bleached = (frames * fade[:, None, None]).astype(np.float32)
+    correlations = []
+    for given in (None, found):
+        level = baseline(bleached, 100, 20, given)[:, 10, 12]
+        trace = bleached[:, 10, 12] / level - 1
+        correlations.append(float(np.corrcoef(trace, active[0])[0, 1]))
+    assert correlations[0] < 0.9
+    assert correlations[1] > 0.97
+
+
+@pytest.mark.parametrize("frames", [np.zeros((4, 3, 3)), -np.ones((4, 3, 3)), np.ones((1, 3, 3))])
+def test_fading_of_what_does_not_shine_is_none(frames: np.ndarray) -> None:
+    assert (fading(frames.astype(np.float32)) == 1).all()
 
 
 def test_change_is_relative_where_it_shines_and_small_where_it_is_dark() -> None:
