@@ -50,6 +50,7 @@ class _Loaded:
     path: Path
     calibration: Calibration
     reconstructor: LiveReconstructor
+    z_um: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,14 +201,29 @@ class LiveReconstructionPanel(Panel):
 
         def work(_: JobContext) -> _Loaded:
             self.follower.stop()
-            return _Loaded(path, calibration, LiveReconstructor(calibration, z_um=z_um, budget_ms=budget_ms))
+            return _Loaded(
+                path, calibration, LiveReconstructor(calibration, z_um=z_um, budget_ms=budget_ms), z_um
+            )
 
         job = self.session.jobs.compute("Preparing the preview", work)
         job.quiet = True
         self._loading = job
         job.succeeded.connect(lambda value: self._ready(job, value))
-        job.failed.connect(lambda why: self._refuse(job, why))
+        job.failed.connect(lambda why: self._not_ready(job, why))
         job.ended.connect(lambda: self._not_loading(job))
+
+    def _not_ready(self, job: Job, why: str) -> None:
+        """Say why, and what goes on: the preview of before."""
+        if job is not self._loading:
+            return
+        loaded = self.loaded
+        if loaded is not None:
+            place = -1 if loaded.z_um is None else self.plane.findData(loaded.z_um)
+            if place >= 0:
+                self.plane.setCurrentIndex(place)
+            where = self.plane.currentText() if place >= 0 else str(loaded.path)
+            why = f"{why} The preview goes on as before: {where}."
+        self.refused(self.file, why)
 
     def _not_loading(self, job: Job) -> None:
         if job is self._loading:

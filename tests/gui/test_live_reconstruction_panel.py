@@ -17,6 +17,7 @@ from gui.main_window import MainWindow
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 from gui.session import BenchSession
 from instrument.calibration_file import load_calibration, save_calibration
+from recon.errors import InputError
 from recon.types import Calibration
 
 WAIT_MS = 40_000
@@ -136,6 +137,27 @@ def test_of_depths_chosen_in_quick_succession_the_last_is_shown(
     assert panel.follower._view is not None
     assert made[panel.loaded.reconstructor] == 3e5
     assert panel.follower._view.reconstructor is panel.loaded.reconstructor
+
+
+def test_a_depth_that_cannot_be_prepared_is_told_and_the_one_before_goes_on(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = load_calibration(tmp_path / "calibration")
+    two = Calibration(np.repeat(one.psfs, 2, axis=0), np.array([[0.0, 0.0, z] for z in (1e5, 2e5)]))
+    panel.file.setText(str(save_calibration(two, tmp_path / "two")))
+    panel.load()
+    qtbot.waitUntil(lambda: panel.z_um == 2e5 and panel._loading is None, timeout=WAIT_MS)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise InputError("This PSF is dark.")
+
+    monkeypatch.setattr(live_reconstruction, "LiveReconstructor", refuse)
+    panel.plane.setCurrentIndex(0)
+    panel.plane.activated.emit(0)
+    qtbot.waitUntil(lambda: "This PSF is dark." in panel.file.toolTip(), timeout=WAIT_MS)
+    assert "goes on as before: z 200 mm" in panel.file.toolTip()
+    assert panel.z_um == 2e5
+    qtbot.waitUntil(lambda: panel.follower.is_following, timeout=WAIT_MS)
 
 
 def _preparing(panel: LiveReconstructionPanel) -> bool:
