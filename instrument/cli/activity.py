@@ -91,13 +91,19 @@ def activity(
             typer.echo(
                 "Warning: frames move by half a pixel or more: edges look active. Try --align.", err=True
             )
-        typer.echo(
-            f"{'Bleaching':<12}{100 * found.faded:.0f} % of the field's light by the end, taken out of F0"
-        )
+        typer.echo(f"{'Bleaching':<12}{_fading(found.faded)}")
         typer.echo(f"{'Regions':<12}{len(found.regions)}")
         if not found.regions:
             typer.echo("Warning: no region found; lower --correlation, or is nothing active?", err=True)
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, write_activity(found, pictures, out, settings)))}")
+
+
+def _fading(share: float) -> str:
+    percent = round(100 * share)
+    if percent == 0:
+        return "none: the field's light does not fade"
+    what = "fades" if percent > 0 else "grows"
+    return f"the field's light {what} by {abs(percent)} % in all; taken out of the baseline"
 
 
 def _video(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -106,6 +107,8 @@ def cluster(*, workers: int | None = None, scheduler: str | None = None) -> Iter
         raise BenchError(
             "Workers need Dask, which is not installed: pip install 'diffuserbench[cluster]'."
         ) from error
+    # Its own configuration says INFO, and silence_logs below is taken back before the last messages come.
+    logging.getLogger("distributed").setLevel(logging.WARNING)
     if scheduler is not None:
         try:
             client = distributed.Client(scheduler, timeout=CONNECT_S)

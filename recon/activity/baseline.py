@@ -104,7 +104,7 @@ def fading(frames: Floats) -> npt.NDArray[np.float64]:
     ----------
     frames : ndarray, (n_frames, height, width)
     """
-    light = np.mean(frames, axis=(1, 2), dtype=np.float64)
+    light: Array = np.asarray(np.mean(frames, axis=(1, 2), dtype=np.float64))
     half = len(frames) // 2
     first, later = light[: len(light) - half], light[half:]
     shines = (first > 0) & (later > 0)
@@ -148,9 +148,9 @@ def baseline(
     levels = []
     for anchor in anchors:
         first = int(np.clip(anchor - window // 2, 0, count - window))
-        part = frames[first : first + window]
+        part: Array = frames[first : first + window]
         if fade is not None:
-            part = part / fade[first : first + window, None, None]
+            part = part / fade[first : first + window, None, None].astype(np.float32)
         levels.append(np.percentile(part, percentile, axis=0))
     # Where the shifted windows of the ends are centred, the level is their own.
     centres = np.clip(anchors, window // 2, count - window + window // 2)
