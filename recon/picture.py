@@ -27,7 +27,7 @@ from recon.volume.channel import PRIORS as VOLUME_PRIORS
 from recon.volume.model import MODELS, ModelName
 
 if TYPE_CHECKING:
-    from recon.auto.decide import Wishes
+    from recon.auto.wishes import Wishes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -169,7 +169,7 @@ def reconstruct(
             judged=judged,
         )
     if wishes is not None:
-        from recon.auto.decide import require_choice
+        from recon.auto.wishes import require_choice
 
         require_choice(wishes, prevented)
     varying = _varying_model(calibration, z_um, model, method, prior, initial)

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.auto.choice import Choice, Decision
-from recon.auto.decide import Wishes, choose
+from recon.auto.decide import choose
 from recon.auto.run import reduce
+from recon.auto.wishes import Wishes
 from recon.checks import as_channels
 from recon.errors import InputError
 from recon.methods import method_named

@@ -22,10 +22,14 @@ COARSE_PX = 96
 """Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
 pattern's edge: on fewer pixels all depths look alike."""
 COARSE_ITERATIONS = 40
+VARYING_ITERATIONS = 20
+"""The same with PSFs that vary over the field, whose solver goes further in one."""
 CHANNEL_NOISE = 1.1
 """Misfit, in units of the noise, up to which colour channels are taken to be proportional."""
 CHANNEL_PSF = 0.05
 """The same of their PSFs, relative to them."""
+ACCEPTED = 0.02
+"""Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
 LIGHT_LOST = 2e-3
 """Share of a PSF's light that may lie outside the window it is cut to, along each axis."""
 
@@ -42,24 +46,41 @@ class CoarsePass:
         Share of every plane in the channel's light.
     seconds : float
         Processor time of an iteration.
+    smooth_share : float
+        Mean of the smooth background relative to that of the data; 0 where none was estimated.
+    objective : float
+        Half the squared misfit and the prior, summed over the channels.
     """
 
     misfit: float
     light: npt.NDArray[np.float64]
     seconds: float
+    smooth_share: float
+    objective: float
 
 
-def coarse_passes(channels: list[Scaled], prior: VolumePrior, *, background: bool) -> CoarsePass:
-    """Reconstruct every channel in few iterations; the misfit is their root mean square."""
-    passes = [coarse_pass(c, "convolution", prior, background=background) for c in channels]
+def coarse_passes(
+    channels: list[Scaled],
+    prior: VolumePrior,
+    *,
+    background: bool,
+    model: ModelName = "convolution",
+    iterations: int = COARSE_ITERATIONS,
+) -> CoarsePass:
+    """Reconstruct every channel in few iterations; misfits are their root mean square, shares their mean."""
+    passes = [coarse_pass(c, model, prior, background=background, iterations=iterations) for c in channels]
     return CoarsePass(
         float(np.sqrt(np.mean([p.misfit**2 for p in passes]))),
         np.concatenate([p.light for p in passes]),
         sum(p.seconds for p in passes),
+        float(np.mean([p.smooth_share for p in passes])),
+        sum(p.objective for p in passes),
     )
 
 
-def coarse_pass(scaled: Scaled, model: ModelName, prior: VolumePrior, *, background: bool) -> CoarsePass:
+def coarse_pass(
+    scaled: Scaled, model: ModelName, prior: VolumePrior, *, background: bool, iterations: int
+) -> CoarsePass:
     """Reconstruct the first channel in few iterations."""
     n_z = len(scaled.depths.z_um)
     run = ChannelProblem(
@@ -74,19 +95,20 @@ def coarse_pass(scaled: Scaled, model: ModelName, prior: VolumePrior, *, backgro
     try:
         solver, _ = run.solver(None, None)
         began = time.process_time()
-        outcome = solver.run(StoppingRules(iterations=COARSE_ITERATIONS, tolerance=0.0))
-        seconds = (time.process_time() - began) / COARSE_ITERATIONS
-        residual = scaled.data[:1] - run.camera.forward(outcome.solution)
-        if background:
-            residual -= run.background(outcome.solution)
+        outcome = solver.run(StoppingRules(iterations=iterations, tolerance=0.0))
+        seconds = (time.process_time() - began) / iterations
+        smooth = run.background(outcome.solution) if background else None
+        residual = run.residual(outcome.solution, smooth)
         volume = np.abs(np.asarray(outcome.solution[0], np.float64))
     finally:
         run.close()
     per_plane = volume.sum(axis=(1, 2)) * scaled.depths.central[:, 0].sum(axis=(1, 2), dtype=np.float64)
     valid = scaled.valid[0]
-    misfit = float(np.sqrt(np.mean(residual[0][valid].astype(np.float64) ** 2)))
+    misfit = float(np.sqrt(np.mean(residual[valid].astype(np.float64) ** 2)))
     share = per_plane / max(float(per_plane.sum()), 1e-30)
-    return CoarsePass(misfit, share[None], seconds)
+    light = float(scaled.data[0][valid].mean(dtype=np.float64))
+    smooth_share = 0.0 if smooth is None or light <= 0 else float(smooth[valid].mean()) / light
+    return CoarsePass(misfit, share[None], seconds, smooth_share, outcome.history[-1].objective)
 
 
 def operator_seconds(scaled: Scaled, model: ModelName) -> float:
@@ -172,7 +194,7 @@ def psf_window(depths: Depths) -> tuple[int, int]:
     return sizes[0], sizes[1]
 
 
-def acceptance_px(depths: Depths, level: float = 0.02) -> float | None:
+def acceptance_px(depths: Depths, level: float = ACCEPTED) -> float | None:
     """Distance from the axis, pixels, at which PSFs are down to ``level`` of the central one's light.
 
     From a Gaussian fitted to the light of the registered PSFs at the places they were calibrated at; None

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.auto.channels import merged_input
 from recon.auto.choice import Choice
-from recon.auto.decide import merged_input
 from recon.auto.reduced import Colours, binned, enlarged, reduced_calibration
 from recon.noise import NoiseModel
 from recon.preparation import channel_noise, data_of

@@ -28,12 +28,13 @@ from recon.volume.channel import PRIORS, ChannelProblem, Scaled, VolumePrior
 from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
 from recon.volume.left_out import limit_of, signs_in_words, signs_of_light
+from recon.volume.light import energies, levelled
 from recon.volume.model import Depths, Extent, ModelName, choose_model, members_of_depths, sort_by_depth
 from recon.volume.positive_background import in_turns, is_negative, may_go_on
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 if TYPE_CHECKING:
-    from recon.auto.decide import Wishes
+    from recon.auto.wishes import Wishes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -174,17 +175,13 @@ def reconstruct_volume(
             cancel=cancel,
         )
     if wishes is not None:
-        from recon.auto.decide import require_choice
+        from recon.auto.wishes import require_choice
 
         require_choice(wishes, prevented)
     tolerance = 1e-3 if tolerance is None else tolerance
     scaled = prepare_volume(measurement, calibration, background, erasures, noise, extent)
     name, reason = choose_model(scaled.depths, model)
-    # l1 counts light on the sensor: a near plane, whose PSF is brighter, must not be the cheaper explanation.
-    gains = plane_gains(scaled) if prior == "l1" else np.ones(len(scaled.depths.z_um), np.float32)
     as_measured = scaled
-    scaled = replace(scaled, depths=scaled.depths.divided(gains))
-    per_plane = gains[:, None, None]
     smooth = background is None if estimate_background is None else estimate_background
     try:
         rules = StoppingRules(
@@ -197,6 +194,11 @@ def reconstruct_volume(
     height, width = scaled.data.shape[1:]
     psf_shape = scaled.depths.central.shape[2:]
     window, centre = _window(field, (height, width), (psf_shape[0], psf_shape[1]))
+    gains = np.ones((1, 1, 1), np.float32)
+    if prior == "l1":  # which counts light on the sensor: no voxel may be the cheaper explanation
+        even, gains = levelled(scaled.depths, (height, width), varying=name != "convolution")
+        scaled = replace(scaled, depths=even)
+        gains = gains if gains.shape[1:] == (1, 1) else gains[:, window[0], window[1]]
     grid = _grid(calibration, scaled.depths, window, centre)
     weights = grid.axis_weights() if axis_weights is None else np.asarray(axis_weights, float)
     volumes, outcomes, backgrounds, taus, empty = [], [], [], [], []
@@ -215,7 +217,7 @@ def reconstruct_volume(
             device=device,
             acceptance_px=None if extent is None else extent.acceptance_px,
         )
-        start = None if initial is None else run.start(_channel(initial.volume, channel) * per_plane, window)
+        start = None if initial is None else run.start(_channel(initial.volume, channel) * gains, window)
         solver, relative = run.solver(tau, start)
         scale = float(scaled.noise[channel]) / scaled.energy
 
@@ -223,7 +225,7 @@ def reconstruct_volume(
             if callback is not None:
                 callback(
                     record,
-                    lambda: solver.solution[0][:, window[0], window[1]] * (np.float32(scale) / per_plane),
+                    lambda: solver.solution[0][:, window[0], window[1]] * (np.float32(scale) / gains),
                 )
 
         if stop_at_noise:
@@ -253,7 +255,7 @@ def reconstruct_volume(
         if extent is not None and extent.left_out is not None:
             rest = run.residual(outcome.solution, smooth_part)
             signs.append(signs_of_light(rest, extent.left_out, channel, extent.psf_window) / limit_of(run))
-        volumes.append(outcome.solution[0][:, window[0], window[1]] * (np.float32(scale) / per_plane))
+        volumes.append(outcome.solution[0][:, window[0], window[1]] * (np.float32(scale) / gains))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
@@ -317,18 +319,6 @@ def _noise_norm(scaled: Scaled, channel: int = 0) -> float:
     return float(np.sqrt(np.count_nonzero(scaled.valid[channel])))
 
 
-def plane_gains(scaled: Scaled) -> npt.NDArray[np.float32]:
-    """Return the energy of every depth's central PSF, relative to their root mean square, (n_z,)."""
-    energy = np.sqrt(np.sum(_energies(scaled.depths.central), axis=1))
-    relative = energy * np.sqrt(len(energy)) / max(float(np.linalg.norm(energy)), 1e-30)
-    return np.where(relative > 0, relative, 1.0).astype(np.float32)
-
-
-def _energies(psfs: Array) -> npt.NDArray[np.float64]:
-    """Return the sum of squares of every PSF, (n_z, n_channels): plane by plane, for memory's sake."""
-    return np.array([np.sum(psf.astype(np.float64) ** 2, axis=(1, 2)) for psf in psfs])
-
-
 def _chosen(
     measurement: npt.ArrayLike,
     calibration: Calibration,
@@ -347,8 +337,9 @@ def _chosen(
     **others: Any,
 ) -> VolumeReconstruction:
     """Choose, reconstruct what was chosen, and bring it back; parameters as :func:`reconstruct_volume`."""
-    from recon.auto.decide import Wishes, choose
+    from recon.auto.decide import choose
     from recon.auto.run import reduce, shown, whole_volume
+    from recon.auto.wishes import Wishes
 
     wishes = wishes or Wishes()
     if wishes.background is None:
@@ -448,7 +439,7 @@ def prepare_volume(
         data=np.where(valid, data / deviation[:, None, None], 0).astype(np.float32),
         valid=valid,
         noise=deviation,
-        energy=float(np.sqrt(np.mean(_energies(psfs)))),
+        energy=float(np.sqrt(np.mean(energies(psfs)))),
         depths=depths,
         warnings=tuple(warnings),
         flat=np.ndim(measurement) == 2,

@@ -13,8 +13,8 @@ from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import _dimming, _similarity, measure
 from recon.volume.channel import Scaled
+from recon.volume.light import plane_gains
 from recon.volume.model import Depths
-from recon.volume.reconstruct import plane_gains
 
 RNG = np.random.default_rng(1)
 
@@ -127,7 +127,7 @@ def test_judging_takes_planes_and_never_the_stack_anew() -> None:
     )
     tracemalloc.start()
     try:
-        similar, dim, gains = _similarity(psfs[:, 0]), _dimming(psfs[:, 0]), plane_gains(scaled)
+        similar, dim, gains = _similarity(psfs[:, 0]), _dimming(psfs[:, 0]), plane_gains(scaled.depths)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -1,0 +1,79 @@
+"""Which depths take part."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.auto.choice import Decision, Option
+from recon.auto.estimates import left_out_db
+from recon.auto.probe import CoarsePass
+from recon.auto.wishes import Wishes
+from recon.volume.model import Depths
+
+LEFT_OUT = 0.02
+"""Share of the coarse pass's light, of any channel, that all planes together that are left out may hold."""
+
+
+def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple[int, ...], Decision]:
+    """Decide which depths take part, by where a coarse pass finds light."""
+    n = len(depths.z_um)
+    everything = tuple(range(n))
+    if n == 1:
+        return everything, Decision("planes", "1", "one depth was calibrated")
+    lit = np.any([_most_of(light) for light in passed.light], axis=0)
+    # The coarse pass may take a plane for its neighbour: those of lit planes stay.
+    order = np.argsort(depths.z_um) if np.isfinite(depths.z_um).all() else np.arange(n)
+    near = lit[order].copy()
+    near[1:] |= lit[order][:-1]
+    near[:-1] |= lit[order][1:]
+    kept = np.zeros(n, bool)
+    kept[order] = near
+    asked = wishes.planes == "all"
+    planes = everything if asked else tuple(int(z) for z in np.flatnonzero(kept))
+    lost = _share(passed.light, ~kept)
+    channel = " of any colour" if len(passed.light) > 1 else ""
+    why = (
+        f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light{channel} into "
+        f"{n - int(kept.sum())} ({LEFT_OUT:.0%} may be left out, and neighbours of those that are not stay)"
+    )
+    loss = 0.0 if asked else left_out_db(lost)
+    numbers = {"planes": float(len(planes)), "of": float(n), "light_left_out": lost}
+    up = None if len(planes) == n else Option(f"all {n}", n / len(planes), -loss)
+    fewest = tuple(int(z) for z in np.flatnonzero(lit))
+    down = None
+    if len(fewest) < len(planes):
+        down = Option(
+            f"{len(fewest)} without their neighbours",
+            len(fewest) / len(planes),
+            left_out_db(_share(passed.light, ~lit)) - loss,
+        )
+    value = f"all {n}" if len(planes) == n else f"{len(planes)} of {n} ({_ranges(planes)})"
+    return planes, Decision("planes", value, why, loss, up, down, asked, numbers)
+
+
+def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return the fewest planes that hold all but ``LEFT_OUT`` of the light; all where there is none."""
+    if not light.any():
+        return np.ones(len(light), bool)
+    order = np.argsort(-light, kind="stable")
+    left = light.sum() - np.cumsum(light[order])
+    chosen = np.zeros(len(light), bool)
+    chosen[order[: int(np.argmax(left <= LEFT_OUT * light.sum())) + 1]] = True
+    return chosen
+
+
+def _share(light: npt.NDArray[np.float64], planes: npt.NDArray[np.bool_]) -> float:
+    """Largest share of any channel's light in some planes."""
+    return float(light[:, planes].sum(axis=1).max())
+
+
+def _ranges(planes: tuple[int, ...]) -> str:
+    """Say indices briefly: ``0-2, 5``."""
+    parts: list[list[int]] = []
+    for z in planes:
+        if parts and parts[-1][-1] == z - 1:
+            parts[-1].append(z)
+        else:
+            parts.append([z])
+    return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else str(p[0]) for p in parts)
