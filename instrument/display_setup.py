@@ -64,9 +64,7 @@ def bench_display(
     """
     table = config.display
     q = expansion or table.expansion
-    k = isqrt(q)
-    if k * k != q:
-        raise BenchError(f"The expansion must be a square (1, 4, 9, 16, 25, 36 ...), not {q}.")
+    k = expansion_side(q)
     (height, width), pitch_um = size
     binning = table.slm_binning
     if height % binning or width % binning:
@@ -88,6 +86,20 @@ def bench_display(
         dc=DcTerm(table.dc_power, table.dc_phase_rad),
         mask_fill=table.mask_fill,
     )
+
+
+def expansion_side(expansion: int) -> int:
+    """Return how many mask pixels an étendue expansion puts along each side of an SLM pixel.
+
+    Raises
+    ------
+    BenchError
+        When the expansion is no square.
+    """
+    side = isqrt(expansion)
+    if side * side != expansion:
+        raise BenchError(f"The expansion must be a square (1, 4, 9, 16, 25, 36 ...), not {expansion}.")
+    return side
 
 
 def _mask_from(path: Path, shape: tuple[int, int], wavelength_nm: float) -> ScatteringMask:

@@ -42,6 +42,7 @@ from gui.views.view_grid import ViewGrid
 from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
+from instrument.display_setup import expansion_side
 from instrument.errors import BenchError
 from instrument.hologram_job import HologramRequest, HologramResult, field_picture
 from instrument.images import read_image
@@ -78,7 +79,7 @@ class HologramsPanel(Panel):
             _signed_mm, tip="Depth behind the focal plane in mm", placeholder="0 mm: the focal plane"
         )
         self.expansion = Entry(
-            number("The expansion", "", above_zero=True, whole=True),
+            _expansion,
             tip="Étendue expansion: 4, 16, 36 …, a square",
             placeholder=f"{session.config.display.expansion}: the bench's",
         )
@@ -534,6 +535,13 @@ def _signed_mm(text: str) -> float:
         raise BenchError(f"The depth {text!r} is no number of mm.") from None
     if not abs(value) < float("inf"):
         raise BenchError(f"The depth must be a finite number of mm, not {text}.")
+    return value
+
+
+def _expansion(text: str) -> int | None:
+    value: int | None = number("The expansion", "", above_zero=True, whole=True)(text)
+    if value is not None:
+        expansion_side(value)
     return value
 
 

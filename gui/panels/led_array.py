@@ -28,6 +28,8 @@ from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import plot_widget, restyle
 
 _LOOK_MS = 300
+_REST_MS = 150
+"""Rest of the brightness before it is sent: a slider that is pulled must not fill a queue."""
 _COLOURS: dict[str, Rgb] = {"white": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 _DPC = ("left", "right", "top", "bottom")
 _DIMMEST = 70
@@ -61,7 +63,12 @@ class LedPanel(Panel):
         self.brightness = QSlider(Qt.Orientation.Horizontal)
         self.brightness.setRange(1, 255)
         self.brightness.setValue(255)
-        self.brightness.setToolTip("Brightness of the LEDs that are lit next, 1 to 255")
+        self.brightness.setToolTip("Brightness of the LEDs that are lit, and of those lit next: 1 to 255")
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.setInterval(_REST_MS)
+        self._rest.timeout.connect(self.dim)
+        self.brightness.valueChanged.connect(lambda _: self._rest.start())
         self.level = QLabel("255")
         self.level.setMinimumWidth(28)
         self.brightness.valueChanged.connect(lambda value: self.level.setText(str(value)))
@@ -134,8 +141,9 @@ class LedPanel(Panel):
         )
 
     def shutdown(self) -> None:
-        """End the timer."""
+        """End the timers."""
         self._timer.stop()
+        self._rest.stop()
 
     def theme_changed(self) -> None:
         """Take over the theme's colours."""
@@ -199,9 +207,10 @@ class LedPanel(Panel):
     def show_pattern(self, name: str) -> None:
         """Show a pattern: ``"bright"``, ``"dark"``, ``"source"``, ``"off"`` or a DPC half."""
         leds, bench = self.session.bench.led_array, self.session.bench
-        na, rgb = self.na.value or 0.25, self.rgb
-        if leds is None:
+        if leds is None or not self.na.submit():  # not with the aperture of before
             return
+        na, rgb = self.na.value or 0.25, self.rgb
+        self._rest.stop()  # the brightness that was pulled goes with the pattern
 
         def work(_: object) -> None:
             if name == "off":
@@ -216,6 +225,21 @@ class LedPanel(Panel):
                 leds.set_pattern(leds.dpc_half(name, na, rgb))
 
         self._start(f"LED array: {name}", work)
+
+    def dim(self) -> None:
+        """Give the LEDs that are lit the chosen brightness, each in its colour; lights none that is dark."""
+        leds, top = self.session.bench.led_array, self.brightness.value()
+        if leds is None or not self.session.is_open("led_array") or leds.pattern.is_dark:
+            return
+
+        def work(_: object) -> None:
+            now = leds.pattern
+            lit = tuple((i, _of_brightness(rgb, top)) for i, rgb in now.levels if max(rgb) > 0)
+            if lit and lit != now.levels:
+                what = now.description.partition(" rgb ")[0].partition(" at ")[0]
+                leds.set_pattern(LedPattern(f"{what} at {top} of 255", lit))
+
+        self._start(f"LED array: brightness {top}", work)
 
     def toggle(self, led: int) -> None:
         """Light an LED in the chosen colour, or darken it."""
@@ -255,6 +279,12 @@ class LedPanel(Panel):
         self.index.submit()
         if self.index.value is not None and not self.index.property("refused"):
             self.toggle(int(self.index.value))
+
+
+def _of_brightness(rgb: Rgb, top: int) -> Rgb:
+    """Return the same hue, its brightest channel at ``top``."""
+    red, green, blue = (round(level * top / max(rgb)) for level in rgb)
+    return (red, green, blue)
 
 
 def _brush(rgb: Rgb) -> Any:

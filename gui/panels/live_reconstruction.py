@@ -33,6 +33,7 @@ from instrument.calibration_file import is_calibration, load_calibration, newest
 from instrument.full_picture import full_picture
 from instrument.live import LiveResult
 from instrument.reconstruction_job import find_calibration
+from instrument.snapshot import Light, light_of
 from recon.live import LiveReconstructor
 from recon.result import Reconstruction
 from recon.types import Calibration
@@ -41,6 +42,7 @@ _LOOK_MS = 50
 _BUDGET_MS = 80.0
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _PROGRESS_S = 0.5
+_NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
 _WHITE = 99.8
 """Percentile of a picture that is shown white."""
 
@@ -105,7 +107,7 @@ class LiveReconstructionPanel(Panel):
         self.budget.setFixedWidth(80)
         self.budget.submitted.connect(self._set_budget)
         self.budget.refused.connect(lambda why: self.refused(None, why))
-        self.status = QLabel("Choose a calibration: diffuserbench calibrate, or the sweeps panel, makes one.")
+        self.status = QLabel(_NO_CALIBRATION)
         self.status.setWordWrap(True)
         self.status.setObjectName("dim")
         first = QHBoxLayout()
@@ -161,6 +163,7 @@ class LiveReconstructionPanel(Panel):
     def load(self) -> None:
         """Load the calibration in the field."""
         folder = Path(self.file.text().strip()).expanduser()
+        self.status.setText(f"Loading {folder} …")
 
         def work(_: JobContext) -> tuple[Path, Calibration]:
             found = find_calibration(folder)
@@ -175,6 +178,8 @@ class LiveReconstructionPanel(Panel):
     def _refuse(self, job: Job, why: str) -> None:
         if job in (self._reading, self._loading):
             self.refused(self.file, why)
+            if self.loaded is None:
+                self.status.setText(_NO_CALIBRATION)
 
     def _got_calibration(self, job: Job, value: object) -> None:
         if job is not self._reading:
@@ -280,7 +285,11 @@ class LiveReconstructionPanel(Panel):
         how = self.follower.status
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        self.status.setText(f"latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}")
+        dark = light_of(self.session.bench) is Light.DARK
+        warning = "Nothing is lit: this is a picture of noise. " if dark else ""
+        self.status.setText(
+            f"{warning}latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}"
+        )
 
     def _show_picture(self, image: npt.NDArray[Any]) -> None:
         sample = image[::3, ::3]

@@ -1,0 +1,85 @@
+"""LED array and holograms in an operator's hands: brightness of what is lit, wrong entries."""
+
+from __future__ import annotations
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from gui.main_window import MainWindow
+from gui.panels.holograms import HologramsPanel
+from gui.panels.led_array import LedPanel
+from gui.panels.live_reconstruction import LiveReconstructionPanel
+
+WAIT_MS = 20_000
+LEFT = Qt.MouseButton.LeftButton
+
+
+@pytest.fixture
+def leds(qtbot: QtBot, window: MainWindow) -> LedPanel:
+    panel = window.show_panel("led_array")
+    assert isinstance(panel, LedPanel)
+    qtbot.waitUntil(lambda: panel._drawn is not None, timeout=WAIT_MS)
+    return panel
+
+
+def test_the_slider_dims_what_is_lit_each_led_in_its_colour_and_lights_nothing(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel
+) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    leds.brightness.setFocus()
+    qtbot.keyClick(leds.brightness, Qt.Key.Key_PageDown)
+    qtbot.waitUntil(lambda: not leds._rest.isActive(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: not window.session.jobs.device_jobs, timeout=WAIT_MS)
+    assert array.pattern.is_dark
+    for led, colour in (("3", "red"), ("7", "blue")):
+        leds.colour.setCurrentText(colour)
+        leds.index.setFocus()
+        leds.index.selectAll()
+        qtbot.keyClicks(leds.index, led)
+        qtbot.keyClick(leds.index, Qt.Key.Key_Return)
+        qtbot.waitUntil(lambda led=led: int(led) in dict(array.pattern.levels), timeout=WAIT_MS)
+    leds.brightness.setFocus()
+    qtbot.keyClick(leds.brightness, Qt.Key.Key_Home)  # the faintest
+    qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (1, 0, 0), 7: (0, 0, 1)}, timeout=WAIT_MS)
+    qtbot.keyClick(leds.brightness, Qt.Key.Key_End)
+    qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (255, 0, 0), 7: (0, 0, 255)}, timeout=WAIT_MS)
+    assert array.pattern.description == "LED 3, 7 at 255 of 255"
+
+
+def test_a_pattern_is_not_lit_with_an_aperture_that_makes_no_sense(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel
+) -> None:
+    leds.na.setFocus()
+    leds.na.selectAll()
+    qtbot.keyClicks(leds.na, "7")
+    qtbot.mouseClick(leds.pattern_buttons["bright"], LEFT)
+    assert leds.na.property("refused")
+    assert not window.session.jobs.is_busy("led_array")
+
+
+def test_an_expansion_that_is_no_square_is_refused_at_its_field(qtbot: QtBot, window: MainWindow) -> None:
+    panel = window.show_panel("holograms")
+    assert isinstance(panel, HologramsPanel)
+    panel.expansion.setFocus()
+    qtbot.keyClicks(panel.expansion, "7")
+    qtbot.keyClick(panel.expansion, Qt.Key.Key_Tab)
+    panel.expansion.check()
+    assert panel.expansion.property("refused")
+    assert "must be a square" in panel.expansion.toolTip()
+
+
+def test_a_calibration_that_cannot_be_loaded_leaves_words_for_what_to_do(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    panel = window.show_panel("live_reconstruction")
+    assert isinstance(panel, LiveReconstructionPanel)
+    before = panel.status.text()
+    assert "Sweeps panel" in before
+    panel.file.setFocus()
+    qtbot.keyClicks(panel.file, "/nowhere")
+    qtbot.keyClick(panel.file, Qt.Key.Key_Return)
+    assert panel.status.text() == "Loading /nowhere …"
+    qtbot.waitUntil(lambda: bool(panel.file.property("refused")), timeout=WAIT_MS)
+    assert panel.status.text() == before
