@@ -207,7 +207,8 @@ def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
 def _hint() -> str:
     fails, works = ("Bright", "dim") if colours().red_light_only else ("Red", "green")
     return (
-        f"{fails} fails, {works} works, dark is the boundary; numbers are errors. Point at a cell for more."
+        f"{fails} fails, {works} works, dark is the boundary; numbers are errors. Point at a cell, "
+        "or go there by arrow keys, for more."
     )
 
 
