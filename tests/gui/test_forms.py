@@ -7,13 +7,28 @@ from typing import Any
 
 import pytest
 
+from calibration_routines.display_procedures import AlignmentProcedure
+from calibration_routines.optics_procedures import BeadProcedure
 from calibration_routines.plan_procedures import PlanProcedure
+from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.sweep_procedure import SweepProcedure
 from calibration_routines.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT
 from gui.forms.as_python import script
-from gui.forms.routines import AXIAL, BEADS, LATERAL, PHOTOGRAPH, PLAN, ROUTINES, SLM
-from instrument.config_file import display_text
+from gui.forms.routines import (
+    ANGULAR,
+    AXIAL,
+    BEADS,
+    DPC,
+    LATERAL,
+    PHOTOGRAPH,
+    PLAN,
+    ROUTINES,
+    SLM,
+    VOLUME,
+)
+from instrument.bench import Bench
+from instrument.config_file import display_text, led_microscope_text
 from instrument.errors import BenchError, SettingsError
 
 Z = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3}
@@ -88,12 +103,24 @@ positions = { kind = "points", points_um = [[0, 0, 8e4], [0, 0, 9e4]] }
 """
 
 
+def bench_for(form: Any) -> str:
+    """A small bench that has what a routine needs."""
+    if form is DPC:
+        return led_microscope_text().replace("pixels = 384", "pixels = 96")
+    if form is SLM:
+        return display_text().replace("[360, 640]", "[100, 140]")
+    return BENCH
+
+
 FAST = {"average": 1, "dark_frames": 1}
 
 
 @pytest.mark.parametrize(
     ("form", "changed"),
     [
+        (VOLUME, {"planes": 2, "half_field_x_um": 0.0, "half_field_y_um": 0.0, "spacing_um": 1e3, **FAST}),
+        (ANGULAR, {"largest_deg": 10.0, "step_deg": 5.0, **FAST}),
+        (DPC, FAST),
         (AXIAL, {"planes": 2, **FAST}),
         (LATERAL, {"half_field_x_um": 0.0, "half_field_y_um": 0.0, "spacing_um": 1e3, **FAST}),
         (PHOTOGRAPH, FAST),
@@ -106,7 +133,7 @@ def test_the_python_of_a_form_runs(
     form: Any, changed: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bench = tmp_path / "bench.toml"
-    bench.write_text(BENCH if form is not SLM else display_text().replace("[360, 640]", "[100, 140]"))
+    bench.write_text(bench_for(form))
     lines = script(form.make(values_of(form, **changed)), bench)
     names: dict[str, Any] = {}
     exec(lines, names)
@@ -115,3 +142,30 @@ def test_the_python_of_a_form_runs(
     assert all(path.exists() for path in written)
     assert written[0].parent == tmp_path / "runs"
     assert done.verdict[0] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("form", "kind", "changed"),
+    [
+        (ALIGNMENT, AlignmentProcedure, {"reach": 6.0, "rows": 2, "columns": 3, "moves": 0}),
+        (BEADS, BeadProcedure, {"images": 2, "rows": 1, "columns": 2, "rank": 1}),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_the_python_of_what_takes_minutes_asks_for_what_the_form_says(
+    form: Any, kind: Any, changed: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = tmp_path / "bench.toml"
+    bench.write_text(display_text().replace("[360, 640]", "[100, 140]") if form is ALIGNMENT else BENCH)
+    asked: list[Any] = []
+
+    def carry_out(procedure: Any, opened: Bench) -> Outcome:
+        asked.append(procedure)
+        assert all(device.is_open for device in opened.devices.values())
+        return Outcome(verdict=("done",), good=True)
+
+    monkeypatch.setattr(kind, "outlook", lambda *_: Outlook(("looked",)))
+    monkeypatch.setattr(kind, "carry_out", carry_out)
+    procedure = form.make(values_of(form, **changed))
+    exec(script(procedure, bench), {})
+    assert asked == [procedure]
