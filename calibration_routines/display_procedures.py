@@ -175,7 +175,7 @@ class AlignmentProcedure:
             def tell(words: str, frames: int) -> None:
                 control.check()
                 heard.said(words)
-                heard.share(frames, settings.max_frames)
+                heard.share(frames, settings.max_frames, at_most=True)
 
             report = MaskAlignment(io, display, settings, progress=tell, on_look=heard.look).run()
             alignment = _alignment(report, bench, display.mask.shape)

@@ -82,8 +82,11 @@ class Listener:
     def step(self, words: str) -> None:
         """Hear that another step begins: ``"finding exposures"``."""
 
-    def share(self, done: float, total: float) -> None:
-        """Hear how much of the step is done, where it does not take the frames of a plan."""
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        """Hear how much of the step is done, where it does not take the frames of a plan.
+
+        ``at_most``: the step ends when it has found what it looks for, usually long before ``total``.
+        """
 
     def said(self, words: str) -> None:
         """Hear what was found on the way, for a log."""

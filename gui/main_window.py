@@ -22,9 +22,10 @@ from PySide6.QtWidgets import (
 )
 
 from gui.jobs import Job, words_for
+from gui.operator_request import OperatorRequest
 from gui.panel import Panel
 from gui.panels import PANELS, PanelEntry
-from gui.session import BenchSession, OperatorRequest
+from gui.session import BenchSession
 from gui.theme import THEMES, apply_theme
 from gui.widgets.device_chips import DeviceChips
 from gui.widgets.image_view import ImageView

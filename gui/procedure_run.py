@@ -37,6 +37,8 @@ class Situation:
         Of the step; total 0: not known.
     seconds, seconds_left : float
         Of the step; None: not known.
+    at_most : bool
+        Whether it usually ends long before ``total``: then ``seconds_left`` is a bound, no estimate.
     paused : bool
         Whether it really waits.
     newest : Snapshot or None
@@ -48,6 +50,7 @@ class Situation:
     step: str = ""
     done: float = 0.0
     total: float = 0.0
+    at_most: bool = False
     seconds: float = 0.0
     seconds_left: float | None = None
     paused: bool = False
@@ -72,12 +75,12 @@ class _Heard(Listener):
             self._began_s = time.monotonic()
             self._situation = Situation(step=words, newest=self._situation.newest)
 
-    def share(self, done: float, total: float) -> None:
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
         seconds = time.monotonic() - self._began_s
         left = seconds * (total - done) / done if done > 0 else None
         with self._lock:
             self._situation = replace(
-                self._situation, done=done, total=total, seconds=seconds, seconds_left=left
+                self._situation, done=done, total=total, at_most=at_most, seconds=seconds, seconds_left=left
             )
 
     def said(self, words: str) -> None:

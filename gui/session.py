@@ -7,54 +7,33 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from drivers.camera import Camera
-from drivers.device import Device
 from drivers.errors import (
     DeviceError,
-    DeviceLostError,
-    DeviceNotOpenError,
-    DeviceTimeoutError,
     LimitError,
     StoppedError,
 )
 from drivers.frame import Frame
+from gui.device_state import DeviceState, is_gone
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
+from gui.log_bridge import LogBridge
+from gui.operator_request import OperatorRequest
 from instrument.bench import Bench
 from instrument.config import BenchConfig, Kind
 from instrument.live_camera import LiveCamera
 from instrument.snapshot import Light, switch_light
 
-DeviceCondition = Literal["closed", "opening", "open", "failed"]
 Level = Literal["debug", "info", "warning", "error"]
 
 _STOP_REPEAT_S = 0.05
 _STOP_WAIT_S = 10.0
 """A job that has not ended by then is told of; STOP goes on, for the job may be about to start a move."""
 _WATCH_MS = 500
-
-
-@dataclass(frozen=True, slots=True)
-class DeviceState:
-    """How a device is doing.
-
-    Attributes
-    ----------
-    condition : str
-        ``"closed"``, ``"opening"``, ``"open"`` or ``"failed"``.
-    text : str
-        Who the device says it is, or why it failed and what to check.
-    simulated : bool
-    """
-
-    condition: DeviceCondition
-    text: str = ""
-    simulated: bool = False
 
 
 class BenchSession(QObject):
@@ -113,7 +92,7 @@ class BenchSession(QObject):
         self._live_job: Job | None = None
         self._requests: list[OperatorRequest] = []
         self._from_thread.connect(self._receive, Qt.ConnectionType.QueuedConnection)
-        self._handler = _ToSession(self)
+        self._handler = LogBridge(lambda *told: self._from_thread.emit("log", told))
         logging.getLogger().addHandler(self._handler)
         for room in ("instrument", "drivers", "calibration_routines"):
             logging.getLogger(room).setLevel(logging.INFO)
@@ -306,7 +285,7 @@ class BenchSession(QObject):
             if (
                 error.device.startswith(device.name)
                 and self.state(kind).condition == "open"
-                and (surely or _is_gone(device, error))
+                and (surely or is_gone(device, error))
             ):
                 self._set_state(kind, DeviceState("failed", words_for(error), self.state(kind).simulated))
 
@@ -490,67 +469,3 @@ def _within(seconds: float, title: str, work: Callable[[], object]) -> list[str]
     if thread.is_alive():
         return [f"{title.capitalize()}: a device does not answer. See by eye that light and motion are off."]
     return problems
-
-
-def _is_gone(device: Device, error: DeviceError) -> bool:
-    """Whether an error means that a device cannot be used any more."""
-    if isinstance(error, DeviceLostError | DeviceNotOpenError | DeviceTimeoutError) or not device.is_open:
-        return True
-    try:
-        _ = device.identity
-    except DeviceError:
-        return True
-    return False
-
-
-class OperatorRequest:
-    """Something that the operator is asked to do by hand; a job waits for the answer."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.answered: Callable[[], None] | None = None
-        self.withdrawn: Callable[[], object] | None = None
-        """Takes the question from the screen when STOP has answered it."""
-        self._done = threading.Event()
-        self._refused = False
-
-    def confirm(self) -> None:
-        """Say that it is done."""
-        self._answer()
-
-    def refuse(self) -> None:
-        """Say that it will not be done: the job ends."""
-        self._refused = True
-        self._answer()
-
-    @property
-    def is_answered(self) -> bool:
-        """Whether the operator (or STOP) has answered."""
-        return self._done.is_set()
-
-    def _answer(self) -> None:
-        if not self._done.is_set():
-            self._done.set()
-            if self.answered is not None:
-                self.answered()
-
-    def wait(self) -> None:
-        """Wait for the answer, in the job's thread; KeyboardInterrupt when it is no."""
-        self._done.wait()
-        if self._refused:
-            raise KeyboardInterrupt
-
-
-class _ToSession(logging.Handler):
-    """Brings what the rooms below log into the log panel."""
-
-    def __init__(self, session: BenchSession) -> None:
-        super().__init__(logging.INFO)
-        self._session = session
-
-    def emit(self, record: logging.LogRecord) -> None:
-        level = {logging.WARNING: "warning", logging.ERROR: "error", logging.CRITICAL: "error"}.get(
-            record.levelno, "info"
-        )
-        with contextlib.suppress(RuntimeError):  # the window is gone
-            self._session._from_thread.emit("log", (level, f"{record.name}: {record.getMessage()}"))

@@ -85,13 +85,13 @@ class RunBar(QWidget):
             self.bar.setValue(round(_STEPS * now.done / now.total))
         words = [now.step[:1].upper() + now.step[1:]]
         if now.total > 1:
-            words.append(f"{now.done:.0f} of {now.total:.0f}")
+            words.append(f"{now.done:.0f} of {'at most ' if now.at_most else ''}{now.total:.0f}")
         elif now.total:
             words.append(f"{now.done / now.total:.0%}")
         if now.paused:
             words.append("PAUSED, light off")
         elif now.seconds_left is not None:
-            words.append(f"{duration(now.seconds_left)} left")
+            words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
         self.words.setText(", ".join(words))
 
     def show_end(self, words: str, *, complete: bool) -> None:

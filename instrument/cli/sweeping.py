@@ -58,12 +58,14 @@ class Told(Listener):
         self._open.close()
         self._bar = None
 
-    def share(self, done: float, total: float) -> None:
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
         """Advance the bar."""
         if self._bar is not None:
             bar, task = self._bar
             scale = 100 if total == 1 else 1  # a fraction is shown in parts of a hundred
             bar.update(task, completed=round(scale * done), total=scale * total)
+            if at_most:
+                bar.update(task, note="at most")
 
     def frame(self, status: RunStatus) -> None:
         """Advance the bar."""

@@ -14,6 +14,8 @@ from calibration_routines.mask_alignment import AlignmentReport
 from calibration_routines.procedure import Outcome
 from gui.main_window import MainWindow
 from gui.panels.alignment import AlignmentPanel
+from gui.procedure_run import Situation
+from gui.widgets.run_bar import RunBar
 from instrument.config_file import display_text
 from recon.holography.pose import NODES, Pose
 
@@ -77,6 +79,16 @@ def test_an_alignment_shows_spots_and_scores_and_can_be_aborted(qtbot: QtBot, pa
     qtbot.mouseClick(panel.before_button, LEFT)
     assert not np.array_equal(panel.spots.image, newest)
     compile(panel.as_python(), "alignment", "exec")
+
+
+def test_frames_and_time_that_are_bounds_are_told_as_bounds(qtbot: QtBot) -> None:
+    bar = RunBar()
+    qtbot.addWidget(bar)
+    bar.show_situation(Situation("aligning the mask", 20, 100, at_most=True, seconds=20, seconds_left=80))
+    assert "20 of at most 100" in bar.words.text()
+    assert "at most" in bar.words.text().split(", ")[-1]
+    bar.show_situation(Situation("sweep", 20, 100, seconds=20, seconds_left=80))
+    assert "at most" not in bar.words.text()
 
 
 def test_a_report_shows_displacement_and_pose_with_errors(qtbot: QtBot, panel: AlignmentPanel) -> None:
