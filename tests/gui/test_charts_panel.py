@@ -19,7 +19,7 @@ from instrument.images import read_image
 from instrument.stability_file import read_stability
 from recon.stability.shipped import shipped_file
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 @pytest.fixture

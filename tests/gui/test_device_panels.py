@@ -22,7 +22,7 @@ from instrument.config_file import parse_config
 from instrument.slm_correction import SlmCorrection, load_slm_correction
 from instrument.slm_image import write_slm_image
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
 
 

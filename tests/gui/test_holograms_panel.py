@@ -23,7 +23,7 @@ from gui.views.view_grid import best_columns
 from instrument.images import read_image, write_image
 from instrument.slm_image import levels_phase, read_slm_image
 
-WAIT_MS = 30_000
+WAIT_MS = 60_000
 
 
 def aligned() -> str:

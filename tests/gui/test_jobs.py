@@ -13,7 +13,7 @@ from drivers.errors import LimitError
 from gui.jobs import BusyError, JobContext, JobRunner, JobState
 from instrument.errors import BenchError
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 @pytest.fixture

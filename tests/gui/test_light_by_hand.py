@@ -11,7 +11,7 @@ from gui.panels.holograms import HologramsPanel
 from gui.panels.led_array import LedPanel
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
 
 

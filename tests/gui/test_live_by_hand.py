@@ -17,7 +17,7 @@ from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from instrument.store import Run
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 CTRL = Qt.KeyboardModifier.ControlModifier
 LEFT = Qt.MouseButton.LeftButton
 

@@ -18,7 +18,7 @@ from instrument.images import read_image
 from instrument.snapshot import Light
 from instrument.store import Run
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from gui.widgets.message import TextWindow
 from gui.widgets.question import choose_path
 from instrument.snapshot import Light
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 def test_a_simulated_bench_says_so(window: MainWindow) -> None:

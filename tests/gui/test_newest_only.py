@@ -9,7 +9,7 @@ from pytestqt.qtbot import QtBot
 from gui.jobs import JobRunner
 from gui.newest_only import NewestOnly
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 def test_of_quick_requests_the_newest_is_read_and_what_is_forgotten_is_not_shown(qtbot: QtBot) -> None:

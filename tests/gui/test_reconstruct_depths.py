@@ -20,7 +20,7 @@ from instrument.calibration_file import (
 )
 from recon.types import Calibration
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 SIZE = 32
 
 

@@ -24,7 +24,7 @@ from instrument.stored_result import open_result
 from instrument.volume_source import VolumeSource
 from recon.auto import Wishes
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4
 
 

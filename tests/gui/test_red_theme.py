@@ -16,7 +16,7 @@ from gui.panels.log import LogPanel
 from gui.theme import DARK, RED, colours
 from gui.widgets.image_view import ImageView
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 _MOST_OTHER = 130
 """Levels of green and blue that antialiased, pale red marks may have: the mark of saturation has 120."""
 

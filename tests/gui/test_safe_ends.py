@@ -10,7 +10,7 @@ from pytestqt.qtbot import QtBot
 from gui.jobs import JobContext, JobState
 from gui.session import BenchSession
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 
 
 def test_what_a_job_lights_in_the_middle_of_stop_is_turned_off(

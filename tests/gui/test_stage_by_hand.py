@@ -9,7 +9,7 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels.stage import StagePanel
 
-WAIT_MS = 20_000
+WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
 
 
