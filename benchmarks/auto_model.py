@@ -1,6 +1,6 @@
 """``model="auto"`` against every fixed model, on 28 simulated scenes that it was not tuned on.
 
-    python benchmarks/auto_model.py [--tuning] [--only NAME] [--keep FILE] [--out docs/benchmarks]
+    python benchmarks/auto_model.py [--tuning] [--only NAME] [--keep FILE [--finished]] [--out FOLDER]
 
 Each scene is rendered lenslet by lenslet (``recon.scenes``) and reconstructed with the convolution,
 low-rank and local models, each without and with a background, all depths, all pixels; and once with ``auto``.
@@ -92,6 +92,11 @@ class Kept:
                 with self.path.open("a") as file:
                     file.write(json.dumps(known) + "\n")
         return known
+
+    def finished(self, scene: str) -> bool:
+        """Tell whether all runs of a scene are kept."""
+        turns = [(label, 0) for label in (*FIXED, "auto")] + [("auto", 1), (LARGEST, 1)]
+        return all((scene, *turn) in self.runs for turn in turns)
 
 
 def judge(name: str, spec: SceneSpec, kept: Kept) -> dict[str, object]:
@@ -199,12 +204,15 @@ def main() -> None:
     parser.add_argument("--tuning", action="store_true", help="the scenes it was tuned on instead")
     parser.add_argument("--only", help="scenes whose name holds this")
     parser.add_argument("--keep", type=Path, help="file of finished runs, to go on from")
+    parser.add_argument("--finished", action="store_true", help="only scenes of which --keep has all runs")
     parser.add_argument("--out", type=Path, help="folder for table and picture")
     arguments = parser.parse_args()
     set_threads(1)
     make_scene("beads", size=32)  # compile
     scenes = [s for s in (TUNING if arguments.tuning else JUDGED) if (arguments.only or "") in s[0]]
     kept = Kept(arguments.keep)
+    if arguments.finished:
+        scenes = [s for s in scenes if kept.finished(s[0])]
     rows = [judge(name, spec, kept) for name, spec in scenes]
     print(summary(rows))
     if arguments.out is not None:

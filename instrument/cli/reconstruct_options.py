@@ -176,8 +176,8 @@ ChooseOption = Annotated[
     typer.Option(
         "--choose",
         metavar="NAME=VALUE",
-        help="Overrule one of auto's choices (repeatable): model=, planes=all, field=all, binning=N, "
-        "channels=all|merged, background=on|off.",
+        help="Overrule one of auto's choices (repeatable): model=, planes=all|0-3,7, between=on|off, "
+        "field=all, binning=N, channels=all|merged, background=on|off, precision=float32|float64.",
         show_default=False,
     ),
 ]

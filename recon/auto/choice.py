@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from recon.preparation import Precision
 from recon.volume.model import ModelName
 
-Name = Literal["model", "planes", "field", "binning", "channels", "background", "iterations", "precision"]
+Name = Literal[
+    "model", "planes", "between", "field", "binning", "channels", "background", "iterations", "precision"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +80,15 @@ class Choice:
         Depths that take part, as indices into the calibration's, in its order.
     n_planes : int
         Depths that the calibration has.
+    between : tuple of int
+        Planes added half way between depths ``k`` and ``k + 1``; the result has their light on these.
     binning : int
         Pixels to average along each axis.
     merged : bool
         Whether colour channels are reconstructed as one.
     background : bool
         Whether a smooth background is estimated as well.
+    precision : "float32" or "float64"
     psf_window : (int, int)
         Central part of the PSFs that holds their light: the object extends half of it beyond the sensor.
     acceptance_px : float or None
@@ -96,9 +102,11 @@ class Choice:
     model: ModelName
     planes: tuple[int, ...]
     n_planes: int
+    between: tuple[int, ...]
     binning: int
     merged: bool
     background: bool
+    precision: Precision
     psf_window: tuple[int, int]
     acceptance_px: float | None
     tolerance: float
@@ -137,9 +145,11 @@ class Choice:
             "model": self.model,
             "planes": list(self.planes),
             "n_planes": self.n_planes,
+            "planes_between": list(self.between),
             "binning": self.binning,
             "channels_merged": self.merged,
             "background": self.background,
+            "precision": self.precision,
             "psf_window": list(self.psf_window),
             "acceptance_px": self.acceptance_px,
             "tolerance": self.tolerance,

@@ -9,11 +9,13 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.auto.between import between_of
 from recon.auto.camera import candidates, model_decision, model_of
 from recon.auto.channels import channels_of, merged
-from recon.auto.choice import Choice, Decision
+from recon.auto.choice import Choice
 from recon.auto.extent import binning_of, field_of
 from recon.auto.planes import planes_of
+from recon.auto.precision import precision_of
 from recon.auto.probe import (
     COARSE_ITERATIONS,
     COARSE_PX,
@@ -23,7 +25,7 @@ from recon.auto.probe import (
     operator_seconds,
 )
 from recon.auto.reduced import binned, reduced_calibration
-from recon.auto.solving import SETTLED, SmoothLight, background_of, is_stray, iterations_of
+from recon.auto.solving import SETTLED, USUAL_ITERATIONS, SmoothLight, background_of, is_stray, iterations_of
 from recon.auto.wishes import Wishes
 from recon.errors import InputError
 from recon.noise import NoiseModel
@@ -46,8 +48,11 @@ def choose(
     background: npt.ArrayLike | None = None,
     erasures: npt.ArrayLike | None = None,
     wishes: Wishes | None = None,
+    picture: bool = False,
 ) -> Choice:
     """Choose what to reconstruct with. Parameters as :func:`recon.reconstruct_volume`.
+
+    ``picture``: of one depth, for which a picture's own solver serves where one convolution is enough.
 
     Returns
     -------
@@ -98,31 +103,35 @@ def choose(
     smooth = background_of(light, kind, wishes, given=given)
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, wishes)
+    between, added = between_of(calibration, depths, planes, wishes)
     times = {m: operator_seconds(coarse[0], m) for m in candidates(depths)}
     binning = binning_of(depths, wishes, whole=whole)
     haze = is_stray(light.share) and not estimated and not given
-    window, reach, field = field_of(depths, wishes, haze=haze)
+    window, reach, field = field_of(depths, wishes, model, haze=haze)
+    usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
+    able = picture and model == "convolution" and not estimated
+    side = max(data.shape[1:]) // int(binning.numbers["binning"])
+    precise = precision_of(wishes, usual, side, able=able)
     decisions = (
         model_decision(model, why, variation, depths, times, wishes),
         dropped,
+        *([added] if len(depths.z_um) > 1 else []),
         field,
         binning,
         merge,
         smooth,
         iterations_of(model, wishes),
-        Decision(
-            "precision",
-            "float32",
-            "it drifts from float64 by about 1e-4 in 500 iterations of the exact-data solver",
-        ),
+        precise,
     )
     return Choice(
         model=model,
         planes=planes,
         n_planes=len(depths.z_um),
+        between=between,
         binning=int(binning.numbers["binning"]),
         merged=merge.value == "merged",
         background=estimated,
+        precision="float64" if precise.value == "float64" else "float32",
         psf_window=window,
         acceptance_px=reach,
         tolerance=SETTLED["convolution" if model == "convolution" else "varying"]

@@ -8,7 +8,7 @@ from recon.auto.choice import Decision, Option
 from recon.auto.estimates import ERROR_SCALE, left_out_db, loss_db
 from recon.auto.probe import ACCEPTED, acceptance_px, psf_window, resolution_px
 from recon.auto.wishes import Wishes
-from recon.volume.model import Depths
+from recon.volume.model import Depths, ModelName
 
 LEAST_SIDE = 20
 """Pixels along the longest side that binning leaves at least."""
@@ -44,13 +44,17 @@ def binning_of(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
     return Decision("binning", f"{binning} x {binning}", why, 0.0, up, down, asked, numbers)
 
 
-def field_of(depths: Depths, wishes: Wishes, *, haze: bool) -> tuple[tuple[int, int], float | None, Decision]:
+def field_of(
+    depths: Depths, wishes: Wishes, model: ModelName, *, haze: bool
+) -> tuple[tuple[int, int], float | None, Decision]:
     """Decide how far from the axis the object is modelled.
 
     Parameters
     ----------
     depths : Depths
     wishes : Wishes
+    model : str
+        One convolution takes the whole field at no more cost than a part of it.
     haze : bool
         Whether there may be smooth light that no background takes: the object beyond what the sensor accepts
         then does, and shutting it out would bring it into the picture (1.4 dB in one scene of a microscope).
@@ -72,7 +76,10 @@ def field_of(depths: Depths, wishes: Wishes, *, haze: bool) -> tuple[tuple[int, 
     why = f"the PSFs' light lies within {window[0]} x {window[1]} of {height} x {width} pixels"
     if reach is not None and reach < 0.5 * float(np.hypot(*extent)):
         why += f"; {reach:.0f} pixels off the axis PSFs are down to {ACCEPTED:.0%} of the central one's light"
-        if haze:
+        if model == "convolution":
+            why += ", which is no limit to one convolution"
+            reach = None
+        elif haze:
             why += ", but smooth light that nothing else takes may go beyond"
             reach = None
     else:

@@ -53,6 +53,7 @@ def choose_picture(
         background=background,
         erasures=erasures,
         wishes=wishes,
+        picture=True,
     )
     return _by_plain_admm(choice, depth, wishes or Wishes()) if _is_plain(choice) else choice
 
@@ -153,6 +154,7 @@ def reconstruct_chosen(
             small.measurement,
             _central(small.calibration),
             model="convolution",
+            precision=choice.precision,
             **common,
         )
     else:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
-from recon.auto.choice import Decision, Option
+from recon.auto.choice import Choice, Decision, Option
 from recon.auto.estimates import left_out_db
 from recon.auto.probe import CoarsePass
 from recon.auto.wishes import Wishes
+from recon.errors import InputError
 from recon.volume.model import Depths
 
 LEFT_OUT = 0.02
@@ -29,15 +33,18 @@ def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple
     near[:-1] |= lit[order][1:]
     kept = np.zeros(n, bool)
     kept[order] = near
-    asked = wishes.planes == "all"
-    planes = everything if asked else tuple(int(z) for z in np.flatnonzero(kept))
+    asked = wishes.planes is not None
+    planes = tuple(int(z) for z in np.flatnonzero(kept))
+    if wishes.planes is not None:
+        planes = _within(wishes.planes, n) if isinstance(wishes.planes, tuple) else everything
+        kept = np.isin(np.arange(n), planes)
     lost = _share(passed.light, ~kept)
     channel = " of any colour" if len(passed.light) > 1 else ""
     why = (
         f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light{channel} into "
         f"{n - int(kept.sum())} ({LEFT_OUT:.0%} may be left out, and neighbours of those that are not stay)"
     )
-    loss = 0.0 if asked else left_out_db(lost)
+    loss = left_out_db(lost)
     numbers = {"planes": float(len(planes)), "of": float(n), "light_left_out": lost}
     up = None if len(planes) == n else Option(f"all {n}", n / len(planes), -loss)
     fewest = tuple(int(z) for z in np.flatnonzero(lit))
@@ -50,6 +57,44 @@ def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple
         )
     value = f"all {n}" if len(planes) == n else f"{len(planes)} of {n} ({_ranges(planes)})"
     return planes, Decision("planes", value, why, loss, up, down, asked, numbers)
+
+
+def put_back(choice: Choice, signs: Sequence[float], *, everything: bool) -> Choice | None:
+    """Return the choice with planes that show signs of light, and their neighbours; None where none does.
+
+    Parameters
+    ----------
+    choice : Choice
+    signs : sequence of float
+        Of every plane that was left out, in order: above 1 where the residual shows light there.
+    everything : bool
+        Put all back, not only those.
+    """
+    rest = [z for z in range(choice.n_planes) if z not in choice.planes]
+    shown = [z for z, sign in zip(rest, signs, strict=False) if sign > 1]
+    if not shown:
+        return None
+    near = {z + by for z in shown for by in (-1, 0, 1)} & set(rest)
+    planes = tuple(sorted({*choice.planes, *(rest if everything else near)}))
+    n = choice.n_planes
+    value = f"all {n}" if len(planes) == n else f"{len(planes)} of {n} ({_ranges(planes)})"
+    why = (
+        f"{_ranges(choice.planes)} were tried, and what they left of the data correlates with the PSFs of "
+        f"{_ranges(tuple(shown))} {max(signs):.1f} times as much as noise and prior explain"
+    )
+    decisions = tuple(
+        replace(d, value=value, why=why, error_db=0.0, up=None, down=None) if d.name == "planes" else d
+        for d in choice.decisions
+    )
+    return replace(choice, planes=planes, decisions=decisions)
+
+
+def _within(wished: tuple[int, ...], n: int) -> tuple[int, ...]:
+    if max(wished) >= n:
+        raise InputError(
+            f"planes={_ranges(wished)}: there are {n} calibrated depths, numbered from 0 to {n - 1}."
+        )
+    return wished
 
 
 def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.auto.between import with_planes_between
 from recon.auto.channels import merged_input
 from recon.auto.choice import Choice
 from recon.auto.reduced import Colours, binned, enlarged, reduced_calibration
@@ -53,15 +54,18 @@ class Reduced:
             channels_first = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
             larger = enlarged(channels_first, self.choice.binning, self.shape)
             image = larger if image.ndim == 2 else np.moveaxis(larger, 0, -1)
-        whole = np.asarray(image, np.float32) if self.tint is None else self.tint.spread(image)
+        whole = image if self.tint is None else self.tint.spread(image)
         return np.ascontiguousarray(whole)
 
     def volume(self, planes: Array) -> Floats:
         """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty."""
-        first = self.picture(planes[0])
-        whole = np.zeros((self.choice.n_planes, *first.shape), np.float32)
-        for z, plane in zip(self.choice.planes, planes, strict=True):
-            whole[z] = self.picture(plane)
+        whole = np.zeros((self.choice.n_planes, *self.picture(planes[0]).shape), np.float32)
+        for at, plane in zip(_places(self.choice), planes, strict=True):
+            picture, below = self.picture(plane), int(at)
+            if at == below:
+                whole[below] += picture
+            else:  # an object half way between two depths belongs to both
+                whole[below : below + 2] += picture / 2
         return whole
 
 
@@ -84,10 +88,15 @@ def reduce(
         data, valid, calibration, tint = merged_input(data, valid, deviation, calibration)
         noise = None if noise is None else float(np.sqrt(np.sum((tint.weights * deviation) ** 2)))
         flat = True
+    if choice.between:
+        depths_um = calibration.source_positions_um[:, 2]
+        calibration = with_planes_between(calibration, depths_um, choice.between)
     factor = choice.binning
     shape = (data.shape[1], data.shape[2])
-    planes = None if len(choice.planes) == choice.n_planes else choice.planes
-    rest = tuple(z for z in range(choice.n_planes) if z not in choice.planes)
+    every = sorted([*range(choice.n_planes), *(k + 0.5 for k in choice.between)])
+    places = _places(choice)
+    planes = None if len(places) == len(every) else tuple(every.index(at) for at in places)
+    rest = tuple(z for z, at in enumerate(every) if at not in places)
     left_out = reduced_calibration(calibration, factor, rest) if rest else None
     calibration = reduced_calibration(calibration, factor, planes)
     window = tuple(max(n // factor, 1) for n in choice.psf_window)
@@ -118,7 +127,7 @@ def whole_volume(
     small: VolumeReconstruction, reduced: Reduced, calibration_grid: VolumeGrid
 ) -> VolumeReconstruction:
     """Return a smaller problem's volume as one of the given pixels and depths."""
-    choice = reduced.choice
+    choice, places = reduced.choice, _places(reduced.choice)
     background = small.background
     if background is not None:
         # Counts a pixel, not light: no sharing among pixels.
@@ -136,7 +145,8 @@ def whole_volume(
         reason=next(d.why for d in choice.decisions if d.name == "model"),
         choice=choice,
         empty_planes=tuple(
-            replace(e, planes=tuple(choice.planes[z] for z in e.planes)) for e in small.empty_planes
+            replace(e, planes=tuple(int(places[z]) for z in e.planes if places[z] == int(places[z])))
+            for e in small.empty_planes
         ),
         warnings=_together(reduced.warnings, small.warnings),
         provenance={**small.provenance, "auto": choice.to_json()},
@@ -146,6 +156,11 @@ def whole_volume(
 def shown(reduced: Reduced, picture: Callable[[], Array]) -> Callable[[], Floats]:
     """Return what makes the present volume of a smaller problem on the given pixels and depths."""
     return lambda: reduced.volume(picture())
+
+
+def _places(choice: Choice) -> list[float]:
+    """Return the planes that are reconstructed, in the calibration's order: ``k + 0.5`` after depth ``k``."""
+    return sorted([*choice.planes, *(k + 0.5 for k in choice.between)])
 
 
 def _together(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:

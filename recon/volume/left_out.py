@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,8 @@ rightly, from 2.6 times where wrongly, on two scenes of beads, each with one PSF
 
 def signs_of_light(
     residual: Array, left_out: Calibration, channel: int, window: tuple[int, int] | None
-) -> float:
-    """Return the largest correlation of a residual with the left-out planes' unit-energy central PSFs.
+) -> npt.NDArray[np.float64]:
+    """Return the largest correlation of a residual with every left-out plane's unit-energy central PSF.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ def signs_of_light(
     """
     from scipy.signal import fftconvolve
 
-    positions, worst = left_out.source_positions_um, 0.0
+    positions, signs = left_out.source_positions_um, []
     for group in members_of_depths(positions):
         off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
         psfs = left_out.psfs[group[int(np.argmin(off_axis))]]
@@ -43,10 +44,9 @@ def signs_of_light(
             first = psf.shape[axis] // 2 - m // 2
             psf = np.take(psf, np.arange(first, first + m), axis=axis)
         energy = float(np.linalg.norm(psf))
-        if energy > 0:
-            correlation = fftconvolve(residual.astype(np.float64), psf[::-1, ::-1] / energy)
-            worst = max(worst, float(correlation.max()))
-    return worst
+        correlation = fftconvolve(residual.astype(np.float64), psf[::-1, ::-1] / max(energy, 1e-30))
+        signs.append(max(float(correlation.max()), 0.0))
+    return np.array(signs)
 
 
 def limit_of(run: ChannelProblem) -> float:
@@ -55,9 +55,9 @@ def limit_of(run: ChannelProblem) -> float:
     return max(noise * (TV_LEAVES if run.prior.startswith("tv") else 1.0), run.weight)
 
 
-def signs_in_words(signs: list[float]) -> list[str]:
-    """Return a warning where a correlation exceeds its limit."""
-    if not signs or max(signs) <= 1:
+def signs_in_words(signs: Sequence[float]) -> list[str]:
+    """Return a warning where a plane's sign, relative to its limit, exceeds 1."""
+    if not len(signs) or max(signs) <= 1:
         return []
     return [
         "There may be light in the depth planes that were left out: what is left of the data correlates with "

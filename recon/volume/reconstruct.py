@@ -29,7 +29,7 @@ from recon.volume.douglas_rachford import DouglasRachford
 from recon.volume.empty_planes import EmptyPlanes
 from recon.volume.left_out import limit_of, signs_in_words, signs_of_light
 from recon.volume.light import energies, levelled
-from recon.volume.model import Depths, Extent, ModelName, choose_model, members_of_depths, sort_by_depth
+from recon.volume.model import Extent, ModelName, choose_model, sort_by_depth
 from recon.volume.positive_background import in_turns, is_negative, may_go_on
 from recon.volume.result import VolumeGrid, VolumeReconstruction
 
@@ -152,7 +152,9 @@ def reconstruct_volume(
     }
     prevented = next((what for what, prevents in preventing.items() if prevents), None)
     if prevented is None:
-        return _chosen(
+        from recon.auto.volume import reconstruct_chosen_volume
+
+        return reconstruct_chosen_volume(
             measurement,
             calibration,
             prior=prior,
@@ -193,16 +195,16 @@ def reconstruct_volume(
         raise InputError(str(error)) from error
     height, width = scaled.data.shape[1:]
     psf_shape = scaled.depths.central.shape[2:]
-    window, centre = _window(field, (height, width), (psf_shape[0], psf_shape[1]))
+    window, centre = window_of(field, (height, width), (psf_shape[0], psf_shape[1]))
     gains = np.ones((1, 1, 1), np.float32)
     if prior == "l1":  # which counts light on the sensor: no voxel may be the cheaper explanation
         even, gains = levelled(scaled.depths, (height, width), varying=name != "convolution")
         scaled = replace(scaled, depths=even)
         gains = gains if gains.shape[1:] == (1, 1) else gains[:, window[0], window[1]]
-    grid = _grid(calibration, scaled.depths, window, centre)
+    grid = grid_of(calibration, scaled.depths.z_um, window, centre)
     weights = grid.axis_weights() if axis_weights is None else np.asarray(axis_weights, float)
     volumes, outcomes, backgrounds, taus, empty = [], [], [], [], []
-    signs: list[float] = []
+    signs: list[npt.NDArray[np.float64]] = []
     for channel in range(len(scaled.data)):
         run = ChannelProblem(
             scaled,
@@ -264,6 +266,7 @@ def reconstruct_volume(
         del solver, outcome
         run.close()
     volume = volumes[0] if scaled.flat else np.stack(volumes, axis=-1)
+    left_out = np.max(signs, axis=0).tolist() if signs else []
     verdict: Verdict | None = None
     failed: list[str] = []
     if judged:
@@ -284,11 +287,11 @@ def reconstruct_volume(
         stop_reasons=tuple(o.stop_reason for o in outcomes),
         seconds=sum(o.seconds for o in outcomes),
         empty_planes=tuple(empty),
-        warnings=(*scaled.warnings, *_uncertified(empty), *signs_in_words(signs), *failed),
+        warnings=(*scaled.warnings, *_uncertified(empty), *signs_in_words(left_out), *failed),
         provenance={
             "noise_deviation": [float(v) for v in scaled.noise],
             "memory": planned,
-            **({"light_in_planes_left_out": max(signs)} if signs else {}),
+            **({"light_in_planes_left_out": left_out} if signs else {}),
         },
         verdict=verdict,
     )
@@ -317,76 +320,6 @@ def _verdict(
 
 def _noise_norm(scaled: Scaled, channel: int = 0) -> float:
     return float(np.sqrt(np.count_nonzero(scaled.valid[channel])))
-
-
-def _chosen(
-    measurement: npt.ArrayLike,
-    calibration: Calibration,
-    *,
-    prior: VolumePrior,
-    axis_weights: npt.ArrayLike | None,
-    estimate_background: bool | None,
-    positive_background: bool,
-    background: npt.ArrayLike | None,
-    erasures: npt.ArrayLike | None,
-    noise: NoiseModel | float | None,
-    tolerance: float | None,
-    field: Field,
-    wishes: Wishes | None,
-    callback: Progress | None,
-    **others: Any,
-) -> VolumeReconstruction:
-    """Choose, reconstruct what was chosen, and bring it back; parameters as :func:`reconstruct_volume`."""
-    from recon.auto.decide import choose
-    from recon.auto.run import reduce, shown, whole_volume
-    from recon.auto.wishes import Wishes
-
-    wishes = wishes or Wishes()
-    if wishes.background is None:
-        asked = True if positive_background else estimate_background
-        wishes = replace(wishes, background=asked)
-    if wishes.tolerance is None:
-        wishes = replace(wishes, tolerance=tolerance)
-    if field == "full":  # what can reach the sensor is asked for, on its pixels
-        wishes = replace(wishes, field="all", binning=1)
-    if axis_weights is not None and np.ndim(axis_weights) == 2:  # one row a depth
-        wishes = replace(wishes, planes="all")
-    choice = choose(
-        measurement,
-        calibration,
-        prior=prior,
-        noise=noise,
-        background=background,
-        erasures=erasures,
-        wishes=wishes,
-    )
-    small = reduce(choice, measurement, calibration, noise=noise, background=background, erasures=erasures)
-    result = reconstruct_volume(
-        small.measurement,
-        small.calibration,
-        prior=prior,
-        axis_weights=axis_weights,
-        model=choice.model,
-        estimate_background=choice.background,
-        positive_background=positive_background,
-        erasures=small.erasures,
-        noise=small.noise,
-        tolerance=choice.tolerance,
-        field=field,
-        extent=small.extent,
-        callback=None if callback is None else lambda record, now: callback(record, shown(small, now)),
-        **others,
-    )
-    psfs = calibration.psfs
-    depths = Depths(_depths_um(calibration), psfs[:1], [])
-    height, width = np.shape(measurement)[:2]
-    window, centre = _window(field, (height, width), (psfs.shape[2], psfs.shape[3]))
-    return whole_volume(result, small, _grid(calibration, depths, window, centre))
-
-
-def _depths_um(calibration: Calibration) -> npt.NDArray[np.float64]:
-    positions = calibration.source_positions_um
-    return np.array([float(np.mean(positions[g, 2])) for g in members_of_depths(positions)])
 
 
 def _uncertified(empty: list[EmptyPlanes]) -> list[str]:
@@ -446,10 +379,10 @@ def prepare_volume(
     )
 
 
-def _window(
+def window_of(
     field: Field, sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
 ) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Part of the operator's grid that a field takes, and where the axis is in it."""
+    """Return the part of the operator's grid that a field takes, and where the axis is in it."""
     (full_height, full_width), (row, column) = field_of(sensor_shape, psf_shape)
     if field == "full":
         return (slice(0, full_height), slice(0, full_width)), (row, column)
@@ -461,12 +394,16 @@ def _window(
     return window, (row - top, column - left)
 
 
-def _grid(
-    calibration: Calibration, depths: Depths, window: tuple[slice, slice], centre: tuple[int, int]
+def grid_of(
+    calibration: Calibration,
+    z_um: npt.NDArray[np.float64],
+    window: tuple[slice, slice],
+    centre: tuple[int, int],
 ) -> VolumeGrid:
+    """Return where the voxels of depths ``z_um`` lie, micrometres."""
     pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
-    pitches = np.full(len(depths.z_um), np.nan)
+    pitches = np.full(len(z_um), np.nan)
     if pitch is not None and distance:
-        pitches = pitch * depths.z_um / (1000 * distance)
-    shape = (len(depths.z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return VolumeGrid(shape, centre, depths.z_um, pitches)
+        pitches = pitch * z_um / (1000 * distance)
+    shape = (len(z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return VolumeGrid(shape, centre, z_um, pitches)

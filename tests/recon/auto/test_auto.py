@@ -9,6 +9,8 @@ import pytest
 import recon
 from recon import InputError
 from recon.auto import Wishes, choose, choose_picture
+from recon.auto.planes import put_back
+from recon.auto.precision import drift, precision_of
 from recon.auto.reduced import binned, enlarged, reduced_calibration
 from recon.scenes import make_scene, score
 
@@ -78,14 +80,104 @@ def test_the_sharpest_colour_and_the_widest_decide():
     assert choose_picture(scene.measurement, apart, wishes=Wishes(channels="all")).binning == 1
 
 
-def test_light_in_planes_that_were_left_out_is_noticed(beads, chosen_beads, monkeypatch):
-    assert 0 < chosen_beads.provenance["light_in_planes_left_out"] < 1
+def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, monkeypatch):
+    assert 0 < max(chosen_beads.provenance["light_in_planes_left_out"]) < 1
     assert not any("left out" in w for w in chosen_beads.warnings)
     wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
-    monkeypatch.setattr("recon.auto.decide.choose", lambda *_, **__: wrong)
+    monkeypatch.setattr("recon.auto.volume.choose", lambda *_, **__: wrong)
     result = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", judged=False)
-    assert result.provenance["light_in_planes_left_out"] > 1
+    assert result.choice is not None
+    assert set(result.choice.planes) > {0, 1, 2}
+    assert "were tried" in decision(result.choice, "planes").why
+    assert not any("left out" in w for w in result.warnings)
+    light = beads.truth.sum(axis=(1, 2))
+    assert light[list(result.choice.planes)].sum() > 0.9 * light.sum()
+
+
+def test_planes_that_the_user_left_out_stay_so_and_light_there_is_warned_of(beads):
+    result = recon.reconstruct_volume(
+        beads.measurement,
+        beads.calibration,
+        prior="l1",
+        judged=False,
+        wishes=Wishes.parse({"planes": "0-2"}),
+    )
+    assert result.choice is not None
+    assert result.choice.planes == (0, 1, 2)
+    assert not result.volume[3:].any()
+    assert max(result.provenance["light_in_planes_left_out"]) > 1
     assert any("light in the depth planes that were left out" in w for w in result.warnings)
+
+
+def test_planes_are_put_back_with_their_neighbours_and_then_all(chosen_beads):
+    choice = replace(chosen_beads.choice, planes=(0,), n_planes=8)
+    assert put_back(choice, [0.5] * 7, everything=True) is None
+    some = put_back(choice, [0.5, 0.5, 0.5, 1.5, 0.5, 0.5, 0.5], everything=False)
+    assert some is not None
+    assert some.planes == (0, 3, 4, 5)
+    every = put_back(some, [0.2, 0.1, 1.2, 0.3], everything=True)
+    assert every is not None
+    assert every.planes == tuple(range(8))
+
+
+def test_unlike_depths_get_planes_between_and_their_light_comes_back_to_the_calibrated_ones():
+    scene = make_scene("beads", size=48, depths=3, density=0.3, seed=52)
+    fine, coarse = (
+        recon.reconstruct_volume(
+            scene.measurement, scene.calibration, prior="l1", judged=False, wishes=Wishes(between=between)
+        )
+        for between in (None, False)
+    )
+    assert fine.choice is not None
+    assert fine.choice.between == (0, 1)
+    assert decision(fine.choice, "between").numbers["least_likeness"] < 0.8
+    assert coarse.choice is not None
+    assert coarse.choice.between == ()
+    assert fine.volume.shape == coarse.volume.shape == scene.truth.shape
+    np.testing.assert_array_equal(fine.grid.z_um, coarse.grid.z_um)
+    assert score(fine.volume, scene.truth).psnr_db > score(coarse.volume, scene.truth).psnr_db + 0.3
+    assert fine.volume.sum() == pytest.approx(coarse.volume.sum(), rel=0.1)
+
+
+def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
+    scene = make_scene("beads", size=32, depths=8, density=0.3, seed=1)
+    choice = choose(scene.measurement, scene.calibration, prior="l1")
+    assert choice.between == ()
+    assert decision(choice, "between").numbers["least_likeness"] > 0.8
+    with pytest.raises(InputError, match="vary over the field"):
+        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(between=True))
+
+
+def test_float64_is_offered_where_it_can_be_computed(beads):
+    scene = make_scene("sparse-picture", size=32, grid=1)
+    usual, exact = (
+        recon.reconstruct(scene.measurement, scene.calibration, wishes=Wishes(precision=p), judged=False)
+        for p in (None, "float64")
+    )
+    assert usual.choice is not None
+    assert usual.choice.precision == "float32"
+    assert decision(usual.choice, "precision").numbers["expected_difference"] < 1e-3
+    assert exact.choice is not None
+    assert exact.choice.precision == "float64"
+    assert exact.state is not None
+    assert exact.state.dtype == np.float64
+    np.testing.assert_allclose(exact.image, usual.image, atol=1e-3 * float(usual.image.max()))
+    with pytest.raises(InputError, match="computed in float32"):
+        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(precision="float64"))
+
+
+def test_float32_gives_way_where_the_map_says_so(monkeypatch):
+    assert drift(1000, 4096) >= drift(100, 64) > 0
+    rough = {"precision": {
+        "x": {"values": [30, 100]},
+        "y": {"values": [32, 64]},
+        "methods": {"admm tv": {"error": [[1e-4, 1e-3], [1e-3, 1e-2]]}},
+    }}  # fmt: skip
+    monkeypatch.setattr("recon.auto.precision.shipped_maps", lambda: rough)
+    assert drift(1000, 64) > 5 * drift(100, 64)
+    assert precision_of(Wishes(), 1000, 64, able=True).value == "float64"
+    assert precision_of(Wishes(), 1000, 64, able=False).value == "float32"
+    assert precision_of(Wishes(precision="float32"), 1000, 64, able=True).value == "float32"
 
 
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
@@ -218,6 +310,11 @@ def test_mistakes_are_named(beads):
         Wishes.parse({"modle": "local"})
     with pytest.raises(InputError, match="whole number"):
         Wishes.parse({"binning": "0"})
+    with pytest.raises(InputError, match="counted from 0"):
+        Wishes.parse({"planes": "3-1"})
+    assert Wishes.parse({"planes": "0-2,5"}).planes == (0, 1, 2, 5)
+    with pytest.raises(InputError, match="numbered from 0 to 5"):
+        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(planes=(2, 6)))
     with pytest.raises(InputError, match="one of on, off"):
         Wishes.parse({"background": "maybe"})
     with pytest.raises(InputError, match="priors"):
