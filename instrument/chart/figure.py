@@ -44,7 +44,7 @@ def chart_figure(data: ChartData) -> Figure:
     groups = list(dict.fromkeys(p.group for p in data.points))
     colours = colours_of(data)
     views = _views(data)
-    figure = Figure(figsize=(13.5, 0.7 + 3.9 * len(groups)), layout="constrained")
+    figure = Figure(figsize=(13.5, 1.0 + 4.1 * len(groups)), layout="constrained")
     grid = figure.subplots(len(groups), 3, squeeze=False, width_ratios=(1.35, 1.0, 0.6))
     for row, group in zip(grid, groups, strict=True):
         own = [p for p in data.points if p.group == group]
