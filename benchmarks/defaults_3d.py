@@ -46,6 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--iterations", type=int, default=150)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--factors", type=float, nargs="+", default=[0.03, 0.1, 0.3, 3.0, 10.0, 30.0])
     a = parser.parse_args()
     set_threads(a.threads)
     print("| scene | voxels | prior | default: dB (tau) | best: dB (tau) | difference |")
@@ -64,7 +65,7 @@ def main() -> None:
             return psnr(r.volume, truth), r.tau
 
         default, tau = judged(None)
-        tries = [judged(tau * factor) for factor in (0.03, 0.1, 0.3, 3.0, 10.0, 30.0)]
+        tries = [judged(tau * factor) for factor in a.factors]
         best, best_tau = max([(default, tau), *tries])
         print(
             f"| {name} | {size} x {size} x {depths} | {prior} | {default:.2f} ({tau:.1e}) "

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import recon
+from recon import threads
 from recon.errors import InputError, StructureError
 from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation, array_namespace
 from recon.gpu.namespace import require_memory
@@ -18,6 +19,15 @@ from recon.solvers import SensorAdmm, StoppingRules
 from recon.volume import DouglasRachford, LeanTotalVariation
 
 SENSOR = (12, 11)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Arrays of a hundred numbers: handing them to another thread takes longer than the work."""
+    before = threads.get_threads()
+    threads.set_threads(1)
+    yield
+    threads.set_threads(before)
 
 
 def problem(dtype=np.float64, n_z=5):
