@@ -49,7 +49,7 @@ SWEEPS = {
     "photons": (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0),
     "neurons": (5, 10, 20, 40, 80),
     "tissue": (0.0, 1.0, 3.0, 10.0),
-    "warm": (1, 2, 3, 6, 12),
+    "warm": (1, 2, 3, 4, 6, 12),
     "motion_px": (0.0, 0.5, 1.0, 3.0),
     "bleached": (0.0, 0.33, 0.7, 0.9, 0.97),
 }
@@ -308,6 +308,8 @@ def figure(path: Path, result, rows: list[dict]) -> None:
             )
         axes.axhline(0.9, color="0.7", lw=0.8)
         axes.set_xscale("log" if name in ("photons", "neurons") else "linear")
+        axes.minorticks_off()
+        axes.set_xticks(values, [f"{value:g}" for value in values], rotation=60, fontsize=7)
         axes.set_ylim(0, 1.02)
         axes.set_xlabel(name)
         axes.legend(fontsize=6, loc="lower left")

@@ -67,6 +67,25 @@ def error(pictures: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sum((gain * soft - truth) ** 2) / np.sum(truth**2))
 
 
+def draw(found: dict[tuple[float, str], list[float]], path: Path) -> None:
+    """Draw the squared errors relative to frames alone against the speed."""
+    from matplotlib.figure import Figure
+
+    page = Figure(figsize=(7, 4), layout="constrained")
+    axes = page.add_subplot()
+    for (photons, name), ratios in found.items():
+        style = "o-" if name == "tv" else "s--"
+        axes.plot(SPEEDS_PX, ratios, style, label=f"{name}, {photons:g} photons")
+    axes.axhline(1, color="0.6", lw=0.8)
+    axes.set_xscale("symlog", linthresh=0.1)
+    axes.set_xlim(-0.01, 1.2 * SPEEDS_PX[-1])
+    axes.set_xticks(SPEEDS_PX, [f"{speed:g}" for speed in SPEEDS_PX])
+    axes.set_xlabel("speed (pixels a frame)")
+    axes.set_ylabel("squared error relative to frames alone")
+    axes.legend()
+    page.savefig(path, dpi=100)
+
+
 def main() -> None:
     """Measure and draw."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -88,21 +107,7 @@ def main() -> None:
                 line += f", {name} x {ratio:.2f}"
             print(line, flush=True)
     if options.out:
-        from matplotlib.figure import Figure
-
-        page = Figure(figsize=(7, 4), layout="constrained")
-        axes = page.add_subplot()
-        for (photons, name), ratios in found.items():
-            axes.plot(
-                SPEEDS_PX, ratios, "o-" if name == "tv" else "s--", label=f"{name}, {photons:g} photons"
-            )
-        axes.axhline(1, color="0.6", lw=0.8)
-        axes.set_xscale("symlog", linthresh=0.1)
-        axes.set_yscale("log")
-        axes.set_xlabel("speed (pixels a frame)")
-        axes.set_ylabel("squared error relative to frames alone")
-        axes.legend()
-        page.savefig(options.out, dpi=100)
+        draw(found, options.out)
 
 
 if __name__ == "__main__":

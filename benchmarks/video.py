@@ -11,6 +11,9 @@ else the machine does.
 
 The overhead of a Dask worker: the same recording in this process with one thread, and with one worker of a
 local cluster once that stands, alternating; wall seconds, least of three.
+
+Offline rates (``--only offline``): the same on all cores, two blocks, at three sizes; wall seconds of the
+second of two runs, with reading and writing.
 """
 
 from __future__ import annotations
@@ -42,6 +45,7 @@ from recon.video.solver import COLD_ITERATIONS
 from tests.mocks.recordings import write_recording
 
 PHOTONS = 1e4
+SIZES = ((270, 480), (512, 640), (1024, 1280))
 PANS = {"still": 0.0, "1/6 px": 0.5, "1/2 px": 1.5, "2 px": 6.0}
 WARM = (1, 2, 3, 4, 6, 8, 12)
 COLD = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 60)
@@ -152,18 +156,47 @@ def overhead(psf, frames) -> dict[str, float]:
     return {**least, "overhead": least["worker"] / least["process"] - 1}
 
 
+def offline(psf, frames) -> float:
+    """Return frames a second on all cores, a block for each."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.save(folder / "psf.npy", psf)
+        top = max(float(f.max()) for f in frames)
+        run = write_recording(folder, {i: np.round(4000 * f / top) for i, f in enumerate(frames)})
+        for turn in range(2):
+            out = folder / f"{turn}.ome.zarr"
+            request = VideoRequest(
+                run=run,
+                out=out,
+                psf=folder / "psf.npy",
+                settings=Settings(dark=0.0, binning=1),
+                block=len(frames) // 2,
+            )
+            job = prepare_video(request).job
+            began_s = time.perf_counter()
+            in_process(job.folder, out, list(range(len(job.blocks))), lambda _: None, threading.Event())
+    return len(frames) / (time.perf_counter() - began_s)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--height", type=int, default=270)
     parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--frames", type=int, default=32)
-    parser.add_argument("--only", choices=("warm", "overhead"))
+    parser.add_argument("--only", choices=("warm", "overhead", "offline"))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    project_fft.set_threads(1)
+    if options.only != "offline":
+        project_fft.set_threads(1)
     when, load = datetime.now(UTC), os.getloadavg()[0]
     print(f"{when:%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}, load {load:.1f}")
+    if options.only == "offline":
+        for height, width in SIZES:
+            light, scene, psf = scenes(height, width)
+            frames, _ = panned(light, scene, height, width, 0.5, options.frames)
+            print(f"{width} x {height}: {offline(psf, frames):.1f} frames/s", flush=True)
+        return
     height, width = options.height, options.width
     light, scene, psf = scenes(height, width)
     result: dict[str, object] = {}
