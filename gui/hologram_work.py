@@ -59,6 +59,8 @@ class HologramOrder:
         None: the bench's.
     alignment : Path or None
         From ``align mask``.
+    further : tuple of (Path, float)
+        Pictures in other planes, each with its depth in mm behind the focal plane.
     request : HologramRequest
     """
 
@@ -69,6 +71,7 @@ class HologramOrder:
     srgb: bool = False
     expansion: int | None = None
     alignment: Path | None = None
+    further: tuple[tuple[Path, float], ...] = ()
     request: HologramRequest = field(default_factory=HologramRequest)
 
     def display(self, config: BenchConfig, size: tuple[tuple[int, int], float]) -> Display:
@@ -76,16 +79,19 @@ class HologramOrder:
         display = self.request.display_of(bench_display(config, size, expansion=self.expansion))
         return display if self.alignment is None else load_alignment(self.alignment).of(display)
 
-    def target(self, display: Display) -> Target:
-        """Return the picture as a target; errors as ``read_image``."""
-        return prepare_target(
-            read_image(self.picture).pixels,
-            display,
-            z_mm=self.z_mm,
-            fit=self.fit,
-            srgb=self.srgb,
-            envelope=self.request.envelope,
-        )
+    def targets(self, display: Display) -> list[Target]:
+        """Return the picture of each plane as a target; errors as ``read_image``."""
+        return [
+            prepare_target(
+                read_image(picture).pixels,
+                display,
+                z_mm=z_mm,
+                fit=self.fit,
+                srgb=self.srgb,
+                envelope=self.request.envelope,
+            )
+            for picture, z_mm in ((self.picture, self.z_mm), *self.further)
+        ]
 
     def files(self, config: BenchConfig, display: Display) -> HologramFiles:
         """Return the files that are written."""
@@ -103,7 +109,10 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Computed:
-    """A hologram with what it was computed for, and its patterns' files (none of a preview)."""
+    """A hologram with what it was computed for, and its patterns' files (none of a preview).
+
+    ``target`` is that of the first plane, on which the camera looks.
+    """
 
     order: HologramOrder
     display: Display
@@ -125,7 +134,7 @@ def compute(
     files = order.files(config, display)
     if write:
         files.check(overwrite=False)
-    target = order.target(display)
+    targets = order.targets(display)
     budget = order.request.budget
     history: list[HologramRecord] = []
     told_s = 0.0
@@ -143,10 +152,10 @@ def compute(
             context.report(Progress(min(share, 1.0), tuple(history), phase.astype(np.float32)))
         told_s = time.monotonic()
 
-    result = run_request(display, [target], order.request, callback=watch, cancel=context.cancel)
+    result = run_request(display, targets, order.request, callback=watch, cancel=context.cancel)
     if write:
         files.write(0, 0, result)
-    return Computed(order, display, target, result, tuple(files.patterns(0, 0)) if write else ())
+    return Computed(order, display, targets[0], result, tuple(files.patterns(0, 0)) if write else ())
 
 
 def show_on_slm(bench: Bench, computed: Computed, correction: Path | None, context: JobContext) -> None:
@@ -252,10 +261,13 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
         imports.append("from instrument.alignment_file import load_alignment")
         lines.append(f"display = load_alignment({expression(order.alignment)}).of(display)")
     lines += [
-        f"pixels = read_image({expression(order.picture)}).pixels",
-        f"target = prepare_target(pixels, display, z_mm={order.z_mm!r}, fit={order.fit!r}, "
+        f"planes = {expression([(order.picture, order.z_mm), *order.further])}",
+        "targets = [",
+        f"    prepare_target(read_image(picture).pixels, display, z_mm=z_mm, fit={order.fit!r}, "
         f"srgb={order.srgb}, envelope=request.envelope)",
-        "result = run_request(display, [target], request)",
+        "    for picture, z_mm in planes",
+        "]",
+        "result = run_request(display, targets, request)",
         f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, request, [display])",
         "files.write(0, 0, result)",
     ]

@@ -38,11 +38,19 @@ from gui.session import BenchSession
 from gui.theme import colours
 from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
 from gui.views.facts import FactsView
+from gui.views.hologram_words import (
+    brush_radius,
+    depth_mm,
+    expansion,
+    further_planes,
+    maybe_path,
+    pattern_png,
+    share,
+)
 from gui.views.view_grid import ViewGrid
 from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from instrument.display_setup import expansion_side
 from instrument.errors import BenchError
 from instrument.hologram_job import HologramRequest, HologramResult, field_picture
 from instrument.images import read_image
@@ -76,18 +84,23 @@ class HologramsPanel(Panel):
         self.srgb = QCheckBox("sRGB-coded")
         self.srgb.setToolTip("The picture's values are decoded to intensities first")
         self.z_mm = Entry(
-            _signed_mm, tip="Depth behind the focal plane in mm", placeholder="0 mm: the focal plane"
+            depth_mm, tip="Depth behind the focal plane in mm", placeholder="0 mm: the focal plane"
+        )
+        self.further = Entry(
+            further_planes,
+            tip="Pictures in other planes: FILE @ DEPTH mm; several are separated by semicolons",
+            placeholder="none (FILE @ 40 mm; …)",
         )
         self.expansion = Entry(
-            _expansion,
+            expansion,
             tip="Étendue expansion: 4, 16, 36 …, a square",
             placeholder=f"{session.config.display.expansion}: the bench's",
         )
         self.weights_mode = _choice(list(_MODES), "Which part of the picture counts")
         self.periphery = Entry(
-            _share, "0.1", tip="Weight outside the fovea, or where nothing is painted (0 to 1)"
+            share, "0.1", tip="Weight outside the fovea, or where nothing is painted (0 to 1)"
         )
-        self.brush = Entry(_brush, "0.06", tip="Radius of the brush, as a fraction of the field")
+        self.brush = Entry(brush_radius, "0.06", tip="Radius of the brush, as a fraction of the field")
         self.clear = QPushButton("Clear")
         self.clear.setToolTip("Take off all that was painted (left button paints, right button rubs out)")
         self.loss = _choice(list(_LOSSES), "Which differences count (Kuo 2020, Eqs. 7.16 and 7.17)")
@@ -106,9 +119,9 @@ class HologramsPanel(Panel):
         self.psnr_db = Entry(
             number("The PSNR", "dB", above_zero=True), tip="Stop at this PSNR", placeholder="no limit (dB)"
         )
-        self.alignment = Entry(_maybe_path, tip="From align mask: alignment.json", placeholder="not aligned")
-        self.correction = Entry(_maybe_path, tip="From calibrate slm", placeholder="an ideal SLM")
-        self.out = Entry(_png, tip="8-bit phase, 256 levels a turn; .json and a preview go beside it")
+        self.alignment = Entry(maybe_path, tip="From align mask: alignment.json", placeholder="not aligned")
+        self.correction = Entry(maybe_path, tip="From calibrate slm", placeholder="an ideal SLM")
+        self.out = Entry(pattern_png, tip="8-bit phase, 256 levels a turn; .json and a preview go beside it")
         self.preview_button = QPushButton("Preview")
         self.preview_button.setToolTip(f"{_PREVIEW_ITERATIONS} iterations, nothing is written")
         self.compute_button = QPushButton("Compute")
@@ -132,6 +145,9 @@ class HologramsPanel(Panel):
             "button or Space paints, right button or Backspace rubs out, arrow keys move the brush"
         )
         self.seen, self.phase, self.captured = ImageView(), ImageView(), ImageView()
+        self.plane = _choice([], "The plane that is looked at")
+        self.plane.currentIndexChanged.connect(self._show_plane)
+        self.plane.hide()
         self.metrics = FactsView()
         self.plot = plot_widget("iteration", "PSNR", y_unit="dB")
         self.plot.setMinimumSize(120, 80)
@@ -159,6 +175,7 @@ class HologramsPanel(Panel):
             ("Fit", self.fit),
             ("", self.srgb),
             ("Depth", self.z_mm),
+            ("Further planes", self.further),
             ("Counts", self.weights_mode),
             ("Elsewhere", self.periphery),
             ("Brush", self._painting),
@@ -185,6 +202,7 @@ class HologramsPanel(Panel):
         column = QVBoxLayout(left)
         column.setContentsMargins(0, 0, 0, 0)
         column.addWidget(scroll, 1)
+        column.addWidget(self.plane)
         column.addWidget(self.progress)
         for buttons in (
             (self.preview_button, self.compute_button, self.stop_button),
@@ -262,6 +280,7 @@ class HologramsPanel(Panel):
             srgb=self.srgb.isChecked(),
             expansion=self.expansion.value(),
             alignment=self.alignment.value(),
+            further=self.further.value(),
             request=request,
         )
 
@@ -383,7 +402,7 @@ class HologramsPanel(Panel):
         self.computed = computed
         result = computed.result
         self.progress.setValue(1000)
-        self.seen.show_image(np.maximum(result.seen[0], 0), 0.0, 1.0)
+        self._list_planes(computed)
         self.phase.show_image(result.hologram.phase_rad[0], 0.0, 2 * np.pi)
         self.captured.clear()
         self._draw_history(result.hologram.history)
@@ -393,10 +412,30 @@ class HologramsPanel(Panel):
         self._suggest_out()
         self._set_running(False)
 
+    def _list_planes(self, computed: Computed) -> None:
+        """Let the plane be chosen that is looked at; shows the first."""
+        order = computed.order
+        depths = [order.z_mm, *(z_mm for _, z_mm in order.further)]
+        self.plane.blockSignals(True)
+        self.plane.clear()
+        self.plane.addItems([f"seen at {z_mm:g} mm" for z_mm in depths])
+        self.plane.blockSignals(False)
+        self.plane.setVisible(len(depths) > 1)
+        self._show_plane(0)
+
+    def _show_plane(self, number: int) -> None:
+        if self.computed is not None and number >= 0:
+            self.seen.show_image(np.maximum(self.computed.result.seen[number], 0), 0.0, 1.0)
+
     def _facts(self, result: HologramResult, computed: Computed) -> list[tuple[str, str]]:
         last, display = result.hologram.history[-1], computed.display
         facts = [
-            ("Seen (computed)", _scores(result.scores[0])),
+            *(
+                (f"Seen (computed){'' if len(result.scores) == 1 else f' at {z_mm:g} mm'}", _scores(scores))
+                for (_, z_mm), scores in zip(
+                    ((None, computed.order.z_mm), *computed.order.further), result.scores, strict=True
+                )
+            ),
             ("Stopped", f"after {last.iteration} iterations, {result.hologram.seconds:.1f} s: "
                 f"{result.hologram.stop_reason}"),
             ("Expansion", f"{display.expansion}x on {display.slm_shape[1]} x {display.slm_shape[0]} pixels, "
@@ -486,6 +525,7 @@ class HologramsPanel(Panel):
         return [
             self.picture,
             self.z_mm,
+            self.further,
             self.periphery,
             self.brush,
             self.expansion,
@@ -523,53 +563,6 @@ def _choice(names: list[str], tip: str) -> QComboBox:
     box.setToolTip(tip)
     narrow(box)
     return box
-
-
-def _signed_mm(text: str) -> float:
-    bare = text.removesuffix("mm").strip()
-    if not bare:
-        return 0.0
-    try:
-        value = float(bare.replace(",", "."))
-    except ValueError:
-        raise BenchError(f"The depth {text!r} is no number of mm.") from None
-    if not abs(value) < float("inf"):
-        raise BenchError(f"The depth must be a finite number of mm, not {text}.")
-    return value
-
-
-def _expansion(text: str) -> int | None:
-    value: int | None = number("The expansion", "", above_zero=True, whole=True)(text)
-    if value is not None:
-        expansion_side(value)
-    return value
-
-
-def _share(text: str) -> float:
-    value = number("The weight", "")(text)
-    if value is None or value > 1:
-        raise BenchError(f"The weight elsewhere lies in 0 to 1, not {text!r}.")
-    return float(value)
-
-
-def _brush(text: str) -> float:
-    value = number("The brush's radius", "", above_zero=True)(text)
-    if value is None or value > 1:
-        raise BenchError(
-            f"The brush's radius is a fraction of the field, above 0 and at most 1, not {text!r}."
-        )
-    return float(value)
-
-
-def _maybe_path(text: str) -> Path | None:
-    return existing_path(text) if text else None
-
-
-def _png(text: str) -> Path:
-    path = Path(text).expanduser()
-    if path.suffix.lower() != ".png":
-        raise BenchError("The pattern needs a name that ends in .png.")
-    return path
 
 
 def _scores(scores: Scores) -> str:

@@ -221,6 +221,37 @@ def test_fovea_and_brush_by_keys_alone(qtbot: QtBot, panel: HologramsPanel) -> N
     assert rubbed[128, 143] < 0.05
 
 
+def test_planes_are_computed_together_shown_one_by_one_and_copied(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
+) -> None:
+    far = tmp_path / "far.png"
+    write_image(far, np.tile(np.linspace(0, 255, 64).astype(np.uint8), (64, 1)))
+    panel.further.setText(f"{far} @ wide")
+    click(qtbot, panel.preview_button)
+    assert panel.further.property("refused")
+    assert panel.job is None
+    panel.further.setText(f"{far} @ 40 mm")
+    panel.iterations.setText("3")
+    computed(qtbot, panel, panel.compute_button)
+    assert panel.computed is not None
+    result = panel.computed.result
+    assert len(result.seen) == 2
+    assert panel.plane.isVisible()
+    assert [panel.plane.itemText(i) for i in range(2)] == ["seen at 0 mm", "seen at 40 mm"]
+    np.testing.assert_array_equal(panel.seen.image, np.maximum(result.seen[0], 0))
+    panel.plane.setFocus()
+    qtbot.keyClick(panel.plane, Qt.Key.Key_Down)
+    np.testing.assert_array_equal(panel.seen.image, np.maximum(result.seen[1], 0))
+    assert "at 40 mm" in panel.metrics.toPlainText()
+    by_window, facts = read_slm_image(panel.computed.patterns[0])
+    assert len(facts["metrics"]) == 2
+    panel.out.setText(str(tmp_path / "by-script.png"))
+    exec(panel.as_python(), {})
+    by_script, _ = read_slm_image(tmp_path / "by-script.png")
+    difference = np.angle(np.exp(1j * (levels_phase(by_script) - levels_phase(by_window))))
+    assert np.sqrt(np.mean(difference**2)) < 0.02
+
+
 @pytest.mark.parametrize("counts", ["all alike", "a fovea, dragged", "painted"])
 def test_the_copied_lines_make_the_same_pattern(
     qtbot: QtBot, panel: HologramsPanel, tmp_path: Path, counts: str
