@@ -21,7 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from scipy.stats import spearmanr
 
-from recon.chart import ChartProblem, Point, run_setting, settings_for
+from recon.chart.reconstruction import ChartProblem, run_setting, settings_for
+from recon.chart.scored import Point
 from recon.scenes import make_scene
 from recon.threads import set_threads
 

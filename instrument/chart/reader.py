@@ -20,7 +20,7 @@ def read_chart(path: Path) -> dict[str, Any]:
     -------
     dict
         ``kind`` (of :data:`recon.chart.scored.KINDS`), ``about`` (what was charted), ``points`` (the fields
-        of :class:`recon.chart.Point`; None where one is not known), ``failed`` (settings and why),
+        of :class:`recon.chart.scored.Point`; None where one is not known), ``failed`` (settings and why),
         ``missing`` (settings without time).
 
     Raises

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from instrument.cli import chart as module
 from instrument.reconstruction_job import Job
 from recon import Calibration, NoiseModel
-from recon import chart as recon_chart
+from recon.chart import reconstruction as recon_chart
 
 
 @pytest.fixture
@@ -201,3 +201,30 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
     )
     assert (tmp_path / "chart.png").stat().st_size > 5000
     assert "middle_psnr_db" in (tmp_path / "chart.html").read_text()
+
+
+def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
+    import multiprocessing
+    from types import SimpleNamespace
+
+    from instrument.chart import process
+
+    ended = []
+    waited = SimpleNamespace(join=lambda: ended.append("parent is gone"))
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: waited)
+    monkeypatch.setattr(process.os, "_exit", ended.append)
+    process._end_with_parent()
+    assert ended == ["parent is gone", 1]
+
+
+def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
+    import signal
+
+    from instrument.chart import process
+
+    masks = []
+    blocked = lambda: masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))  # noqa: E731
+    monkeypatch.setattr(process.forkserver, "ensure_running", blocked)
+    process._context()
+    assert signal.SIGINT in masks[0]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

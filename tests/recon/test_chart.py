@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.chart import ChartProblem, Point, Setting, pareto, run_setting, settings_for
+from recon.chart.reconstruction import ChartProblem, Setting, run_setting, settings_for
+from recon.chart.scored import Point, pareto
 from recon.errors import InputError, StructureError
 from recon.picture import PRIORS, reconstruct
 from recon.scenes import make_scene
