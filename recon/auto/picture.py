@@ -13,6 +13,7 @@ import numpy.typing as npt
 from recon.auto.choice import Choice, Decision
 from recon.auto.decide import choose
 from recon.auto.run import reduce
+from recon.auto.solving import steps_of_tolerance
 from recon.auto.wishes import Wishes
 from recon.checks import as_channels
 from recon.errors import InputError
@@ -79,6 +80,8 @@ def _by_plain_admm(choice: Choice, depth: Calibration, wishes: Wishes) -> Choice
             "iterations",
             f"until they change by less than {tolerance:g}",
             "as asked" if wishes.tolerance is not None else "where this solver stops by default",
+            0.0,
+            *steps_of_tolerance(tolerance),
             overruled=wishes.tolerance is not None,
             numbers={"tolerance": tolerance},
         ),

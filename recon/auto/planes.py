@@ -24,6 +24,8 @@ def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple
     n = len(depths.z_um)
     everything = tuple(range(n))
     if n == 1:
+        if isinstance(wishes.planes, tuple):
+            _within(wishes.planes, n)
         return everything, Decision("planes", "1", "one depth was calibrated")
     lit = np.any([_most_of(light) for light in passed.light], axis=0)
     # The coarse pass may take a plane for its neighbour: those of lit planes stay.
@@ -91,9 +93,7 @@ def put_back(choice: Choice, signs: Sequence[float], *, everything: bool) -> Cho
 
 def _within(wished: tuple[int, ...], n: int) -> tuple[int, ...]:
     if max(wished) >= n:
-        raise InputError(
-            f"planes={_ranges(wished)}: there are {n} calibrated depths, numbered from 0 to {n - 1}."
-        )
+        raise InputError(f"planes={_ranges(wished)}: the calibrated depths are numbered from 0 to {n - 1}.")
     return wished
 
 

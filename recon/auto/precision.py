@@ -56,7 +56,7 @@ def precision_of(wishes: Wishes, iterations: int, pixels: int, *, able: bool) ->
         f"by the stability map float32 differs from float64 by at most {expected:.0e} of the picture after "
         f"{iterations} iterations on {pixels} pixels ({PRECISION:.0%} is a failure)"
     )
-    loss = -10 * float(np.log10(1 + expected**2))
+    loss = 0.0 - 10 * float(np.log10(1 + expected**2))
     numbers = {"expected_difference": expected}
     if not able:
         if wishes.precision == "float64":
@@ -69,5 +69,5 @@ def precision_of(wishes: Wishes, iterations: int, pixels: int, *, able: bool) ->
     if value == "float64":
         down = Option("float32", 1 / DOUBLE_COST, loss)
         return Decision("precision", value, why, 0.0, None, down, asked, numbers)
-    up = Option("float64", DOUBLE_COST, -loss)
+    up = Option("float64", DOUBLE_COST, abs(loss))
     return Decision("precision", value, why, loss, up, None, asked, numbers)

@@ -109,8 +109,12 @@ def iterations_of(model: ModelName, wishes: Wishes) -> Decision:
         f"until they change by less than {tolerance:g}",
         "pictures were seen to be within 0.2 dB of the end there",
         0.0,
-        Option(f"until {tolerance / 10:g}", 3.0, 0.2),
-        Option(f"until {tolerance * 3:g}", 0.5, -0.5),
+        *steps_of_tolerance(tolerance),
         wishes.tolerance is not None,
         {"tolerance": tolerance},
     )
+
+
+def steps_of_tolerance(tolerance: float) -> tuple[Option, Option]:
+    """Return what stopping later and earlier would be: rules of thumb of the scenes tuned on."""
+    return Option(f"until {tolerance / 10:g}", 3.0, 0.2), Option(f"until {tolerance * 3:g}", 0.5, -0.5)
