@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
+
+DrawnMap = Callable[[str, Sequence[float], str, Mapping[object, Sequence[float]]], str]
 
 FINE = 3
 """The scene and the PSF are drawn on a grid this much finer than the sensor's."""
@@ -76,3 +79,32 @@ def shoot() -> Callable[..., Shot]:
         )
 
     return shoot
+
+
+@pytest.fixture
+def drawn_map(tmp_path: Path) -> DrawnMap:
+    """Draw a map of severities when a test has failed: in text, and as a picture whose path is told.
+
+    Called in an assertion's message, which is made only then.
+    """
+
+    def draw(x_name: str, x: Sequence[float], y_name: str, rows: Mapping[object, Sequence[float]]) -> str:
+        from instrument.figures import save_figure
+        from instrument.stability_figure import map_figure
+        from recon.stability.map import Axis, as_text
+
+        axes = Axis(x_name, x_name, "", tuple(x), ()), Axis(y_name, y_name, "", tuple(range(len(rows))), ())
+        grid = np.array(list(rows.values()), float)
+        text = as_text(*axes, (axes[0].values, axes[1].values), grid)
+        shown = {
+            "title": f"{x_name} and {y_name}",
+            "error": "severity",
+            "x": {"label": x_name, "unit": "", "values": list(x)},
+            "y": {"label": y_name, "unit": "", "values": [], "ticks": [str(name) for name in rows]},
+            "methods": {"": {"severity": grid.tolist(), "error": grid.tolist()}},
+        }
+        picture = save_figure(map_figure(shown), tmp_path / "boundary.png")
+        names = ", ".join(f"{k}: {name}" for k, name in enumerate(rows))
+        return f"{text}\n{names}\nThe map: {picture}"
+
+    return draw
