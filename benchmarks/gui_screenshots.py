@@ -70,6 +70,8 @@ scene_depth_mm = 50.0
 SWEEP = ["--z-min", "22", "--z-max", "80", "--planes", "12", "--average", "2"]
 EXPOSURES_MS = {"beads": 1.0, "bars": 60.0}
 PICTURE_Z_MM = "40.84"
+LENS_TURNS = 20.0
+"""Of phase, from the middle of the SLM over its longer side."""
 SMALL_DISPLAY = {"shape": "[200, 280]", "shift_um": "[31.0, -42.0]", "z_um": "80.0"}
 """The display that ships takes minutes to align; a small one, less far off, takes one."""
 ALIGNMENT = {"reach": "8", "depth_um": "100"}
@@ -188,6 +190,10 @@ def _show(window: MainWindow, name: str, out: Path) -> None:
         _sweep(window)
     if name == "runs":
         _first_run(window)
+    if name == "led_array":
+        _half(window)
+    if name == "slm":
+        _lens(window)
     _grab(window, out / f"{name}.png")
     if name == "charts":
         _chart(window)
@@ -202,6 +208,33 @@ def _chart(window: MainWindow) -> None:
     assert isinstance(panel, ChartsPanel)
     panel.open(panel.session.runs_folder.parent / "chart" / "chart.json")
     _wait(lambda: bool(panel.chart.front), "the chart")
+
+
+def _half(window: MainWindow) -> None:
+    """Light a half circle of LEDs."""
+    from gui.panels.led_array import LedPanel
+
+    panel = window.panel("led_array")
+    assert isinstance(panel, LedPanel)
+    panel.pattern_buttons["left"].click()
+    _wait(lambda: panel._drawn is not None and not panel._drawn.is_dark, "the LEDs")
+
+
+def _lens(window: MainWindow) -> None:
+    """Show the phase of a lens on the SLM."""
+    from gui.panels.slm import SlmPanel
+
+    panel = window.panel("slm")
+    assert isinstance(panel, SlmPanel)
+    slm = panel.session.bench.slm
+    assert slm is not None
+    y, x = (np.arange(n) - n / 2 for n in slm.shape)
+    turns = (y[:, None] ** 2 + x**2) * (LENS_TURNS / max(slm.shape) ** 2)
+    picture = panel.session.runs_folder.parent / "lens.png"
+    write_image(picture, np.round(256 * (turns % 1)).astype(np.uint8))
+    panel.file.setText(str(picture))
+    panel.load()
+    _wait(lambda: slm.displayed.any(), "the SLM")
 
 
 def _sweep(window: MainWindow) -> None:
