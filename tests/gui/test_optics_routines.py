@@ -72,7 +72,6 @@ def test_the_diffusers_surface(qtbot: QtBot, window: MainWindow) -> None:
     assert window.session.bench.led_array.pattern.is_dark
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("bench_text", [SLIDES], indirect=True, ids=["slides"])
 def test_bead_slides(qtbot: QtBot, window: MainWindow) -> None:
     panel = carry_out(
