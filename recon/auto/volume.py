@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from recon.auto.decide import choose
 from recon.auto.planes import put_back
-from recon.auto.run import reduce, shown, whole_volume
+from recon.auto.run import Reduced, reduce, shown, whole_volume
 from recon.auto.wishes import Wishes
 from recon.noise import NoiseModel
 from recon.preparation import Field
@@ -52,7 +52,8 @@ def reconstruct_chosen_volume(
 
     Where what is left of the data shows light in depths that were left out, these are put back and the volume
     is reconstructed again: once with them and their neighbours, then with all, as far as ``time_s`` allows. A
-    last run that still shows signs has its warning.
+    last run that still shows signs has its warning. One that was cut short serves only where it came
+    further than the one before, by what both minimise; else that one is returned, with its warning.
     """
     wishes = _settled(
         wishes or Wishes(), axis_weights, estimate_background, positive_background, tolerance, field
@@ -67,6 +68,7 @@ def reconstruct_chosen_volume(
         wishes=wishes,
     )
     spent = 0.0
+    best: tuple[VolumeReconstruction, Reduced] | None = None
     for left in range(MORE_RUNS, -1, -1):
         small = reduce(
             choice, measurement, calibration, noise=noise, background=background, erasures=erasures
@@ -97,6 +99,8 @@ def reconstruct_chosen_volume(
             **others,
         )
         spent += result.seconds
+        if best is None or not _cut_short(result) or _objective(result) < _objective(best[0]):
+            best = result, small
         more = put_back(choice, result.provenance.get("light_in_planes_left_out", []), everything=left == 1)
         out_of_time = time_s is not None and spent >= time_s
         if not left or more is None or wishes.planes is not None or out_of_time or _cancelled(result):
@@ -105,8 +109,9 @@ def reconstruct_chosen_volume(
     psfs = calibration.psfs
     height, width = np.shape(measurement)[:2]
     window, centre = window_of(field, (height, width), (psfs.shape[2], psfs.shape[3]))
-    whole = whole_volume(result, small, grid_of(calibration, _depths_um(calibration), window, centre))
-    return replace(whole, seconds=spent)
+    assert best is not None
+    whole = whole_volume(*best, grid_of(calibration, _depths_um(calibration), window, centre))
+    return replace(whole, seconds=spent, stop_reasons=result.stop_reasons)
 
 
 def _settled(
@@ -132,6 +137,15 @@ def _settled(
 
 def _cancelled(result: VolumeReconstruction) -> bool:
     return StopReason.CANCELLED in result.stop_reasons
+
+
+def _cut_short(result: VolumeReconstruction) -> bool:
+    return StopReason.TIME in result.stop_reasons or _cancelled(result)
+
+
+def _objective(result: VolumeReconstruction) -> float:
+    """Return misfit and prior together, which a run with more planes can only make smaller in the end."""
+    return sum(history[-1].objective for history in result.histories)
 
 
 def _depths_um(calibration: Calibration) -> npt.NDArray[np.float64]:
