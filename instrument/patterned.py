@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import threading
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -220,9 +222,11 @@ def _require_same_plan(run: Run, sheet: Run) -> None:
 
 def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
     try:
-        patterns = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
+        patterns = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FileError(path, f"cannot be read: {error}.") from None
+    if not isinstance(patterns, np.ndarray):
+        raise FileError(path, "is an .npz archive by another name; one plain .npy array is expected.")
     if patterns.shape != shape or patterns.dtype.kind not in "fiu":
         raise FileError(
             path,

@@ -123,6 +123,14 @@ def test_patterns_may_come_from_a_file(files: tuple[Path, Path, Path], tmp_path:
     np.save(tmp_path / "patterns.npy", -lights())
     with pytest.raises(FileError, match="negative"):
         prepare_patterned(request)
+    for content in (b"", b"PK\x03\x04 cut off"):
+        (tmp_path / "patterns.npy").write_bytes(content)
+        with pytest.raises(FileError, match="cannot be read"):
+            prepare_patterned(request)
+    np.savez(tmp_path / "several.npz", lights())
+    (tmp_path / "several.npz").replace(tmp_path / "patterns.npy")
+    with pytest.raises(FileError, match="archive"):
+        prepare_patterned(request)
 
 
 def test_what_does_not_belong_together_is_refused(files: tuple[Path, Path, Path], tmp_path: Path) -> None:
