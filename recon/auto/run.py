@@ -145,8 +145,7 @@ def whole_volume(
         reason=next(d.why for d in choice.decisions if d.name == "model"),
         choice=choice,
         empty_planes=tuple(
-            replace(e, planes=tuple(int(places[z]) for z in e.planes if places[z] == int(places[z])))
-            for e in small.empty_planes
+            replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes
         ),
         warnings=_together(reduced.warnings, small.warnings),
         provenance={**small.provenance, "auto": choice.to_json()},
@@ -161,6 +160,12 @@ def shown(reduced: Reduced, picture: Callable[[], Array]) -> Callable[[], Floats
 def _places(choice: Choice) -> list[float]:
     """Return the planes that are reconstructed, in the calibration's order: ``k + 0.5`` after depth ``k``."""
     return sorted([*choice.planes, *(k + 0.5 for k in choice.between)])
+
+
+def _empty(choice: Choice, places: list[float]) -> tuple[int, ...]:
+    """Return the depths that are empty where these places are: none that got light of a plane between."""
+    given = {k + by for k in choice.between if k + 0.5 not in places for by in (0, 1)}
+    return tuple(int(at) for at in places if at == int(at) and at not in given)
 
 
 def _together(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:

@@ -172,6 +172,16 @@ def test_unlike_depths_get_planes_between_and_their_light_comes_back_to_the_cali
     assert fine.volume.sum() == pytest.approx(coarse.volume.sum(), rel=0.1)
 
 
+def test_a_depth_that_gets_light_of_a_plane_between_is_not_called_empty():
+    scene = make_scene("beads", size=48, depths=4, density=0.1, seed=53)
+    found = recon.reconstruct_volume(scene.measurement, scene.calibration, prior="l1", judged=False)
+    assert found.choice is not None
+    assert found.choice.between
+    (empty,) = found.empty_planes
+    assert empty.planes
+    assert not found.volume[list(empty.planes)].any()
+
+
 def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
     scene = make_scene("beads", size=32, depths=8, density=0.3, seed=1)
     choice = choose(scene.measurement, scene.calibration, prior="l1")
