@@ -22,6 +22,9 @@ next to nothing, a relative change means nothing."""
 
 BRIGHT_PERCENTILE = 99.9
 
+MOST_COMPARED = 500
+"""Frames whose light is compared, each with each, to find how it fades; of longer videos every so many."""
+
 _ANCHORS_A_WINDOW = 4
 
 
@@ -96,21 +99,22 @@ def _shift(frame: Floats, window: Array, reference: Array) -> tuple[float, float
 def fading(frames: Floats) -> npt.NDArray[np.float64]:
     """Return how the whole field's light fades, relative to the first frame, (n_frames,): an exponential.
 
-    Its rate is the median slope between frames half the video apart (Sen 1968), of the logarithm of a frame's
-    light: activity, which comes and goes, does not tell on it. What bleaches otherwise than the whole is left
-    to the sliding baseline.
+    Its rate is the median slope of the logarithm of a frame's light between any two frames (Sen 1968):
+    activity, which comes and goes, does not tell on it; a step that stays does in part. What bleaches
+    otherwise than the whole is left to the sliding baseline.
 
     Parameters
     ----------
     frames : ndarray, (n_frames, height, width)
     """
     light: Array = np.asarray(np.mean(frames, axis=(1, 2), dtype=np.float64))
-    half = len(frames) // 2
-    first, later = light[: len(light) - half], light[half:]
-    shines = (first > 0) & (later > 0)
-    if half == 0 or not shines.any():
+    at = np.arange(0, len(frames), max(-(-len(frames) // MOST_COMPARED), 1))
+    at = at[light[at] > 0]
+    if len(at) < 2:
         return np.ones(len(frames))
-    slope = float(np.median(np.log(later[shines] / first[shines]))) / half
+    first, later = np.triu_indices(len(at), 1)
+    level = np.log(light[at])
+    slope = float(np.median((level[later] - level[first]) / (at[later] - at[first])))
     relative: npt.NDArray[np.float64] = np.exp(slope * np.arange(len(frames)))
     return relative
 

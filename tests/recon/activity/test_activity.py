@@ -61,6 +61,15 @@ def test_fading_is_found_under_activity_and_taken_out_of_the_baseline() -> None:
     assert correlations[1] > 0.97
 
 
+def test_a_step_that_stays_is_not_told_as_twice_itself() -> None:
+    frames, _ = cells(noise=0.02)
+    step = np.where(np.arange(len(frames)) < 0.65 * len(frames), 1.0, 2.0)
+    # Of frames half the video apart nearly all lie on both sides of it: 3.8 where the light ends at 2.
+    assert 1 < fading((frames * step[:, None, None]).astype(np.float32))[-1] < 2
+    longer = 0.2 ** (np.arange(1203) / 1202)
+    assert fading((longer[:, None, None] * np.ones((1, 2, 2))).astype(np.float32))[-1] == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize("frames", [np.zeros((4, 3, 3)), -np.ones((4, 3, 3)), np.ones((1, 3, 3))])
 def test_fading_of_what_does_not_shine_is_none(frames: np.ndarray) -> None:
     assert (fading(frames.astype(np.float32)) == 1).all()
