@@ -73,9 +73,12 @@ def test_scoring_takes_no_time_of_the_optimiser_and_happens_aside(problem):
         yield
         told.append("out")
 
+    problem.run(HologramSetting(4), counts=(1,))  # compiles, which may take many seconds
+    began = time.perf_counter()
     points = problem.run(HologramSetting(4), aside=slow, counts=(1, 2)).points
     assert told == ["in", "out"] * 2
-    assert points[-1].seconds < 0.3
+    # However slow the machine: what the optimiser took and both waits make no more than all.
+    assert points[-1].seconds < time.perf_counter() - began - 0.6
     (one,) = problem.run(HologramSetting(4, "one_step")).points
     assert one.iterations == 0
     assert one.seconds > 0
