@@ -32,6 +32,7 @@ _REST_MS = 150
 """Rest of the brightness before it is sent: a slider that is pulled must not fill a queue."""
 _COLOURS: dict[str, Rgb] = {"white": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 _DPC = ("left", "right", "top", "bottom")
+_WITHOUT_APERTURE = ("off", "source")
 _DIMMEST = 70
 """Grey level of the faintest lit LED as drawn, so that it is seen to be lit."""
 
@@ -68,6 +69,7 @@ class LedPanel(Panel):
         self._rest.setSingleShot(True)
         self._rest.setInterval(_REST_MS)
         self._rest.timeout.connect(self.dim)
+        session.stop_pressed.connect(self._rest.stop)  # what was pulled before STOP lights nothing after it
         self.brightness.valueChanged.connect(lambda _: self._rest.start())
         self.level = QLabel("255")
         self.level.setMinimumWidth(28)
@@ -207,7 +209,9 @@ class LedPanel(Panel):
     def show_pattern(self, name: str) -> None:
         """Show a pattern: ``"bright"``, ``"dark"``, ``"source"``, ``"off"`` or a DPC half."""
         leds, bench = self.session.bench.led_array, self.session.bench
-        if leds is None or not self.na.submit():  # not with the aperture of before
+        if leds is None:
+            return
+        if name not in _WITHOUT_APERTURE and not self.na.submit():  # not with the aperture of before
             return
         na, rgb = self.na.value or 0.25, self.rgb
         self._rest.stop()  # the brightness that was pulled goes with the pattern

@@ -59,6 +59,31 @@ def test_a_pattern_is_not_lit_with_an_aperture_that_makes_no_sense(
     assert not window.session.jobs.is_busy("led_array")
 
 
+def test_the_light_goes_off_whatever_stands_in_the_field_of_the_aperture(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel
+) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    qtbot.mouseClick(leds.pattern_buttons["bright"], LEFT)
+    qtbot.waitUntil(lambda: not array.pattern.is_dark, timeout=WAIT_MS)
+    leds.na.setFocus()
+    leds.na.selectAll()
+    qtbot.keyClicks(leds.na, "7")
+    qtbot.mouseClick(leds.pattern_buttons["off"], LEFT)
+    qtbot.waitUntil(lambda: array.pattern.is_dark, timeout=WAIT_MS)
+
+
+def test_brightness_that_was_pulled_before_stop_is_not_sent_after_it(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel
+) -> None:
+    leds._rest.setInterval(WAIT_MS)
+    leds.brightness.setValue(100)
+    assert leds._rest.isActive()
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.mouseClick(window.stop_button, LEFT)
+    assert not leds._rest.isActive()
+
+
 def test_an_expansion_that_is_no_square_is_refused_at_its_field(qtbot: QtBot, window: MainWindow) -> None:
     panel = window.show_panel("holograms")
     assert isinstance(panel, HologramsPanel)
