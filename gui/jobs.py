@@ -278,9 +278,12 @@ class JobRunner(QObject):
 
     def cancel_device_jobs(self) -> None:
         """Ask every device job to end; those that wait end at once. For the window's thread."""
-        for number in list(self._waiting):
-            self._finish(number, "cancelled", JobCancelledError())
         for job in self.device_jobs:
+            job.cancel()
+        waiting, self._waiting = self._waiting, []  # none of them begins when the one before it ends
+        for number in waiting:
+            self._finish(number, "cancelled", JobCancelledError())
+        for job in self.device_jobs:  # what an end has asked for
             job.cancel()
 
     def join(self, timeout_s: float) -> bool:

@@ -165,3 +165,22 @@ def test_a_job_that_waits_can_be_withdrawn(qtbot: QtBot, jobs: JobRunner) -> Non
     gate.set()
     qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
     assert first.state is JobState.SUCCEEDED
+
+
+def test_no_job_that_waits_begins_while_those_before_it_are_cancelled(qtbot: QtBot, jobs: JobRunner) -> None:
+    gate = threading.Event()
+    begun: list[str] = []
+    first = jobs.device("first", lambda _: gate.wait(WAIT_MS / 1000), {"camera"})
+    qtbot.waitUntil(lambda: first.state is JobState.RUNNING, timeout=WAIT_MS)
+    waiting = [
+        jobs.device("second", lambda _: begun.append("second"), {"camera", "led_array"}),
+        jobs.device("third", lambda _: begun.append("third"), {"led_array"}),
+    ]
+    for job in waiting:
+        job.started.connect(lambda job=job: begun.append(job.title))
+    jobs.cancel_device_jobs()
+    assert [job.state for job in waiting] == [JobState.CANCELLED] * 2
+    gate.set()
+    qtbot.waitUntil(lambda: first.is_over, timeout=WAIT_MS)
+    assert jobs.join(WAIT_MS / 1000)
+    assert begun == []
