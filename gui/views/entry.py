@@ -122,6 +122,7 @@ class PathEntry(QWidget):
     def _chosen(self, path: Path) -> None:
         self.entry.setText(str(path))
         self.entry.check()
+        self.entry.editingFinished.emit()  # as if it had been typed
 
 
 def narrow(box: QComboBox) -> None:

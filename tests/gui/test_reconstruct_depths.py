@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import tifffile
 from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QFileDialog
 from pytestqt.qtbot import QtBot
 
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
+from gui.views.entry import PathEntry
 from instrument.calibration_file import (
     CalibrationFileError,
     calibrated_depths_um,
@@ -91,6 +93,24 @@ def test_with_one_depth_nothing_is_asked_and_a_calibration_that_was_named_stays(
     panel.form.psfs.editingFinished.emit()  # no calibration: no depths, and no mistake of their own
     qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
     assert "which one" not in panel.form.z_mm.placeholderText()
+
+
+def test_the_depths_are_those_of_the_calibration_that_was_chosen_in_the_dialogue(
+    qtbot: QtBot, panel: ReconstructionsPanel, photograph: Path, tmp_path: Path
+) -> None:
+    form = panel.form
+    panel.take(photograph)
+    panel.take(_calibration(tmp_path / "several", (22e3, 80e3)))
+    qtbot.waitUntil(lambda: "which one" in form.z_mm.placeholderText(), timeout=WAIT_MS)
+    one = _calibration(tmp_path / "one", (50e3,))
+    row = form.psfs.parent()
+    assert isinstance(row, PathEntry)
+    qtbot.mouseClick(row.button, Qt.MouseButton.LeftButton)
+    (dialogue,) = row.findChildren(QFileDialog)
+    dialogue.fileSelected.emit(str(one))
+    dialogue.close()
+    qtbot.waitUntil(lambda: "which one" not in form.z_mm.placeholderText(), timeout=WAIT_MS)
+    assert form.request().z_um is None
 
 
 def test_depths_of_a_calibration(tmp_path: Path) -> None:
