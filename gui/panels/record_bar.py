@@ -134,12 +134,12 @@ class RecordBar(QWidget):
 
     def _look_at_disk(self) -> None:
         folder = self._session.runs_folder.absolute()
-        while not folder.exists():
-            folder = folder.parent
         import shutil
 
         self.gauge.setRange(0, 1000)
         try:
+            while not folder.exists():
+                folder = folder.parent
             usage, free = shutil.disk_usage(folder), free_bytes(self._session.runs_folder)
         except (OSError, FileError) as error:  # no such place, a drive taken away, a server that is silent
             self.gauge.setValue(0)

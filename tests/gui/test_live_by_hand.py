@@ -149,3 +149,14 @@ def test_a_disk_that_tells_no_size_takes_nothing_but_the_gauge(
     monkeypatch.setattr(shutil, "disk_usage", usage)
     live.record_bar._look_at_disk()
     assert live.record_bar.gauge.format() == "disk not known"
+
+
+def test_a_folder_whose_disk_was_taken_away_takes_nothing_but_the_gauge(
+    live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exists(_: Path) -> bool:
+        raise OSError(107, "Transport endpoint is not connected")
+
+    monkeypatch.setattr(Path, "exists", exists)
+    live.record_bar._look_at_disk()
+    assert live.record_bar.gauge.format() == "disk not known"
