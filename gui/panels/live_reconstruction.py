@@ -228,6 +228,8 @@ class LiveReconstructionPanel(Panel):
                 self.plane.setCurrentIndex(place)
             where = self.plane.currentText() if place >= 0 else str(loaded.path)
             why = f"{why} The preview goes on as before: {where}."
+        else:
+            self.status.setText(_NO_CALIBRATION)
         self.refused(self.file, why)
 
     def _not_loading(self, job: Job) -> None:

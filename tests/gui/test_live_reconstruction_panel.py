@@ -160,6 +160,24 @@ def test_a_depth_that_cannot_be_prepared_is_told_and_the_one_before_goes_on(
     qtbot.waitUntil(lambda: panel.follower.is_following, timeout=WAIT_MS)
 
 
+def test_a_first_calibration_that_cannot_be_prepared_leaves_words_for_what_to_do(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel = window.show_panel("live_reconstruction")
+    assert isinstance(panel, LiveReconstructionPanel)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise InputError("This PSF is dark.")
+
+    monkeypatch.setattr(live_reconstruction, "LiveReconstructor", refuse)
+    before = panel.status.text()
+    one = Calibration(np.ones((1, 1, 8, 8), np.float32), np.zeros((1, 3)))
+    panel.file.setText(str(save_calibration(one, tmp_path / "one")))
+    panel.load()
+    qtbot.waitUntil(lambda: "This PSF is dark." in panel.file.toolTip(), timeout=WAIT_MS)
+    assert panel.status.text() == before
+
+
 def _preparing(panel: LiveReconstructionPanel) -> bool:
     return any(job.title == "Preparing the preview" for job in panel.session.jobs.jobs)
 
