@@ -108,12 +108,12 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
 
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
-        told = settle_checkpoint(keeper, volume.stop_reasons)
         write_volume(outputs, volume, prepared)
+        told = settle_checkpoint(keeper, volume.stop_reasons)
     else:
         picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
-        told = settle_checkpoint(keeper, [picture.stop_reason])
         write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
+        told = settle_checkpoint(keeper, [picture.stop_reason])
     return Written(outputs.image, told)
 
 
@@ -135,6 +135,7 @@ def lines_of(work: ReconstructionWork) -> str:
         imports.add("from recon.auto import Wishes")
     named = f"Outputs.named({expression(work.outputs.image)}{', volume=True' if volume else ''})"
     lines = [f"request = {expression(request)}", "job = request.prepare()"]
+    settled: list[str] = []
     if work.kept_in is None:
         lines.append("result = request.solve(job)")
     else:
@@ -143,8 +144,8 @@ def lines_of(work: ReconstructionWork) -> str:
         lines += [
             f"keeper = checkpoint_for({expression(work.kept_in)}, job, request)",
             "result = request.solve(job, keeper=keeper)",
-            f"settle_checkpoint(keeper, {reasons})",
         ]
+        settled.append(f"settle_checkpoint(keeper, {reasons})")
     turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
     lines.append(f"{'write_volume' if volume else 'write_reconstruction'}({named}, result, job{turned})")
-    return "\n".join(["from pathlib import Path", "", *sorted(imports), "", *lines, ""])
+    return "\n".join(["from pathlib import Path", "", *sorted(imports), "", *lines, *settled, ""])

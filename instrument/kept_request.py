@@ -71,7 +71,10 @@ def checkpoint_for(
 def settle_checkpoint(
     keeper: CheckpointFolder | None, reasons: Sequence[StopReason | None]
 ) -> dict[str, str]:
-    """Remove a checkpoint whose work has come to its end; return what is to be told of it, by headings."""
+    """Remove a checkpoint whose work has come to its end; return what is to be told of it, by headings.
+
+    To be called once the result is written: until then the checkpoint is all that there is of it.
+    """
     told: dict[str, str] = {}
     if keeper is None:
         return told

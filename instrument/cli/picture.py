@@ -44,10 +44,10 @@ def reconstruct_to_picture(
             typer.echo(f"Warning: {warning}", err=True)
         keeper = checkpoint_for(checkpoint, job, request)
         result = _solve(job, request, keeper)
-        for name, text in settle_checkpoint(keeper, [result.stop_reason]).items():
-            typer.echo(f"{name:<12}{text}")
         _tell(result)
         _write(outputs, result, job, rotate_deg)
+        for name, text in settle_checkpoint(keeper, [result.stop_reason]).items():
+            typer.echo(f"{name:<12}{text}")
     if result.stop_reason is StopReason.CANCELLED:
         count = len(result.history)
         typer.echo(f"Interrupted after {count} iterations: this is the picture so far.", err=True)

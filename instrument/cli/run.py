@@ -40,10 +40,28 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
         with parser.make_context(f"diffuserbench {name}", list(arguments)) as context:
             parser.invoke(context)
     except BaseException as error:
+        if isinstance(error, KeyboardInterrupt | Terminated):
+            _be_silent_about_half_made_objects()
         if debug and not isinstance(error, _UsageError | typer.Abort | typer.Exit | SystemExit):
             raise
         return report(error)
     return 0
+
+
+def _be_silent_about_half_made_objects() -> None:
+    """Keep what an interrupted library says of its own half-made objects out of the user's sight.
+
+    Ctrl-C in the middle of a compilation, say, leaves an object without the attribute that its ``__del__``
+    releases. Python prints a traceback for that when the exception is let go, after everything was said.
+    """
+    if sys.unraisablehook is not sys.__unraisablehook__:
+        return  # whoever runs this program watches by itself
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if not issubclass(unraisable.exc_type, AttributeError):
+            sys.__unraisablehook__(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def report(error: BaseException) -> int:

@@ -46,8 +46,6 @@ def reconstruct_to_volume(
                 bar.update(task, completed=record.iteration, note=f"residual {record.data_residual:.3g}")
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
-        for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
-            typer.echo(f"{name:<12}{text}")
         if result.choice is not None:
             for line in result.choice.brief():
                 typer.echo(line)
@@ -63,6 +61,8 @@ def reconstruct_to_volume(
             typer.echo(f"Warning: {warning}", err=True)
         write_volume(outputs, result, job)
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
+            typer.echo(f"{name:<12}{text}")
     if StopReason.CANCELLED in result.stop_reasons:
         typer.echo(f"Interrupted after {count} iterations: this is the volume so far.", err=True)
         raise typer.Exit(130)

@@ -53,7 +53,8 @@ def run(files, capsys):
     [
         ("--psf", "psf.tif"),
         ("--psf", "psf.tif", "--method", "fista"),
-        ("--volume", "psfs.tif", "--prior", "l1"),
+        # The model is named: what --model auto chooses besides it, it does not choose with --checkpoint.
+        ("--volume", "psfs.tif", "--prior", "l1", "--model", "convolution"),
     ],
     ids=["picture", "fista", "volume"],
 )
@@ -147,3 +148,22 @@ def test_a_digest_tells_arrays_apart():
     a = np.arange(6.0).reshape(2, 3)
     assert digest(a) == digest(a.copy())
     assert len({digest(a), digest(a.T), digest(a + 1), digest(a.astype(np.float32)), digest(None)}) == 5
+
+
+def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monkeypatch):
+    import instrument.cli.picture as module
+
+    def full(*_args, **_kwargs):
+        raise FileError(files / "a.tif", "cannot be written: the disk is full.", "Make room.")
+
+    kept = files / "kept"
+    what = ("--psf", files / "psf.tif", "--tolerance", "0.5", "--checkpoint", kept, "-o", files / "a.tif")
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "_write", full)
+        code, said = run(*what)
+    assert code == 2
+    assert "disk is full" in said
+    assert list(kept.iterdir())
+    code, said = run(*what)
+    assert code == 0, said
+    assert "removed: the work has come to its end" in said

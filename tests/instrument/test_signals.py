@@ -154,3 +154,24 @@ with open_bench("bench.toml") as bench:
     assert process.returncode == 0, errors
     (line,) = [line for line in out.splitlines() if line.startswith("TOOK")]
     assert line.split()[2:] == ["True", "stopped"]
+
+
+def test_an_object_half_made_when_interrupted_shows_no_traceback(here: Path) -> None:
+    """As a library's, interrupted while it compiles: it fails once more when the interruption is let go."""
+    code = """
+import sys
+import instrument.cli.snap as snap
+from instrument.cli import main
+class Handle:
+    def __init__(self):
+        raise KeyboardInterrupt
+    def __del__(self):
+        del self.never_set
+snap.app.registered_commands[0].callback = lambda: Handle()
+sys.exit(main(["snap"]))
+"""
+    process = program(code, here)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted." in errors
+    assert "Traceback" not in errors
