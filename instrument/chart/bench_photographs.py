@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -175,7 +176,7 @@ def _taken(bench: _Bench, advance: Advance) -> Photographs:
 
 def _read(path: Path, bench: _Bench) -> Photographs:
     try:
-        with np.load(path) as file:
+        with path.open("rb") as opened, np.load(opened) as file:
             kept = dict(file)
         if str(kept["key"]) != bench.key:
             raise FileError(
@@ -194,7 +195,7 @@ def _read(path: Path, bench: _Bench) -> Photographs:
             bench.window_px,
             REACH,
         )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise FileError(
             path, f"holds no photographs ({error}).", "Delete it, or name another folder."
         ) from error

@@ -76,6 +76,8 @@ def _work(pipe: Connection, problem: Problem, setting: Named, limit_s: float) ->
         pipe.send(str(error))
     except MemoryError:
         pipe.send("there is not enough memory")
+    except Exception as error:  # noqa: BLE001 (whatever it is concerns this setting alone, and is told in its row)
+        pipe.send(f"{type(error).__name__}: {error}")
     finally:
         pipe.close()
 

@@ -315,6 +315,12 @@ class CalibrationProblem:
         if pitch is None or distance is None:
             raise InputError("Calibrations on a grid need the pixel pitch and the diffuser's distance.")
         light = psfs.sum(axis=(1, 2)) * (places[:, 2] / p.z_um) ** 2
+        if not np.all(light > 0):
+            row, column, z_um = places[np.argmin(light)]
+            raise InputError(
+                f"The PSF photographed from row {row:.0f}, column {column:.0f} at {z_um:.0f} um shows no "
+                "light above its noise: it cannot be calibrated with."
+            )
         object_um = pitch * places[:, 2] / (1e3 * distance)
         positions = np.column_stack([-places[:, 1] * object_um, -places[:, 0] * object_um, places[:, 2]])
         return Calibration(

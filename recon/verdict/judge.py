@@ -18,7 +18,7 @@ from recon.verdict.verdict import Finding, Region, Verdict
 Floats = npt.NDArray[np.float64]
 
 NEIGHBOURS = 16
-"""Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 137,
+"""Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 134,
 and with a tenth of failures allowed 2 of 165 (the mixed scenes, each judged by the cases of the others)."""
 RELIABLE, LOST = 0.05, 0.5
 """Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""

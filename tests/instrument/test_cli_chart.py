@@ -228,3 +228,28 @@ def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
     process._context()
     assert signal.SIGINT in masks[0]
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"PK\x03\x04 cut off", b"no archive"], ids=["empty", "cut", "other"]
+)
+def test_damaged_photographs_are_refused_by_name(tmp_path, content):
+    from instrument.chart.bench_photographs import photographs
+    from instrument.errors import FileError
+
+    damaged = tmp_path / "photographs.npz"
+    damaged.write_bytes(content)
+    with pytest.raises(FileError, match=r"photographs\.npz.*no photographs"):
+        photographs(96, damaged, lambda done, total: None)
+
+
+def test_what_ends_a_setting_is_told_in_its_row():
+    from instrument.chart.problems import problem_of_scene
+    from instrument.chart.process import in_own_process
+
+    problem, _ = problem_of_scene("sparse-picture", 32, 0)
+    broken = replace(problem, measurement=None)
+    found = in_own_process(broken, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    assert isinstance(found, str)
+    assert "Error" in found
+    assert "status" not in found
