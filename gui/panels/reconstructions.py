@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -214,12 +215,12 @@ class ReconstructionsPanel(Panel):
         values = "*.tif *.npy" if self.result.volume is None else "*.tif *.ome.zarr *.npy"
         filters = f"All values ({values});;What is shown (*.png)"
         start = str(self.result.path.parent)
-        choose_path(self.viewers, "save", "Export", start, self._export_chosen, filters)
+        choose_path(self.viewers, "save", "Export", start, partial(self._export_chosen, self.result), filters)
 
-    def _export_chosen(self, target: Path) -> None:
-        """Export, after asking whether files that exist may be replaced."""
-        if self.result is None:
-            return  # closed while the name was chosen
+    def _export_chosen(self, result: StoredResult, target: Path) -> None:
+        """Export the result that the name was chosen for, after asking whether files may be replaced."""
+        if not self._still_shown(result):
+            return
         present = [path for path in self._export_files(target) if path.exists()]
         if not present:
             self.export_to(target)
@@ -228,10 +229,20 @@ class ReconstructionsPanel(Panel):
         box = Question(QMessageBox.Icon.Question, "Replace?", f"{names}: exists already. Replace it?", self)
         replace = box.addButton("Replace", QMessageBox.ButtonRole.DestructiveRole)
         box.setDefaultButton(box.addButton("Keep", QMessageBox.ButtonRole.RejectRole))
-        box.finished.connect(
-            lambda _: self.export_to(target, overwrite=True) if box.clickedButton() is replace else None
-        )
+
+        def answered() -> None:
+            if box.clickedButton() is replace and self._still_shown(result):
+                self.export_to(target, overwrite=True)
+
+        box.finished.connect(answered)
         box.ask()
+
+    def _still_shown(self, result: StoredResult) -> bool:
+        """Whether a result is still open; says so where another was opened while the operator was asked."""
+        if self.result is result:
+            return True
+        self.refused(None, f"{result.path.name} is not open any more: nothing was exported. Open it again.")
+        return False
 
     def _export_files(self, target: Path) -> dict[Path, str]:
         """Return the files that an export writes, each with the view that it shows ("" for all values)."""

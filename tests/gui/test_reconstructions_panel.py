@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobState
@@ -18,6 +18,7 @@ from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.views.reconstruct_form import PSF, VOLUME
+from gui.widgets.question import Question
 from instrument.images import read_image, write_image
 from instrument.reconstruction_request import VolumeRequest
 from instrument.stored_result import open_result
@@ -312,6 +313,37 @@ def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPane
     with qtbot.waitSignal(job.failed, timeout=WAIT_MS):
         pass
     assert "exists already" in panel._note.toolTip()
+
+
+@pytest.mark.parametrize("opened_during", ["the name", "the question"])
+def test_another_result_is_not_exported_under_the_name_of_the_first(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path, opened_during: str
+) -> None:
+    for name in ("first", "second"):
+        write_image(tmp_path / f"{name}.tif", np.random.default_rng(0).random((20, 30), np.float32))
+    target = tmp_path / "target.tif"
+    target.write_bytes(b"kept")
+
+    def show(name: str) -> None:
+        panel.open(tmp_path / f"{name}.tif")
+        qtbot.waitUntil(lambda: panel.result is not None and panel.result.path.stem == name, timeout=WAIT_MS)
+
+    show("first")
+    qtbot.mouseClick(panel.export_button, Qt.MouseButton.LeftButton)
+    (dialogue,) = panel.findChildren(QFileDialog)
+    if opened_during == "the name":
+        show("second")
+    dialogue.fileSelected.emit(str(target))
+    dialogue.close()
+    if opened_during == "the question":
+        (question,) = panel.findChildren(Question)
+        show("second")
+        (replace,) = (button for button in question.buttons() if button.text() == "Replace")
+        qtbot.mouseClick(replace, Qt.MouseButton.LeftButton)
+    assert not panel.findChildren(Question) or opened_during == "the question"
+    assert "first.tif is not open any more" in panel._note.toolTip()
+    assert not any(job.title.startswith("Exporting") for job in panel.session.jobs.jobs)
+    assert target.read_bytes() == b"kept"
 
 
 def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
