@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import threading
 import time
 import traceback
@@ -20,6 +21,8 @@ from PySide6.QtCore import QObject, Qt, Signal
 
 from drivers.errors import StoppedError
 from instrument.errors import BenchError, in_words
+
+_log = logging.getLogger(__name__)
 
 DEVICE_LANES = frozenset({"camera", "stage", "led_array", "slm", "light"})
 """Jobs on different devices run side by side; on the same device one after the other."""
@@ -106,7 +109,10 @@ class JobContext:
             self.cancel.set()
             actions = list(self._on_cancel)
         for action in actions:
-            action()
+            try:
+                action()
+            except Exception as error:  # noqa: BLE001 - the other actions, jobs and STOP go on
+                _log.error("Cancelling a job: %s", words_for(error))
 
     def _take_newest(self) -> list[Any]:
         with self._lock:

@@ -308,18 +308,25 @@ class BenchSession(QObject):
         Overtakes everything: the devices' stop functions are called from a thread of their own, again and
         again until no job can start anything any more.
         """
-        self.jobs.cancel_device_jobs()
-        self.stop_pressed.emit()
+        self._whatever_happens(self.jobs.cancel_device_jobs)
+        self._whatever_happens(self.stop_pressed.emit)
         for request in list(self._requests):
-            request.refuse()
+            self._whatever_happens(request.refuse)
             if request.withdrawn is not None:
-                request.withdrawn()
+                self._whatever_happens(request.withdrawn)
         if self._stopping:
             self._stop_again = True
             return
         self._stopping = True
         self.log("warning", "STOP")
         self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
+
+    def _whatever_happens(self, step: Callable[[], object]) -> None:
+        """Take a step of STOP; one that fails is told and keeps the bench from nothing."""
+        try:
+            step()
+        except Exception as error:  # noqa: BLE001 - the bench is made safe all the same
+            self.log("error", f"STOP: {words_for(error)}")
 
     def _stop_all(self, running: tuple[Job, ...]) -> None:
         """Make the bench safe until a round began after the last job had ended: none can light anything."""

@@ -8,6 +8,7 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobContext, JobState
+from gui.operator_request import OperatorRequest
 from gui.session import BenchSession
 
 WAIT_MS = 60_000
@@ -58,6 +59,41 @@ def test_stop_goes_on_until_a_late_job_has_ended(
         go_on.set()
     assert job.is_over
     assert not session.bench.source_lit
+
+
+def test_what_fails_in_the_midst_of_stop_keeps_nothing_from_being_safe(
+    qtbot: QtBot, session: BenchSession
+) -> None:
+    def broken() -> None:
+        raise OSError("the callback's own error")
+
+    def gone() -> None:
+        raise RuntimeError("the question is gone")
+
+    lines: list[str] = []
+    session.logged.connect(lambda _, text: lines.append(text))
+    requests: list[OperatorRequest] = []
+    session.asked.connect(requests.append)
+    goes_on, over = threading.Event(), threading.Event()
+
+    def first(context: JobContext) -> None:
+        context.on_cancel(broken)
+        context.on_cancel(over.set)
+        goes_on.set()
+        assert over.wait(WAIT_MS / 1000)
+        context.check()
+
+    job = session.device_job("with a broken callback", first, {"stage"})
+    asking = session.device_job("by hand", lambda _: session._ask("Please light the scene."), {"slm"})
+    qtbot.waitUntil(lambda: goes_on.is_set() and bool(requests), timeout=WAIT_MS)
+    requests[0].withdrawn = gone
+    session.bench.source_on()
+    with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
+        session.stop()
+    assert job.state is asking.state is JobState.CANCELLED
+    assert not session.bench.source_lit
+    qtbot.waitUntil(lambda: any("the callback's own error" in line for line in lines), timeout=WAIT_MS)
+    assert any("the question is gone" in line for line in lines)
 
 
 def test_a_device_that_never_answers_does_not_keep_the_bench_open(
