@@ -12,20 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.verdict.cases import FEATURES, Cases, cases_of, group_of, place_of
+from recon.verdict.collect import DIVERGED
 from recon.verdict.evidence import Evidence
-from recon.verdict.verdict import Finding, Region, Verdict
+from recon.verdict.verdict import LOST, UNFINISHED, Finding, Region, Verdict
 
 Floats = npt.NDArray[np.float64]
 
 NEIGHBOURS = 16
 """Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 134,
 and with a tenth of failures allowed 2 of 165 (the mixed scenes, each judged by the cases of the others)."""
-RELIABLE, LOST = 0.05, 0.5
-"""Shares of failures among them up to which a reconstruction is inside, and from which it is outside."""
+RELIABLE = 0.05
+"""Share of failures among them up to which a reconstruction is inside."""
 FAR = 2.0
 """Distance beyond which the nearest case is no witness: a factor of about seven in one number."""
-UNFINISHED = 10.0
-"""``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
 FEWEST = 40
 """Cases that a group needs to be judged by."""
 
@@ -115,7 +114,7 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
         f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)}; "
         f"{mixed} mixed scenes)"
     )
-    findings = _findings(cases, place, numbers, share)
+    findings = _unfinished_first(_findings(cases, place, numbers, share), numbers)
     return Verdict(region, method, share, findings, numbers, basis)
 
 
@@ -161,3 +160,19 @@ def _findings(cases: Cases, place: Floats, numbers: Mapping[str, float], share: 
         if gain > 0:
             findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
     return tuple(sorted(findings, key=lambda f: -f.gain))
+
+
+def _unfinished_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Return the findings, first that the picture had hardly begun to settle where that is so.
+
+    It alone puts a reconstruction outside, whatever similar cases say; and what else was measured of such a
+    picture, first of all what the model leaves unexplained, may well come of it.
+    """
+    if numbers["unsettled"] < UNFINISHED:
+        return findings
+    _, words, help_ = STRESSES["unsettled"]
+    if numbers["unsettled"] >= DIVERGED:
+        help_ += ", or another method if they make it worse"
+    gain = next((f.gain for f in findings if f.stress == "unsettled"), 0.0)
+    first = Finding("unsettled", numbers["unsettled"], gain, words, help_)
+    return (first, *(f for f in findings if f.stress != "unsettled"))

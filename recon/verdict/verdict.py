@@ -24,6 +24,12 @@ WORDS: Mapping[Region, str] = {
     Region.UNKNOWN: "not judged: the stability maps hold no case of {method} that is much like this one",
 }
 
+UNFINISHED = 10.0
+"""``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
+FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had hardly begun to settle"
+LOST = 0.5
+"""Share of failures among similar cases from which a reconstruction is outside."""
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
@@ -78,7 +84,10 @@ class Verdict:
     def sentences(self) -> tuple[str, ...]:
         """The verdict in plain words: what, which stress limits it, what would help."""
         said = [WORDS[self.region].format(method=self.method)]
-        if self.failing is not None:
+        unfinished = self.evidence.get("unsettled", 0.0) >= UNFINISHED
+        if unfinished and self.failing is not None and self.failing < LOST:
+            said = [FIRST_ITERATIONS]  # that is why; the share of similar cases would contradict it
+        elif self.failing is not None:
             said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
         if self.region in (Region.NEAR, Region.OUTSIDE):
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]

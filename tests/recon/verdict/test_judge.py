@@ -74,6 +74,26 @@ def test_what_no_map_saw_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
 
 
+def test_a_picture_that_had_hardly_begun_to_settle_is_said_to_be_just_that() -> None:
+    # No similar case failed: their share would contradict the verdict, and nothing else explains it.
+    good = judge.verdict_on(evidence(30, 0.03, unsettled=20), "admm tv")
+    assert good.failing is not None
+    assert good.failing < 0.05
+    assert len(good.sentences) == 2
+    assert "hardly begun to settle" in good.sentences[0]
+    assert "%" not in good.sentences[0]
+    assert "More iterations" in good.sentences[1]
+    # Similar cases failed as well: what remains unexplained may come of too few iterations, named first.
+    bad = judge.verdict_on(evidence(30, 0.8, unsettled=20), "admm tv")
+    assert bad.region is Region.OUTSIDE
+    assert [f.stress for f in bad.findings[:2]] == ["unsettled", "unexplained"]
+    assert "% failed" in bad.sentences[0]
+    assert "More iterations" in bad.sentences[1]
+    assert len([f for f in bad.findings if f.stress == "unsettled"]) == 1
+    diverged = judge.verdict_on(evidence(30, 0.8, unsettled=1e3), "fista tv")
+    assert "another method" in diverged.sentences[1]
+
+
 def test_a_psf_that_repeats_itself_is_judged_by_those_that_did(monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = evidence(30, 0.03, ambiguity=0.82).as_json()
     lost = [
