@@ -135,6 +135,12 @@ def prepare_patterned(
         patterns = _patterns_from_file(request.sheet, frames.shape)
     else:
         sheet = Run.open(request.sheet)
+        if sheet.path.samefile(run.path):
+            raise FileError(
+                request.sheet,
+                "is the scene's own run: its patterns would be the scene's.",
+                "Run the same plan with a plain white sheet in the scene's place, and give that run.",
+            )
         _require_same_plan(run, sheet)
         warnings += _saturation(sheet)
         patterns = _patterns_of(_frames(sheet, calibration, request.binning), job, request, told)

@@ -143,6 +143,7 @@ def test_what_does_not_belong_together_is_refused(files: tuple[Path, Path, Path]
 
     other = write_run(tmp_path / "other", np.ones(SHAPE), groups=[[0], [2], [3]])
     assert "same groups" in refused(other)
+    assert "scene's own run" in refused(run)
     recording = write_recording(tmp_path / "recording", {0: np.ones(SHAPE)})
     assert "no run of active illumination" in refused(sheet, recording)
     dark = write_run(tmp_path / "dark", np.zeros(SHAPE))
