@@ -42,6 +42,10 @@ class FileError(BenchError):
         self.remedy = remedy
         super().__init__(f"{path}: {problem}" + (f" {remedy}" if remedy else ""))
 
+    def __reduce__(self) -> tuple[type[FileError], tuple[Path, str, str]]:
+        """Travel whole from a worker process: an exception is otherwise made again from its text alone."""
+        return type(self), (self.path, self.problem, self.remedy)
+
 
 class SettingsError(BenchError):
     """Settings that make no sense: every mistake at once, each with the name of its setting.

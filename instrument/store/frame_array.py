@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.atomic import sync_folder
+from instrument.errors import FileError
 from instrument.store.durable import SyncPool, make_folder, write_json
 
 Image = npt.NDArray[Any]
@@ -165,13 +166,18 @@ class FrameArray:
         ------
         FileNotFoundError
             When the frame is not there.
-        ValueError
+        FileError
             When its file has the wrong size.
         """
         path = self.chunk_path(index)
         flat = np.fromfile(path, dtype=self.dtype.newbyteorder("<"))
         if flat.size != int(np.prod(self.frame_shape)):
-            raise ValueError(f"{path}: {flat.nbytes} bytes; a frame {self.frame_shape} has more or fewer.")
+            right = int(np.prod(self.frame_shape)) * self.dtype.itemsize
+            raise FileError(
+                path,
+                f"has {path.stat().st_size} bytes; frame {index} takes {right}: it is damaged.",
+                "diffuserbench verify RUN names every damaged frame.",
+            )
         flat = flat.astype(self.dtype, copy=False)
         if self.is_colour:
             height, width, channels = self.frame_shape

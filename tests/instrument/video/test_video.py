@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
+import shutil
 import signal
 import threading
 import time
@@ -189,6 +191,27 @@ def test_other_settings_do_not_go_on_and_finished_videos_stay(
     assert not prepare_video(request(recording, tmp_path, warm_iterations=7), force=True).resumed
     with pytest.raises(FileError, match="exists"):
         prepare_video(request(recording, video))
+
+
+def test_a_damaged_frame_is_named_in_a_sentence(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "recording"
+    shutil.copytree(recording, run)
+    chunk = run / "frames.ome.zarr" / "0" / "c" / "6" / "0" / "0"
+    os.truncate(chunk, 1000)
+    psf, out = str(recording.parent / "psf.npy"), str(tmp_path / "v.ome.zarr")
+    given = ["--psf", psf, "--dark", "20", "--bin", "1", "--iterations", "2", "--block", "4", "--out", out]
+    assert main(["reconstruct", str(run), "--video", *given]) == 2
+    said = capsys.readouterr().err
+    assert "has 1000 bytes; frame 6 takes 4160: it is damaged" in said
+    assert "Traceback" not in said
+
+
+def test_a_file_error_of_a_worker_process_arrives_whole() -> None:
+    error = FileError("a.npy", "is damaged.", "Mend it.")
+    arrived = pickle.loads(pickle.dumps(error))
+    assert (type(arrived), str(arrived), arrived.path) == (FileError, str(error), error.path)
 
 
 def test_force_begins_anew_whatever_there_is(recording: Path, tmp_path: Path) -> None:
