@@ -329,6 +329,14 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
                 "Give the same as then to go on with it, or --force to begin anew.",
             )
         raise FileError(request.out, "exists.", "Choose another name with --out, or --force to replace it.")
+    beside = (request.film_path, request.record_path) if request.film else (request.record_path,)
+    for other in () if force else beside:
+        if other.exists():
+            raise FileError(
+                other,
+                "exists, and would be replaced by what goes with the video.",
+                "Choose another name with --out, or --force to replace it.",
+            )
     for old in (folder, request.out):
         if old.exists():
             shutil.rmtree(old)

@@ -193,6 +193,24 @@ def test_other_settings_do_not_go_on_and_finished_videos_stay(
         prepare_video(request(recording, video))
 
 
+@pytest.mark.parametrize("name", ["v.mp4", "v.json"])
+def test_files_beside_a_new_video_stay(recording: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FileError, match=f"{name}: exists"):
+        prepare_video(request(recording, tmp_path))
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+    assert not prepare_video(request(recording, tmp_path), force=True).resumed
+
+
+def test_a_film_that_is_not_written_may_be_there(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "v.mp4").write_text("mine")
+    prepared = prepare_video(request(recording, tmp_path, film=False))
+    prepared.request.film_path.unlink()
+    prepared.request.record_path.write_text("{}")  # as when finishing was cut off
+    assert prepare_video(request(recording, tmp_path, film=False)).resumed
+
+
 def test_a_damaged_frame_is_named_in_a_sentence(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
