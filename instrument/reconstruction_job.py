@@ -307,14 +307,27 @@ def job_with(
 def refocused(job: Job, z_um: float) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
 
-    Where the calibration has the depth, or does not know its depths or the distance from diffuser to sensor,
-    the job is returned as it is: the reconstruction then takes the nearest PSF.
+    Where the calibration has the depth the job is returned as it is. Where depths, or the distance from
+    diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
+    reconstruction takes the PSF as it is, or the nearest one.
+
+    Raises
+    ------
+    BenchError
+        When ``z_um`` is no distance.
     """
+    if not 0 < z_um < np.inf:
+        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
     calibration = job.calibration
     z = calibration.source_positions_um[:, 2]
-    known = calibration.geometry.diffuser_distance_mm is not None and bool((z > 0).all())
-    if not (known and z_um > 0):
-        return job
+    if not bool((z > 0).all()):
+        return _as_measured(job, z_um, "at what depth it was measured is not known")
+    if calibration.geometry.diffuser_distance_mm is None:
+        if np.isclose(z, z_um).any():
+            return job
+        return _as_measured(
+            job, z_um, "the diffuser's distance from the sensor is not known; the nearest is taken"
+        )
     calibration, made = at_depth(calibration, z_um)
     if made is None:
         return job
@@ -332,6 +345,13 @@ def refocused(job: Job, z_um: float) -> Job:
             },
         },
     )
+
+
+def _as_measured(job: Job, z_um: float, why: str) -> Job:
+    """Return the job with a note that its PSF was not refocused."""
+    said = f"not refocused to {z_um / 1e3:g} mm: {why}"
+    read = job.notes.get("PSF")
+    return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})
 
 
 def find_calibration(folder: Path) -> Path:

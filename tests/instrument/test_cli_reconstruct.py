@@ -404,3 +404,29 @@ def count_runs(line: npt.NDArray[np.bool_]) -> int:
 def test_every_method_and_prior_is_on_offer() -> None:
     assert [m.value for m in Method] == list(method_names())
     assert [p.value for p in PriorName] == list(PRIORS)
+
+
+@pytest.mark.usefixtures("here")
+def test_a_psf_image_is_said_not_to_be_refocused(capsys: pytest.CaptureFixture[str]) -> None:
+    words = "reconstruct --psf psf.tif --image raw.tif --method wiener --out out.tif".split()
+    assert main([*words, "--z-mm", "40"]) == 0
+    assert "not refocused to 40 mm" in capsys.readouterr().out
+    assert main([*words, "--force"]) == 0
+    assert "refocused" not in capsys.readouterr().out
+    for z_mm in ("-4", "0", "nan", "inf"):
+        assert main([*words, "--force", "--z-mm", z_mm]) == 2
+        assert "distance must be above 0 mm" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("here")
+def test_without_the_diffusers_distance_the_nearest_psf_is_said_to_be_taken(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    psfs = np.stack([PSF, np.roll(PSF, 1, axis=0)])[:, None].astype(np.float32)
+    places = np.array([[0, 0, 20_000], [0, 0, 40_000]], float)
+    save_calibration(Calibration(psfs, places), Path("measured"))
+    words = "reconstruct --calibration measured --image raw.tif --method wiener --force".split()
+    assert main([*words, "--out", "out.tif", "--z-mm", "30"]) == 0
+    assert "not refocused to 30 mm" in capsys.readouterr().out
+    assert main([*words, "--out", "out.tif", "--z-mm", "40"]) == 0
+    assert "refocused" not in capsys.readouterr().out
