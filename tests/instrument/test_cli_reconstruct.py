@@ -408,7 +408,8 @@ def test_every_method_and_prior_is_on_offer() -> None:
 
 @pytest.mark.usefixtures("here")
 def test_a_psf_image_is_said_not_to_be_refocused(capsys: pytest.CaptureFixture[str]) -> None:
-    words = "reconstruct --psf psf.tif --image raw.tif --method wiener --out out.tif".split()
+    words = ["reconstruct", "--psf", "psf.tif", "--image", "raw.tif", "--method", "wiener"]
+    words += ["--out", "out.tif"]
     assert main([*words, "--z-mm", "40"]) == 0
     assert "not refocused to 40 mm" in capsys.readouterr().out
     assert main([*words, "--force"]) == 0
@@ -425,7 +426,8 @@ def test_without_the_diffusers_distance_the_nearest_psf_is_said_to_be_taken(
     psfs = np.stack([PSF, np.roll(PSF, 1, axis=0)])[:, None].astype(np.float32)
     places = np.array([[0, 0, 20_000], [0, 0, 40_000]], float)
     save_calibration(Calibration(psfs, places), Path("measured"))
-    words = "reconstruct --calibration measured --image raw.tif --method wiener --force".split()
+    words = ["reconstruct", "--calibration", "measured", "--image", "raw.tif", "--method", "wiener"]
+    words += ["--force"]
     assert main([*words, "--out", "out.tif", "--z-mm", "30"]) == 0
     assert "not refocused to 30 mm" in capsys.readouterr().out
     assert main([*words, "--out", "out.tif", "--z-mm", "40"]) == 0
