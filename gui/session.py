@@ -452,6 +452,8 @@ class BenchSession(QObject):
             self._stop_late(*value)
         elif what == "closed":
             self._ended(value)
+        elif what == "ask" and (self._stopping or self._closing):
+            value.refuse()  # sent before STOP was heard of: nobody may wait for its answer
         elif what == "ask":
             self._requests.append(value)
             value.answered = lambda: self._requests.remove(value)

@@ -96,6 +96,27 @@ def test_what_fails_in_the_midst_of_stop_keeps_nothing_from_being_safe(
     assert any("the question is gone" in line for line in lines)
 
 
+@pytest.mark.parametrize("end", ["stop", "close"])
+def test_what_is_asked_just_after_the_end_is_refused_and_not_shown(
+    qtbot: QtBot, session: BenchSession, end: str
+) -> None:
+    asked: list[OperatorRequest] = []
+    session.asked.connect(asked.append)
+    ended = threading.Event()
+
+    def work(_: JobContext) -> None:
+        assert ended.wait(WAIT_MS / 1000)
+        session._ask("Please light the scene.")
+
+    job = session.device_job("by hand", work, {"slm"})
+    qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
+    getattr(session, end)()
+    ended.set()
+    qtbot.waitUntil(lambda: job.is_over or bool(asked), timeout=WAIT_MS)
+    assert not asked
+    assert job.state is JobState.CANCELLED
+
+
 def test_a_device_that_never_answers_does_not_keep_the_bench_open(
     qtbot: QtBot, session: BenchSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
