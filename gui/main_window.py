@@ -247,7 +247,8 @@ class MainWindow(QMainWindow):
     def _on_live_panel(self, what: str) -> None:
         """Do what the live view offers, whatever panel is in front, with what is being typed there."""
         panel, typed = self.panel("live"), QApplication.focusWidget()
-        if isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
+        ends = what == "record" and getattr(panel, "is_recording", False)  # no number keeps it from ending
+        if not ends and isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
             return  # refused where it stands
         getattr(panel, what)()
 

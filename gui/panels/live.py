@@ -428,6 +428,11 @@ class LivePanel(Panel):
         self.record_bar.toggle()
 
     @property
+    def is_recording(self) -> bool:
+        """Whether a recording runs, which ``record`` would end."""
+        return self.record_bar.job is not None
+
+    @property
     def light(self) -> Light:
         """What is lit, as far as the program knows."""
         return light_of(self.session.bench)

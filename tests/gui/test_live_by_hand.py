@@ -68,6 +68,18 @@ def test_a_wrong_length_is_refused_and_nothing_is_recorded(
     assert live.record_bar.job is None
 
 
+def test_a_recording_is_ended_by_its_key_whatever_number_is_wrong(qtbot: QtBot, live: LivePanel) -> None:
+    finished: list[Path] = []
+    live.session.run_finished.connect(finished.append)
+    _type_only(qtbot, live.record_bar.seconds, "600")
+    qtbot.keyClick(live.record_bar.seconds, Qt.Key.Key_R, CTRL)
+    qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
+    _type_only(qtbot, live.average, "0")
+    qtbot.keyClick(live.average, Qt.Key.Key_R, CTRL)
+    qtbot.waitUntil(lambda: bool(finished), timeout=WAIT_MS)
+    assert live.average.text() == "0"
+
+
 def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: QtBot, live: LivePanel) -> None:
     _type_only(qtbot, live.form.exposure, "7.5")
     qtbot.keyClick(live.form.exposure, Qt.Key.Key_K, CTRL)
