@@ -293,8 +293,9 @@ class StagePanel(Panel):
         job = self._start(words, {name: value}, relative=False)
         if job is not None:
             job.failed.connect(row.target.refuse)
-            # Stopped on its way: the field shows where it is, and the same target can be entered again.
-            job.cancelled.connect(lambda _: row.target.set_value(None, overwrite=True))
+            # Stopped on its way: the field shows where it is, unless the next target is being typed there
+            # already, and the same target can be entered again.
+            job.cancelled.connect(lambda _: row.target.set_value(None))
 
     def _start(self, title: str, where: dict[str, float], *, relative: bool) -> Job | None:
         stage = self.session.bench.stage

@@ -66,3 +66,21 @@ def test_a_target_can_be_entered_again_after_stop(
         qtbot.waitUntil(
             lambda here=here: target.value is not None and abs(target.value - here) < 1, timeout=WAIT_MS
         )
+
+
+def test_stop_leaves_the_target_that_is_being_typed(
+    qtbot: QtBot, window: MainWindow, stage: StagePanel
+) -> None:
+    device = window.session.bench.stage
+    assert device is not None
+    target = stage.rows["z_um"].target
+    _type(qtbot, target, "290000")
+    qtbot.keyClick(target, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: device.is_moving, timeout=WAIT_MS)
+    _type(qtbot, target, "12000")
+    with qtbot.waitSignal(window.session.stopped, timeout=WAIT_MS):
+        qtbot.keyClick(target, Qt.Key.Key_Escape)
+    qtbot.waitUntil(lambda: stage.state.text() == "At rest, homed", timeout=WAIT_MS)
+    assert target.text() == "12000"
+    qtbot.keyClick(target, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: device.position()["z_um"] == 12_000, timeout=WAIT_MS)
