@@ -315,6 +315,7 @@ def _digest(camera: VideoCamera, reduction: Reduction) -> str:
 
 def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob | None, bool]:
     """Return the job begun before for the same plan; none with ``force``, which removes what there is."""
+    _require_spared(request)
     folder = VideoJob.folder_of(request.out)
     begun = None
     if not force and (folder / "job.json").exists() and request.out.exists():
@@ -341,6 +342,26 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
         if old.exists():
             shutil.rmtree(old)
     return None, False
+
+
+def _require_spared(request: VideoRequest) -> None:
+    """Refuse an output that is, holds or is a part of what is read: ``--force`` would delete measurements.
+
+    A video may lie in the folder of its run; a record beside it tells it from the run's own frames.
+    """
+    out = request.out.resolve()
+    ours = request.record_path.exists() or VideoJob.folder_of(request.out).exists()
+    for read in (request.run, request.psf, request.calibration):
+        if read is None:
+            continue
+        source = read.resolve()
+        part = source in out.parents and out.exists() and not ours
+        if source == out or out in source.parents or part:
+            raise FileError(
+                request.out,
+                f"cannot be replaced by the video: it is read, as {read}.",
+                "Choose another --out.",
+            )
 
 
 def _difference(plan: VideoPlan, begun: VideoPlan) -> str:

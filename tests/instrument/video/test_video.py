@@ -203,6 +203,16 @@ def test_files_beside_a_new_video_stay(recording: Path, tmp_path: Path, name: st
     assert not prepare_video(request(recording, tmp_path), force=True).resumed
 
 
+def test_force_never_replaces_what_is_read(recording: Path, tmp_path: Path) -> None:
+    frames = recording / "frames.ome.zarr"
+    before = sorted(frames.rglob("*"))
+    with pytest.raises(FileError, match="it is read"):
+        prepare_video(request(recording, tmp_path, out=frames), force=True)
+    assert sorted(frames.rglob("*")) == before
+    assert not prepare_video(request(recording, recording), force=True).resumed
+    assert prepare_video(request(recording, recording)).resumed
+
+
 def test_a_film_that_is_not_written_may_be_there(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "v.mp4").write_text("mine")
     prepared = prepare_video(request(recording, tmp_path, film=False))
