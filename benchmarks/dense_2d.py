@@ -210,7 +210,7 @@ def report(args: argparse.Namespace, curves: dict, truth, best) -> None:
     for axis, (title, image) in zip(axes[1:], (("truth", truth), ("reconstruction", best)), strict=True):
         axis.imshow(image, cmap="gray", vmax=np.percentile(truth, 99.5), vmin=0)
         axis.set(title=title, xticks=(), yticks=())
-    figure.savefig(args.out / "dense-2d.png", dpi=100)
+    figure.savefig(args.out / "dense-2d.png", dpi=100, bbox_inches="tight")
     print(f"curves and picture in {args.out}")
 
 
