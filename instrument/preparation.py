@@ -19,6 +19,8 @@ FloatImage = npt.NDArray[np.float32]
 
 AUTO_PIXELS = 500_000
 """Automatic binning goes on until the image has at most this many pixels."""
+LEAST_BINNED = 8
+"""Pixels along each side that binning must leave: fewer hold no pattern to decode."""
 SATURATED_LIGHT_LIMIT = 0.01
 """A PSF with a larger share of its light in saturated pixels is refused: its true shape is unknown."""
 
@@ -269,10 +271,24 @@ def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
 
 
 def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:
-    """Subtract the dark level, cut the window out, bin; float32, negative values kept."""
+    """Subtract the dark level, cut the window out, bin; float32, negative values kept.
+
+    Raises
+    ------
+    BenchError
+        When binning leaves less than :data:`LEAST_BINNED` pixels along a side.
+    """
     if isinstance(dark, np.ndarray) and dark.ndim < pixels.ndim:
         dark = dark[..., None]
     image: FloatImage = np.subtract(pixels, dark, dtype=np.float32)
     if crop is not None:
         image = image[crop.slices(image.shape[:2])]
-    return bin_image(image, binning)
+    binned = bin_image(image, binning)
+    if binning > 1 and min(binned.shape[:2]) < LEAST_BINNED:
+        most = max(min(image.shape[:2]) // LEAST_BINNED, 1)
+        raise BenchError(
+            f"--bin {binning} leaves {binned.shape[0]} x {binned.shape[1]} of {image.shape[0]} x "
+            f"{image.shape[1]} pixels; a picture takes {LEAST_BINNED} or more along each side. "
+            f"Take --bin {most}{' or less' if most > 1 else ''}."
+        )
+    return binned

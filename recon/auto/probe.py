@@ -172,7 +172,8 @@ def resolution_px(psf: Array) -> float:
     for axis in (0, 1):
         profile = correlation.profile(axis)
         quarter = len(profile) // 4
-        base = float(np.median(profile[quarter:-quarter]))  # farther out the images hardly overlap
+        # Farther out the images hardly overlap.
+        base = float(np.median(profile[quarter : len(profile) - quarter]))
         widths.append(2 * correlation.half_width(axis, 0.5 * (1 + base)))
     return float(np.sqrt(widths[0] * widths[1]))
 

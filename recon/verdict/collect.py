@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.checks import as_channels, saturated_share
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
 from recon.verdict.evidence import Evidence, averaged, measure
 
 Array = npt.NDArray[Any]
@@ -75,10 +75,17 @@ def not_judged(error: Exception) -> str:
 
 
 def unsettled_by(history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float) -> float:
-    """Return the last change over ten times the tolerance, where a limit ended the run; else 0."""
+    """Return the last change over ten times the tolerance, where a limit ended the run; else 0.
+
+    A run that was ended before it could be seen to settle (:class:`~recon.solvers.stopping.StoppingRules`
+    ask for several calm iterations in a row) counts as if everything had changed: many solvers do not move
+    at all in their first iteration.
+    """
     if reason is StopReason.NOT_FINITE:
         return DIVERGED
     if not history or tolerance <= 0 or reason not in LIMITS:
         return 0.0
     change = history[-1].change
+    if len(history) < StoppingRules().patience:
+        change = max(change, 1.0)
     return min(float(change / (10 * tolerance)), DIVERGED) if np.isfinite(change) else DIVERGED

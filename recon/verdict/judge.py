@@ -14,7 +14,7 @@ import numpy.typing as npt
 from recon.verdict.cases import FEATURES, Cases, cases_of, group_of, place_of
 from recon.verdict.collect import DIVERGED
 from recon.verdict.evidence import Evidence
-from recon.verdict.verdict import LOST, UNFINISHED, Finding, Region, Verdict
+from recon.verdict.verdict import LOST, NOISELESS, UNFINISHED, Finding, Region, Verdict
 
 Floats = npt.NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
     share, nearest = failing_share(cases, place)
     if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all() or share >= LOST:
         region = Region.OUTSIDE
-    elif nearest > FAR:
+    elif nearest > FAR or numbers["signal"] >= NOISELESS:
         region = Region.UNKNOWN
     else:
         region = Region.INSIDE if share <= RELIABLE else Region.NEAR

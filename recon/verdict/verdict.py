@@ -27,6 +27,12 @@ WORDS: Mapping[Region, str] = {
 UNFINISHED = 10.0
 """``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
 FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had hardly begun to settle"
+NOISELESS = 1e3
+"""``signal`` from which the data are no photograph's: a full well of 100,000 electrons gives some 300."""
+COMPUTED = (
+    "not judged: the measurement has next to no noise, as computed images have, and verdicts are made from "
+    "photographs"
+)
 LOST = 0.5
 """Share of failures among similar cases from which a reconstruction is outside."""
 
@@ -87,7 +93,9 @@ class Verdict:
         unfinished = self.evidence.get("unsettled", 0.0) >= UNFINISHED
         if unfinished and self.failing is not None and self.failing < LOST:
             said = [FIRST_ITERATIONS]  # that is why; the share of similar cases would contradict it
-        elif self.failing is not None:
+        elif self.region is Region.UNKNOWN and self.evidence.get("signal", 0.0) >= NOISELESS:
+            said = [COMPUTED]
+        elif self.failing is not None and self.region is not Region.UNKNOWN:
             said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
         if self.region in (Region.NEAR, Region.OUTSIDE):
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]

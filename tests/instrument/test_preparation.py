@@ -75,6 +75,13 @@ def test_binning_is_the_mean_and_leaves_out_the_rest() -> None:
         bin_image(image, 6)
 
 
+def test_binning_leaves_something_to_decode() -> None:
+    assert reduce(np.ones((64, 80)), 0.0, None, 8).shape == (8, 10)
+    with pytest.raises(BenchError, match=r"--bin 30 leaves 2 x 2 of 64 x 80 pixels.*Take --bin 8 or less"):
+        reduce(np.ones((64, 80)), 0.0, None, 30)
+    assert reduce(np.ones((4, 4)), 0.0, None, 1).shape == (4, 4)
+
+
 @pytest.mark.parametrize(("shape", "factor"), [((480, 640), 1), ((1200, 1600), 2), ((2160, 2560), 4)])
 def test_automatic_binning(shape: tuple[int, int], factor: int) -> None:
     assert auto_binning(shape) == factor
@@ -82,7 +89,8 @@ def test_automatic_binning(shape: tuple[int, int], factor: int) -> None:
 
 def test_reduce_subtracts_first_and_keeps_negative_values() -> None:
     image = np.array([[10, 30], [30, 50], [9, 9]], np.uint16)
-    assert reduce(image, 40.0, Crop(0, 0, 2, 2), 2).tolist() == [[-10.0]]
+    tiled = np.vstack([np.tile(image[:2], (8, 8)), np.full((1, 16), 9, np.uint16)])
+    assert reduce(tiled, 40.0, Crop(0, 0, 16, 16), 2).tolist() == [[-10.0] * 8] * 8
     dark = np.array([[10, 30], [30, 50], [0, 0]], np.float32)
     assert reduce(image, dark, Crop(0, 0, 2, 2), 1).tolist() == [[0, 0], [0, 0]]
 

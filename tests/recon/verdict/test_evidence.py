@@ -12,6 +12,7 @@ from recon.scenes import SceneSpec, make_scene
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import _dimming, _similarity, measure
+from recon.verdict.verdict import Region
 from recon.volume.channel import Scaled
 from recon.volume.light import plane_gains
 from recon.volume.model import Depths
@@ -74,11 +75,22 @@ def test_a_regular_array_is_ambiguous_and_random_lenslets_are_not() -> None:
 
 
 def test_only_a_limit_leaves_a_run_unsettled() -> None:
-    history = (IterationRecord(9, 1.0, change=0.05),)
+    history = tuple(IterationRecord(k, 1.0, change=0.05) for k in (7, 8, 9))
     assert unsettled_by(history, StopReason.ITERATIONS, 1e-3) == pytest.approx(5)
     assert unsettled_by(history, StopReason.CONVERGED, 1e-3) == 0
     assert unsettled_by((), None, 1e-3) == 0
     assert unsettled_by(history, StopReason.NOT_FINITE, 1e-3) == DIVERGED
+
+
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_a_run_of_one_iteration_is_named_unfinished(iterations: int) -> None:
+    """ADMM does not move in its first iteration: that is no sign of having settled, nor of little light."""
+    scene = make_scene(SceneSpec("sparse-picture", size=40))
+    result = reconstruct(scene.measurement, scene.calibration, iterations=iterations)
+    assert result.verdict is not None
+    assert result.verdict.region is Region.OUTSIDE
+    assert result.verdict.findings[0].stress == "unsettled"
+    assert "More iterations" in result.verdict.sentences[1]
 
 
 def test_every_reconstruction_carries_its_evidence() -> None:

@@ -70,8 +70,19 @@ def test_what_no_map_saw_is_not_called_reliable() -> None:
     strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
     assert strange.region is Region.UNKNOWN
     # More light than any case had is as good as the most.
-    assert judge.verdict_on(evidence(5000, 0.03), "admm tv").region is Region.INSIDE
+    assert judge.verdict_on(evidence(500, 0.03), "admm tv").region is Region.INSIDE
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
+
+
+def test_data_without_noise_are_no_photograph() -> None:
+    """Numbers in units of the noise mean nothing there, good or bad."""
+    exact = judge.verdict_on(evidence(9e4, 0.03, load=5e-4), "admm tv")
+    assert exact.region is Region.UNKNOWN
+    assert len(exact.sentences) == 1
+    assert "next to no noise" in exact.sentences[0]
+    assert "%" not in exact.sentences[0]
+    # What is unlike all cases is not given those cases' share of failures.
+    assert "%" not in judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv").sentences[0]
 
 
 def test_a_picture_that_had_hardly_begun_to_settle_is_said_to_be_just_that() -> None:
