@@ -27,6 +27,7 @@ from instrument.volume_job import volume_job
 from recon.auto import Choice, Wishes, choose, choose_picture
 from recon.gpu.namespace import DEVICES, Device
 from recon.picture import reconstruct
+from recon.preparation import Precision
 from recon.result import Reconstruction
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
@@ -94,6 +95,8 @@ class Settings:
         As :func:`recon.reconstruct`. Without ``iterations`` and ``time_s`` a default count applies.
     wishes : recon.auto.Wishes or None
         With the model ``"auto"``: choices that are not to be left to the program.
+    precision : "float32", "float64" or None
+        Of the arithmetic; None: what ``"auto"`` chooses, else float32.
     """
 
     model: ModelName = "auto"
@@ -110,6 +113,13 @@ class Settings:
     stop_at_noise: bool = False
     mosaic: MosaicChoice = "auto"
     wishes: Wishes | None = None
+    precision: Precision | None = None
+
+    def exactness(self, *, all_chosen: bool) -> tuple[Wishes | None, Precision]:
+        """Return wishes and precision: where all is chosen, the precision is one of the wishes."""
+        if not all_chosen or self.precision is None:
+            return self.wishes, self.precision or "float32"
+        return replace(self.wishes or Wishes(), precision=self.precision), "float32"
 
     def limit(self, default: int) -> int | None:
         """Return the largest count of iterations: as given, or the default, or none where time is the end."""
@@ -221,6 +231,7 @@ class PictureRequest:
             When the input does not allow it.
         """
         given = self.settings
+        wishes, precision = given.exactness(all_chosen=self.nothing_chosen_by is None and keeper is None)
         return reconstruct(
             job.measurement,
             job.calibration,
@@ -235,7 +246,8 @@ class PictureRequest:
             erasures=None if job.valid is None else ~job.valid,
             tolerance=given.tolerance,
             stop_at_noise=given.stop_at_noise,
-            wishes=given.wishes,
+            wishes=wishes,
+            precision=precision,
             callback=watch,
             cancel=cancel,
             keeper=keeper,
@@ -251,7 +263,7 @@ class PictureRequest:
         """
         _require_choice("--explain", self.nothing_chosen_by)
         given = self.settings
-        wishes = given.wishes or Wishes()
+        wishes = given.exactness(all_chosen=True)[0] or Wishes()
         if wishes.tolerance is None:
             wishes = replace(wishes, tolerance=given.tolerance)
         return choose_picture(
@@ -340,6 +352,7 @@ class VolumeRequest:
     ) -> VolumeReconstruction:
         """Reconstruct what :meth:`prepare` returned; errors as :meth:`PictureRequest.solve`."""
         given = self.settings
+        wishes, precision = given.exactness(all_chosen=self.nothing_chosen_by is None and keeper is None)
         return reconstruct_volume(
             job.measurement,
             job.calibration,
@@ -357,7 +370,8 @@ class VolumeRequest:
             time_s=given.time_s,
             stop_at_noise=given.stop_at_noise,
             tolerance=given.tolerance,
-            wishes=given.wishes,
+            wishes=wishes,
+            precision=precision,
             callback=watch,
             cancel=cancel,
             keeper=keeper,
@@ -373,7 +387,7 @@ class VolumeRequest:
         """
         _require_choice("--explain", self.nothing_chosen_by)
         given = self.settings
-        wishes = given.wishes or Wishes()
+        wishes = given.exactness(all_chosen=True)[0] or Wishes()
         if wishes.background is None:
             asked = True if self.positive_background else self.estimate_background
             wishes = replace(wishes, background=asked)

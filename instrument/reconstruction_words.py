@@ -13,6 +13,7 @@ from instrument.reconstruction_job import DarkChoice, NoiseChoice
 from recon.auto import Wishes
 from recon.errors import InputError
 from recon.noise import NoiseModel
+from recon.preparation import PRECISIONS, Precision
 
 
 def parse_dark(text: str) -> DarkChoice:
@@ -81,6 +82,24 @@ def parse_noise(text: str | None) -> NoiseChoice:
             "in counts and counts per electron (2.1,0.13), or estimate."
         )
     return values[0] if len(values) == 1 else NoiseModel(*values)
+
+
+def parse_precision(text: str, wishes: Wishes | None) -> Precision | None:
+    """Read ``float32``, ``float64``, or ``auto`` (None).
+
+    Raises
+    ------
+    BenchError
+        When it is something else, or said twice.
+    """
+    if text == "auto":
+        return None
+    found = next((precision for precision in PRECISIONS if precision == text), None)
+    if found is None:
+        raise BenchError(f"--precision {text!r} is not known; choose one of auto, {', '.join(PRECISIONS)}.")
+    if wishes is not None and wishes.precision is not None:
+        raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
+    return found
 
 
 def parse_wishes(model: str, texts: Sequence[str]) -> Wishes | None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.methods import Problem, method_named, method_names
 from recon.noise import NoiseModel
-from recon.preparation import Field, Precision, Prepared, prepare
+from recon.preparation import Field, Precision, Prepared, prepare, require_precision
 from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
 from recon.result import Reconstruction
 from recon.solvers.base import Keeper, Outcome, Solver
@@ -128,8 +128,8 @@ def reconstruct(
     keeper : Keeper, optional
         Keeps the solver's state, and has it go on from what was kept of the same reconstruction.
     precision : "float32" or "float64"
-        Of the solver's arithmetic; the picture is float32. With float64, which takes twice the memory, the
-        model is one convolution: the others compute in float32.
+        Of the solver's arithmetic, with any model; the picture is float32. Float64 takes twice the memory.
+        With ``"auto"`` and float64 only the model is chosen; to have all chosen in float64, wish for it.
 
     Returns
     -------
@@ -144,6 +144,7 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
+    require_precision(precision)
     prevented = _no_choice(calibration, model, method, prior, initial, keeper, precision)
     if prevented is None:
         from recon.auto.picture import reconstruct_chosen
@@ -173,11 +174,6 @@ def reconstruct(
 
         require_choice(wishes, prevented)
     varying = _varying_model(calibration, z_um, model, method, prior, initial)
-    if varying is not None and varying[0] != "convolution" and precision != "float32":
-        raise InputError(
-            f"The {varying[0]} model computes in float32. For precision={precision!r} choose "
-            'model="convolution".'
-        )
     if varying is not None and varying[0] != "convolution":
         assert isinstance(calibration, Calibration)
         return reconstruct_varying(
@@ -200,6 +196,7 @@ def reconstruct(
             cancel=cancel,
             judged=judged,
             keeper=keeper,
+            precision=precision,
         )
     problem = prepare(
         measurement,
@@ -267,6 +264,7 @@ def reconstruct(
         provenance={
             "noise_deviation": [float(v) for v in problem.noise],
             "psf_z_um": problem.psf_z_um,
+            "precision": precision,
             "valid_share": float(problem.noise_norm**2 / problem.data.size),
         },
         verdict=verdict,

@@ -105,8 +105,7 @@ def prepare(
     precision: Precision = "float32",
 ) -> Prepared:
     """Check, subtract the background, scale. Parameters as :func:`recon.reconstruct`."""
-    if precision not in PRECISIONS:
-        raise InputError(f"The precision is {' or '.join(PRECISIONS)}, not {precision!r}.")
+    require_precision(precision)
     dtype = np.dtype(precision)
     data, valid, saturated = data_of(measurement, background, erasures)
     if isinstance(calibration, Calibration):
@@ -142,6 +141,12 @@ def prepare(
         psfs=psfs,
         valid=valid,
     )
+
+
+def require_precision(precision: str) -> None:
+    """Raise InputError for what is not one of :data:`PRECISIONS`."""
+    if precision not in PRECISIONS:
+        raise InputError(f"The precision is {' or '.join(PRECISIONS)}, not {precision!r}.")
 
 
 def data_of(

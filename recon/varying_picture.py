@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.errors import InputError
 from recon.noise import NoiseModel
-from recon.preparation import Field
+from recon.preparation import Field, Precision
 from recon.result import ImageGrid, Reconstruction
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
@@ -69,6 +69,7 @@ def reconstruct_varying(
     judged: bool = True,
     estimate_background: bool = False,
     extent: Extent | None = None,
+    precision: Precision = "float32",
 ) -> Reconstruction:
     """Reconstruct a picture with the local or low-rank model. Parameters as :func:`recon.reconstruct`."""
     if prior not in PRIORS:
@@ -102,6 +103,7 @@ def reconstruct_varying(
         judged=judged,
         keeper=keeper,
         stop_at_noise=stop_at_noise,
+        precision=precision,
     )
     z, pitch = float(result.grid.z_um[0]), float(result.grid.pitch_um[0])
     provenance: dict[str, Any] = {**result.provenance, "model": model, "model_reason": reason}

@@ -17,7 +17,7 @@ from instrument.images import read_image
 from instrument.reconstruction_job import Job
 from instrument.sample_images import SAMPLES
 from recon.chart.hologram import HologramProblem
-from recon.chart.reconstruction import ChartProblem
+from recon.chart.reconstruction import ChartProblem, left_out
 from recon.errors import InputError
 from recon.noise import NoiseModel
 from recon.scenes import make_scene
@@ -47,7 +47,8 @@ def problem_of_scene(family: str, size: int, seed: int) -> tuple[ChartProblem, d
         scene.noise,
         scene.truth,
     )
-    return problem, {"scene": family, "size": size, "seed": seed, "simulated": True}
+    about = {"scene": family, "size": size, "seed": seed, "simulated": True}
+    return problem, {**about, "left_out": list(left_out(problem))}
 
 
 def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[ChartProblem, dict[str, Any]]:
@@ -59,16 +60,15 @@ def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[Chart
         calibration = replace(calibration, psfs=calibration.psfs.mean(axis=1, keepdims=True), background=None)
     if not volume:
         calibration = one_depth(calibration, z_um)
-    return (
-        ChartProblem(
-            np.ascontiguousarray(measurement, np.float32),
-            calibration,
-            volume,
-            None if valid is None or valid.all() else np.logical_not(np.asarray(valid, bool)),
-            _noise_of_mean(job),
-        ),
-        {"inputs": dict(job.provenance), "simulated": job.simulated},
+    problem = ChartProblem(
+        np.ascontiguousarray(measurement, np.float32),
+        calibration,
+        volume,
+        None if valid is None or valid.all() else np.logical_not(np.asarray(valid, bool)),
+        _noise_of_mean(job),
     )
+    about = {"inputs": dict(job.provenance), "simulated": job.simulated}
+    return problem, {**about, "left_out": list(left_out(problem))}
 
 
 def _noise_of_mean(job: Job) -> NoiseModel | float | None:

@@ -294,6 +294,8 @@ def _tell(data: ChartData) -> None:
         for p in front:
             paid, value = getattr(p, cost.key), getattr(p, score.key)
             typer.echo(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
+    for why in data.about.get("left_out", ()):
+        typer.echo(f"{'Not charted':<12}{why}")
     for setting, why in data.failed.items():
         typer.echo(f"Warning: {setting} could not be run: {why}", err=True)
     if data.missing:

@@ -36,6 +36,7 @@ from instrument.cli.reconstruct_options import (
     OverTimeOption,
     PatternedOption,
     PositiveBackgroundOption,
+    PrecisionOption,
     PriorOption,
     PsfOption,
     RotateOption,
@@ -109,6 +110,7 @@ def reconstruct(
     rotate: RotateOption = Rotation.NONE,
     figure: FigureOption = None,
     device: DeviceOption = "cpu",
+    precision: PrecisionOption = "auto",
     force: ForceOption = False,
     allow_saturated: AllowSaturatedOption = False,
     mixed_depth: MixedDepthOption = False,
@@ -146,6 +148,7 @@ def reconstruct(
         stop_at_noise=stop_at_noise,
         bayer=bayer,
         choices=choices,
+        precision=precision,
     )
     if explain and model != "auto":
         raise BenchError(
@@ -181,6 +184,7 @@ def reconstruct(
             "--checkpoint": checkpoint is not None,
             "--figure": figure is not None,
             "--device": device != "cpu",
+            "--precision": precision != "auto",
             "--allow-saturated": allow_saturated,
             "--mixed-depth": mixed_depth,
             "--warm": warm is not None,
@@ -243,6 +247,7 @@ def reconstruct(
             "--scratch": scratch is not None,
             "--memory": memory_gib is not None,
             "--device": device != "cpu",
+            "--precision (videos are computed in float32)": precision != "auto",
             "--workers and --scheduler together": workers is not None and scheduler is not None,
         }
         if given := [option for option, is_given in no_videos.items() if is_given]:

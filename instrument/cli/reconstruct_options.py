@@ -16,6 +16,7 @@ from instrument.reconstruction_words import (
     parse_dark,
     parse_erasures,
     parse_noise,
+    parse_precision,
     parse_wishes,
 )
 
@@ -187,6 +188,15 @@ BackgroundOption = Annotated[
         "--background/--no-background",
         help="Of a volume: estimate a smooth background as well. Default: auto decides; other models: yes.",
         show_default=False,
+    ),
+]
+PrecisionOption = Annotated[
+    str,
+    typer.Option(
+        "--precision",
+        metavar="auto|float32|float64",
+        help="Of the arithmetic. auto: float32, unless --model auto finds that it would show. float64 takes "
+        "twice the memory and up to twice the time.",
     ),
 ]
 DistanceOption = Annotated[
@@ -381,6 +391,7 @@ def parse_settings(
     stop_at_noise: bool,
     bayer: str,
     choices: list[str] | None = None,
+    precision: str = "auto",
 ) -> Settings:
     """Understand the options that pictures and volumes share.
 
@@ -389,6 +400,7 @@ def parse_settings(
     BenchError
         Which option is not understood, and what is expected.
     """
+    wishes = parse_wishes(model, choices or [])
     return Settings(
         model=known_model(model),
         dark=parse_dark(dark),
@@ -403,5 +415,6 @@ def parse_settings(
         tolerance=tolerance,
         stop_at_noise=stop_at_noise,
         mosaic=mosaic_named(bayer),
-        wishes=parse_wishes(model, choices or []),
+        wishes=wishes,
+        precision=parse_precision(precision, wishes),
     )

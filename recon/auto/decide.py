@@ -48,11 +48,8 @@ def choose(
     background: npt.ArrayLike | None = None,
     erasures: npt.ArrayLike | None = None,
     wishes: Wishes | None = None,
-    picture: bool = False,
 ) -> Choice:
     """Choose what to reconstruct with. Parameters as :func:`recon.reconstruct_volume`.
-
-    ``picture``: of one depth, for which a picture's own solver serves where one convolution is enough.
 
     Returns
     -------
@@ -109,9 +106,8 @@ def choose(
     haze = is_stray(light.share) and not estimated and not given
     window, reach, field = field_of(depths, wishes, model, haze=haze)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
-    able = picture and model == "convolution" and not estimated
     side = max(data.shape[1:]) // int(binning.numbers["binning"])
-    precise = precision_of(wishes, usual, side, able=able)
+    precise = precision_of(wishes, usual, side)
     decisions = (
         model_decision(model, why, variation, depths, times, wishes),
         dropped,

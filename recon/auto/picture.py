@@ -54,7 +54,6 @@ def choose_picture(
         background=background,
         erasures=erasures,
         wishes=wishes,
-        picture=True,
     )
     return _by_plain_admm(choice, depth, wishes or Wishes()) if _is_plain(choice) else choice
 
@@ -170,6 +169,7 @@ def reconstruct_chosen(
             keeper=None,
             estimate_background=choice.background,
             extent=small.extent,
+            precision=choice.precision,
             **common,
         )
     return _whole(result, choice, small.picture(result.image), (*warnings, *small.warnings))

@@ -6,12 +6,12 @@ import numpy as np
 
 from recon.auto.choice import Decision, Option
 from recon.auto.wishes import Wishes
-from recon.errors import InputError
 from recon.stability.failure import PRECISION
 from recon.stability.shipped import shipped_maps
 
 METHOD = "admm tv"
-"""Of the map; it is ADMM that reconstructs what is chosen here."""
+"""Of the map; it is ADMM that reconstructs what is chosen here. The map is of pictures; those of volumes are
+ADMM as well, with sums as long for each of their planes."""
 DOUBLE_COST = 2.0
 """Time of float64 relative to float32: transforms move twice the bytes."""
 
@@ -34,7 +34,7 @@ def drift(iterations: int, pixels: int) -> float:
     return float(error.max() * np.exp(grown))
 
 
-def precision_of(wishes: Wishes, iterations: int, pixels: int, *, able: bool) -> Decision:
+def precision_of(wishes: Wishes, iterations: int, pixels: int) -> Decision:
     """Decide in which precision to compute.
 
     Parameters
@@ -42,13 +42,6 @@ def precision_of(wishes: Wishes, iterations: int, pixels: int, *, able: bool) ->
     wishes : Wishes
     iterations, pixels : int
         How many are usual, and the longest side.
-    able : bool
-        Whether there is a choice: pictures by one convolution.
-
-    Raises
-    ------
-    InputError
-        Where float64 is wished for and there is no choice.
     """
     expected = drift(iterations, pixels)
     asked = wishes.precision is not None
@@ -58,13 +51,6 @@ def precision_of(wishes: Wishes, iterations: int, pixels: int, *, able: bool) ->
     )
     loss = 0.0 - 10 * float(np.log10(1 + expected**2))
     numbers = {"expected_difference": expected}
-    if not able:
-        if wishes.precision == "float64":
-            raise InputError(
-                "precision=float64: volumes, PSFs that vary over the field and backgrounds are computed in "
-                "float32. Leave it out, or overrule that: model=convolution, background=off."
-            )
-        return Decision("precision", "float32", why, loss, None, None, asked, numbers)
     value = wishes.precision or ("float64" if expected > PRECISION else "float32")
     if value == "float64":
         down = Option("float32", 1 / DOUBLE_COST, loss)

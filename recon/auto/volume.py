@@ -94,6 +94,7 @@ def reconstruct_chosen_volume(
             time_s=None if time_s is None else time_s - spent,
             field=field,
             extent=small.extent,
+            precision=choice.precision,
             callback=None if callback is None else tell,
             cancel=cancel,
             **others,

@@ -49,7 +49,7 @@ PICTURE_METHODS: dict[str, tuple[str, ...]] = {
 }
 """Methods of a picture, each with the priors that it has a way for. Wiener's knows bounds only."""
 GPU_PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
-"""Those of ``admm-gpu``, in float32, where there is a GPU."""
+"""Those of ``admm-gpu``, where there is a GPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,11 +152,11 @@ class ChartProblem:
 def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
     """Return every applicable setting, the quick ones first.
 
-    Float64 is for the methods of a picture with one convolution; what varies over the field, or is a volume,
-    is computed in float32.
+    Which are not applicable, and why: :func:`left_out`.
     """
-    varies = len(problem.calibration.psfs) > len(members_of_depths(problem.calibration.source_positions_um))
-    models: tuple[ModelName, ...] = ("convolution", "lowrank", "local") if varies else ("convolution",)
+    models: tuple[ModelName, ...] = ("convolution",)
+    if _varies(problem):
+        models = ("convolution", "lowrank", "local")
     found: list[Setting] = []
     for binning in _binnings(problem):
         if not problem.volume:
@@ -167,9 +167,14 @@ def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
                 for prior in priors
             ]
             if _has_gpu():
-                found += [Setting("admm-gpu", "convolution", prior, binning) for prior in GPU_PRIORS]
+                found += [
+                    Setting("admm-gpu", "convolution", prior, binning, precision=precision)
+                    for precision in PRECISIONS
+                    for prior in GPU_PRIORS
+                ]
         found += [
-            Setting("volume", model, prior, binning, background)
+            Setting("volume", model, prior, binning, background, precision)
+            for precision in PRECISIONS
             for prior in VOLUME_PRIORS
             for model in models
             for background in (False, True)
@@ -177,6 +182,32 @@ def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
             if problem.volume or model != "convolution" or background
         ]
     return tuple(sorted(found, key=_cost))
+
+
+def left_out(problem: ChartProblem) -> tuple[str, ...]:
+    """Say which settings are not applicable to a problem, and why."""
+    found = []
+    if problem.volume:
+        found.append(
+            f"the methods {', '.join(PICTURE_METHODS)}: they are for one depth, volumes have their own"
+        )
+    else:
+        found.append("tv-haar but for fista, and any prior for wiener: these methods have no way for them")
+    if not _varies(problem):
+        found.append("the local and low-rank models: the calibration has one PSF a depth")
+    if _binnings(problem) == [1]:
+        small = problem.erasures is None
+        found.append(
+            f"binning: {'too few pixels would be left' if small else 'erased pixels cannot be averaged'}"
+        )
+    if not problem.volume and not _has_gpu():
+        found.append("admm-gpu: there is no GPU that CuPy can use")
+    return tuple(found)
+
+
+def _varies(problem: ChartProblem) -> bool:
+    positions = problem.calibration.source_positions_um
+    return len(positions) > len(members_of_depths(positions))
 
 
 @cache
@@ -264,6 +295,7 @@ def run_setting(
             estimate_background=setting.background,
             tolerance=1e-7,
             callback=note,
+            precision=setting.precision,
             **common,
         )
         return Curve(tuple(points), StopReason.TIME not in volume.stop_reasons)

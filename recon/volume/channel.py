@@ -24,6 +24,7 @@ from recon.operators import (
     low_rank,
 )
 from recon.operators.local_convolution import field_of
+from recon.preparation import Precision
 from recon.solvers import Solver
 from recon.volume import memory
 from recon.volume.douglas_rachford import DouglasRachford
@@ -80,6 +81,8 @@ class ChannelProblem:
         As :func:`recon.reconstruct_volume`.
     acceptance_px : float, optional
         As :class:`recon.volume.model.Extent`.
+    precision : "float32" or "float64"
+        Of operator and solver.
     """
 
     def __init__(
@@ -96,6 +99,7 @@ class ChannelProblem:
         scratch: Path | str | None = None,
         device: Device = "cpu",
         acceptance_px: float | None = None,
+        precision: Precision = "float32",
     ) -> None:
         # Before any work: what is missing for the device is said at once.
         self._namespace = array_namespace(device)
@@ -103,7 +107,8 @@ class ChannelProblem:
             raise InputError(
                 f"The {model} model runs on the cpu only. Choose the model convolution for the {device}."
             )
-        self.data = self._measured = scaled.data[channel : channel + 1]
+        self.dtype = np.dtype(precision)
+        self.data = self._measured = scaled.data[channel : channel + 1].astype(self.dtype, copy=False)
         self.weight = 0.0
         self._removed: BackgroundRemoval | None = None
         self.valid = scaled.valid[channel]
@@ -112,7 +117,9 @@ class ChannelProblem:
         self.drop_empty = drop_empty
         self._unit = scaled.energy / float(scaled.noise[channel])
         self._removal = (
-            BackgroundRemoval((1, *self.valid.shape), BACKGROUND_FREQUENCIES, self.valid) if smooth else None
+            BackgroundRemoval((1, *self.valid.shape), BACKGROUND_FREQUENCIES, self.valid, dtype=self.dtype)
+            if smooth
+            else None
         )
         self._limit = None if memory_gib is None else int(memory_gib * memory.GIB)
         self._storage = memory.Storage()
@@ -126,16 +133,26 @@ class ChannelProblem:
         else:
             fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in scaled.depths.fields]
             self.camera = self._varying(fields, model, acceptance_px)
-            self._central = Convolution3D(scaled.depths.central[:, own] * scale, (height, width))
+            self._central = Convolution3D(
+                scaled.depths.central[:, own] * scale, (height, width), dtype=self.dtype
+            )
 
     def _convolution(self, psfs: Array, scratch: Path | str | None) -> Convolution3D:
         height, width = self.valid.shape
         camera = Convolution3D(
-            psfs, (height, width), allocate=lambda shape, dtype: self._storage.zeros(shape, dtype)
+            psfs,
+            (height, width),
+            dtype=self.dtype,
+            allocate=lambda shape, dtype: self._storage.zeros(shape, dtype),
         )
         kind = "tv" if self.prior.startswith("tv") else "l1"
         self.plan = memory.plan(
-            kind, camera.domain_shape, psfs.size, len(psfs) * height * width, available=self._limit
+            kind,
+            camera.domain_shape,
+            psfs.size,
+            len(psfs) * height * width,
+            itemsize=self.dtype.itemsize,
+            available=self._limit,
         )
         if not self.plan.fits:
             self._storage = memory.Storage(memory.scratch_for(self.plan, scratch), self.plan.room)
@@ -152,12 +169,14 @@ class ChannelProblem:
             support = np.broadcast_to(off_axis <= acceptance_px, (len(fields), *field_shape))
         grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
         camera = (
-            local_convolution(fields, shape, support=support, grid_shape=grid)
+            local_convolution(fields, shape, support=support, grid_shape=grid, dtype=self.dtype)
             if model == "local"
-            else low_rank(fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid)
+            else low_rank(
+                fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid, dtype=self.dtype
+            )
         )
         volumes = 12 if self.prior.startswith("tv") else 6
-        size = 4 * int(np.prod(camera.domain_shape))
+        size = self.dtype.itemsize * int(np.prod(camera.domain_shape))
         available = memory.available_bytes() if self._limit is None else self._limit
         self.plan = memory.MemoryPlan(0, volumes * size + camera.nbytes, available)
         if not self.plan.fits:
@@ -184,13 +203,13 @@ class ChannelProblem:
         """The camera with everything that happens to its data."""
         operator: LinearOperator = self.camera
         if not self.valid.all():
-            operator = Erasures(self.valid, self.data.shape) @ operator
+            operator = Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
         return operator if self._removal is None else self._removal @ operator
 
     def start(self, volume: Array, window: tuple[slice, slice]) -> Array:
         """Place a volume in measurement units on the operator's grid."""
         _, n_z, height, width = self.camera.domain_shape
-        grid = np.zeros((1, n_z, height, width), np.float32)
+        grid = np.zeros((1, n_z, height, width), self.dtype)
         if grid[0][:, window[0], window[1]].shape != volume.shape:
             raise InputError(
                 f"The volume to start from is {volume.shape}; this measurement needs "
@@ -222,7 +241,7 @@ class ChannelProblem:
     def with_background(self, background: Array) -> Solver:
         """Take a background for given, and return a solver for what is left, with the same weight."""
         self._removed, self._removal = self._removal or self._removed, None
-        self.data = np.where(self.valid, self._measured - background, 0)
+        self.data = np.where(self.valid, self._measured - background, 0).astype(self.dtype)
         return self._solver(None)
 
     def solver(self, tau: float | None, start: Array | None) -> tuple[Solver, float]:

@@ -16,7 +16,14 @@ from recon.errors import InputError
 from recon.gpu.namespace import Device
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
-from recon.preparation import Field, channel_noise, data_of, require_same_pixels
+from recon.preparation import (
+    Field,
+    Precision,
+    channel_noise,
+    data_of,
+    require_precision,
+    require_same_pixels,
+)
 from recon.solvers import Outcome, Solver, StoppingRules
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
@@ -69,6 +76,7 @@ def reconstruct_volume(
     cancel: threading.Event | None = None,
     judged: bool = True,
     keeper: Keeper | None = None,
+    precision: Precision = "float32",
 ) -> VolumeReconstruction:
     """Reconstruct a volume from one measurement (Kuo 2020, Eq. 4.2; with a background Eq. 6.2).
 
@@ -133,6 +141,9 @@ def reconstruct_volume(
     keeper : Keeper, optional
         Keeps the solvers' state, a part a channel, and has them go on from what was kept of the same
         reconstruction. Turns for a positive background are not kept: they begin anew.
+    precision : "float32" or "float64"
+        Of the solver's arithmetic, with any model; the volume is float32. Float64 takes twice the memory.
+        With ``"auto"`` and float64 only the model is chosen; to have all chosen in float64, wish for it.
 
     Raises
     ------
@@ -141,6 +152,7 @@ def reconstruct_volume(
     """
     if prior not in PRIORS:
         raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
+    require_precision(precision)
     preventing = {
         f"model={model!r}": model != "auto",
         f"device={device!r}": device != "cpu",
@@ -149,6 +161,7 @@ def reconstruct_volume(
         "an extent": extent is not None,
         "a memory limit (memory_gib)": memory_gib is not None,
         "a scratch folder": scratch is not None,
+        f"precision={precision!r}": precision != "float32",
     }
     prevented = next((what for what, prevents in preventing.items() if prevents), None)
     if prevented is None:
@@ -218,6 +231,7 @@ def reconstruct_volume(
             scratch=scratch,
             device=device,
             acceptance_px=None if extent is None else extent.acceptance_px,
+            precision=precision,
         )
         start = None if initial is None else run.start(_channel(initial.volume, channel) * gains, window)
         solver, relative = run.solver(tau, start)
@@ -227,7 +241,7 @@ def reconstruct_volume(
             if callback is not None:
                 callback(
                     record,
-                    lambda: solver.solution[0][:, window[0], window[1]] * (np.float32(scale) / gains),
+                    lambda: _measured(solver.solution, window, np.float32(scale) / gains),
                 )
 
         if stop_at_noise:
@@ -257,7 +271,7 @@ def reconstruct_volume(
         if extent is not None and extent.left_out is not None:
             rest = run.residual(outcome.solution, smooth_part)
             signs.append(signs_of_light(rest, extent.left_out, channel, extent.psf_window) / limit_of(run))
-        volumes.append(outcome.solution[0][:, window[0], window[1]] * (np.float32(scale) / gains))
+        volumes.append(_measured(outcome.solution, window, np.float32(scale) / gains))
         backgrounds.append(None if smooth_part is None else smooth_part * scaled.noise[channel])
         outcomes.append(Outcome(np.empty(0), outcome.history, outcome.stop_reason, outcome.seconds))
         taus.append(relative)
@@ -291,10 +305,18 @@ def reconstruct_volume(
         provenance={
             "noise_deviation": [float(v) for v in scaled.noise],
             "memory": planned,
+            "precision": precision,
             **({"light_in_planes_left_out": left_out} if signs else {}),
         },
         verdict=verdict,
     )
+
+
+def _measured(
+    solution: Array, window: tuple[slice, slice], factor: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
+    """Return a solution's window in units of the measurement."""
+    return np.asarray(solution[0][:, window[0], window[1]] * factor, np.float32)
 
 
 def _verdict(

@@ -91,6 +91,35 @@ def test_the_tolerance_that_was_asked_for_is_explained_and_kept(picture_files, v
             assert decision(choice, "iterations").overruled
 
 
+@pytest.mark.parametrize("model", ["auto", "convolution"])
+def test_the_precision_that_was_asked_for_is_computed_in(picture_files, volume_files, model):
+    for precision in ("float64", None):
+        settings = Settings(model=model, precision=precision, iterations=2)
+        for request in (
+            PictureRequest(**picture_files, settings=settings),
+            VolumeRequest(**volume_files, settings=settings),
+        ):
+            job = request.prepare()
+            result = request.solve(job)
+            assert result.provenance["precision"] == (precision or "float32")
+            if model == "auto":
+                assert request.explain(job).precision == (precision or "float32")
+                assert decision(result.choice, "precision").overruled == (precision is not None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--precision", "double"], "choose one of auto, float32, float64"),
+        (["--precision", "float64", "--choose", "precision=float32"], "the same twice"),
+        (["--precision", "float64", "--video"], "videos are computed in float32"),
+    ],
+)
+def test_a_precision_that_is_not_understood_is_refused(picture_files, capsys, arguments, said):
+    assert main(["reconstruct", "--psf", str(picture_files["psf"]), *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_a_picture_of_one_convolution_says_the_field_and_the_end_that_it_has(picture_files):
     request = PictureRequest(**picture_files)
     result = request.solve(request.prepare())

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.chart.reconstruction import ChartProblem, Setting, run_setting, settings_for
+from recon.chart.reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
 from recon.chart.scored import Point, pareto
 from recon.errors import InputError, StructureError
 from recon.picture import PRIORS, reconstruct
@@ -88,9 +88,21 @@ def test_a_run_says_whether_time_cut_it_off(setting):
     assert run_setting(problem(), setting, limit_s=1000.0, counts=(1, 2)).finished
 
 
+def test_what_is_not_charted_is_said():
+    said = " ".join(left_out(problem(erased=0.2)))
+    assert "erased pixels cannot be averaged" in said
+    assert "one PSF a depth" in said
+    assert "tv-haar" in said
+    varying = " ".join(left_out(problem("beads", depths=3, grid=3)))
+    assert "one PSF a depth" not in varying
+    assert "too few pixels" in varying
+    assert "wiener" in varying
+
+
 def test_settings_fit_the_problem():
     single = settings_for(problem())
-    assert {s.precision for s in single if s.method != "volume"} == {"float32", "float64"}
+    for method in {s.method for s in single}:
+        assert {s.precision for s in single if s.method == method} == {"float32", "float64"}
     assert {s.prior for s in single if s.method == "fista"} == set(PRIORS)
     assert not any(s.prior == "tv-haar" for s in single if s.method != "fista")
     assert {s.model for s in single} == {"convolution"}
@@ -153,11 +165,3 @@ def test_every_setting_of_a_picture_runs_and_no_other():
             )
         with pytest.raises(InputError, match="does not apply"):
             run_setting(case, Setting(method, "convolution", "tv-haar"))
-
-
-def test_float64_is_refused_where_it_would_be_float32():
-    varying = problem(grid=3)
-    with pytest.raises(InputError, match="computes in float32"):
-        reconstruct(varying.measurement, varying.calibration, model="local", precision="float64")
-    with pytest.raises(InputError, match="float32 or float64"):
-        reconstruct(varying.measurement, varying.calibration, model="convolution", precision="float16")

@@ -191,7 +191,7 @@ def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
         choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(between=True))
 
 
-def test_float64_is_offered_where_it_can_be_computed(beads):
+def test_float64_is_offered_everywhere(beads):
     scene = make_scene("sparse-picture", size=32, grid=1)
     usual, exact = (
         recon.reconstruct(scene.measurement, scene.calibration, wishes=Wishes(precision=p), judged=False)
@@ -205,8 +205,8 @@ def test_float64_is_offered_where_it_can_be_computed(beads):
     assert exact.state is not None
     assert exact.state.dtype == np.float64
     np.testing.assert_allclose(exact.image, usual.image, atol=1e-3 * float(usual.image.max()))
-    with pytest.raises(InputError, match="computed in float32"):
-        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(precision="float64"))
+    volume = choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(precision="float64"))
+    assert volume.precision == "float64"
 
 
 def test_float32_gives_way_where_the_map_says_so(monkeypatch):
@@ -218,9 +218,8 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
     }}  # fmt: skip
     monkeypatch.setattr("recon.auto.precision.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
-    assert precision_of(Wishes(), 1000, 64, able=True).value == "float64"
-    assert precision_of(Wishes(), 1000, 64, able=False).value == "float32"
-    assert precision_of(Wishes(precision="float32"), 1000, 64, able=True).value == "float32"
+    assert precision_of(Wishes(), 1000, 64).value == "float64"
+    assert precision_of(Wishes(precision="float32"), 1000, 64).value == "float32"
 
 
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
