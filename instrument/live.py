@@ -65,6 +65,8 @@ class LiveStatus:
         Frames with a picture, and those without, since the start.
     quality : str
         Of the newest picture, in words; empty before the first.
+    warnings : tuple of str
+        What is doubtful about the calibration, and what pictures had to do without since.
     """
 
     pictures_per_s: float
@@ -73,6 +75,7 @@ class LiveStatus:
     pictures: int
     passed_over: int
     quality: str
+    warnings: tuple[str, ...]
 
 
 class LiveView:
@@ -208,6 +211,7 @@ class LiveView:
             pictures=pictures,
             passed_over=passed_over,
             quality="" if newest is None else newest.picture.quality,
+            warnings=self.reconstructor.warnings,
         )
 
     # The worker ------------------------------------------------------------------------------------

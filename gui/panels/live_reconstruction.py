@@ -77,6 +77,8 @@ class LiveReconstructionPanel(Panel):
         self._refining: Job | None = None
         self._holds = False
         self._shown: LiveResult | None = None
+        self._logged: tuple[str, ...] = ()
+        """Warnings of the reconstructor in use that are in the log already."""
         self.view = ImageView()
         self.file = QLineEdit()
         self.file.setPlaceholderText("calibration folder")
@@ -285,6 +287,7 @@ class LiveReconstructionPanel(Panel):
         self._shown = result
         self._show_picture(result.picture.image)
         how = self.follower.status
+        self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
         dark = light_of(self.session.bench) is Light.DARK
@@ -292,6 +295,13 @@ class LiveReconstructionPanel(Panel):
         self.status.setText(
             f"{warning}latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}"
         )
+
+    def _log_new(self, warnings: tuple[str, ...]) -> None:
+        """Write each warning into the log once."""
+        for warning in warnings:
+            if warning not in self._logged:
+                self.session.log("warning", f"Live reconstruction: {warning}")
+        self._logged = warnings
 
     def _show_picture(self, image: npt.NDArray[Any]) -> None:
         sample = image[::3, ::3]

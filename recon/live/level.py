@@ -86,11 +86,13 @@ class ComingLevel:
 
     Parameters
     ----------
+    binning : int
     make : callable
-        Returns the level.
+        Returns the level, of this binning.
     """
 
-    def __init__(self, make: Callable[[], Level]) -> None:
+    def __init__(self, binning: int, make: Callable[[], Level]) -> None:
+        self.binning = binning
         self._make = make
         self._made: Level | None = None
         self._error: Exception | None = None

@@ -174,6 +174,15 @@ class Pace:
         self._level, self._votes, self._since = level, 0, 0
         self._records[level] = _Record()
 
+    def give_up(self, level: int) -> None:
+        """Choose a level no more that cannot be had, nor finer ones unless one of those is in use."""
+        if level <= self._level:
+            self.levels = tuple(b for b in self.levels if b > level)
+        else:
+            self.levels = tuple(b for b in self.levels if b != level)
+        self._came_from = None
+        self._votes = 0
+
     def next_level(self, budget_ms: float) -> int:
         """Return the level for the pictures to come: another one only when several in a row asked for it."""
         self._since += 1

@@ -91,7 +91,8 @@ class LiveReconstructor:
     The first picture of a scene is a Wiener filter's, at once; from the next on, or by :meth:`refine`, it is
     iterated. While the scene is still, frames are averaged and iterations go on from frame to frame, so that
     the picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
-    Another binning is prepared in a thread of its own while pictures go on.
+    Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is told
+    in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
 
     Parameters
     ----------
@@ -109,6 +110,11 @@ class LiveReconstructor:
         Bounds of the binning.
     average : int
         Frames averaged at most while the scene is still.
+
+    Attributes
+    ----------
+    warnings : tuple of str
+        What is doubtful about the calibration, and what became of the pictures since.
 
     Raises
     ------
@@ -134,7 +140,7 @@ class LiveReconstructor:
                 background = np.moveaxis(calibration.background, 0, -1)
         else:
             self._psfs, self.psf_z_um = as_channels(calibration, "PSF"), None
-        self.warnings = check_psf(self._psfs)
+        self.warnings = self._doubts = check_psf(self._psfs)
         if not budget_ms > 0:
             raise InputError(f"budget_ms must be above 0, not {budget_ms}.")
         if not 1 <= finest <= coarsest:
@@ -147,7 +153,8 @@ class LiveReconstructor:
         self._noise = noise
         self._background = None if background is None else self._like_psf(background)
         fine_enough = [b for b in range(finest, coarsest + 1) if min(self._psfs.shape[1:]) >= LEAST_SIDE * b]
-        self._pace = Pace(fine_enough or [finest])
+        self._binnings = fine_enough or [finest]
+        self._pace = Pace(self._binnings)
         self._level: FilterLevel | None = None
         self._coming: ComingLevel | None = None
         self._watch = SceneWatch(average)
@@ -236,7 +243,8 @@ class LiveReconstructor:
     def restart(self) -> None:
         """Forget the scene, the machine's timing and the noise: the next frame is the first."""
         self._level = self._coming = None
-        self._pace = Pace(self._pace.levels)
+        self._pace = Pace(self._binnings)
+        self.warnings = self._doubts
         self._shape = ()
         self._watch.forget()
         self._follows = self._greeted = self._settled = False
@@ -268,7 +276,11 @@ class LiveReconstructor:
             self._make(binning, small)
         elif self._coming is not None:
             if self._coming.wait(0):
-                self._enter(self._coming.result())
+                self._take_up(self._coming)
+        elif not isinstance(self._level, Level):  # there was no memory for its solver
+            coarser = next((b for b in self._pace.levels if b > self._level.binning), None)
+            if coarser is not None:
+                self._make(coarser, binned(frame, coarser).copy())
         elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.binning:
             self._make(wanted, binned(frame, wanted).copy())
         return self._level
@@ -281,7 +293,7 @@ class LiveReconstructor:
 
     def _make(self, binning: int, small: Floats) -> None:
         """Begin to make a level for a frame on its pixels."""
-        self._coming = ComingLevel(lambda: Level(self._psfs, binning, small, self._noise))
+        self._coming = ComingLevel(binning, lambda: Level(self._psfs, binning, small, self._noise))
 
     def _solving_level(self, newer: Callable[[], bool]) -> Level | None:
         """Return the level in use once it has a solver; None when a newer frame comes first."""
@@ -289,10 +301,32 @@ class LiveReconstructor:
             if self._coming is None:
                 return None
             if self._coming.wait(_POLL_S):
-                self._enter(self._coming.result())
+                self._take_up(self._coming)
             elif newer():
                 return None
         return self._level
+
+    def _take_up(self, coming: ComingLevel) -> None:
+        """Go on at the level that was made; without memory for it, at the one in use."""
+        try:
+            level = coming.result()
+        except MemoryError:
+            self._coming = None
+            self._do_without(coming.binning)
+        else:
+            self._enter(level)
+
+    def _do_without(self, binning: int) -> None:
+        """Say that there is no memory for a binning, and give it up."""
+        assert self._level is not None
+        self._pace.give_up(binning)
+        present = self._level.binning
+        how = "go on" if isinstance(self._level, Level) else "are a Wiener filter's,"
+        self.warnings = (
+            *self.warnings,
+            f"There was no memory to iterate pictures binned {binning} x {binning}: they {how} binned "
+            f"{present} x {present}. End what else needs memory, then begin anew.",
+        )
 
     def _enter(self, level: Level) -> None:
         """Go on at another level; one of other pixels knows nothing of the scene."""

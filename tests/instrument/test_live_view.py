@@ -38,6 +38,7 @@ class Slow(LiveReconstructor):
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
+        self.warnings = ()
         self.fed: list[int] = []
         self.at_once = threading.Semaphore(1)
         self.refined = 0

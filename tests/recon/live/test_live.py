@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -173,17 +175,96 @@ def test_no_pixels_are_given_up_where_they_are_not_what_costs_time() -> None:
     assert (picture.binning, picture.method) == (1, "wiener")
 
 
-def test_a_level_that_cannot_be_made_is_told_by_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def lacking(monkeypatch: pytest.MonkeyPatch) -> set[int]:
+    """The binnings for whose solver there is no memory."""
+    binnings: set[int] = set()
+
     class NoMemory(Level):
-        def __init__(self, *_: object) -> None:
-            raise MemoryError("none left")
+        def __init__(self, psfs: np.ndarray, binning: int, *rest: Any) -> None:
+            if binning in binnings:
+                raise MemoryError("none left")
+            super().__init__(psfs, binning, *rest)
 
     monkeypatch.setattr("recon.live.reconstructor.Level", NoMemory)
+    return binnings
+
+
+def test_a_coarser_binning_without_memory_is_told_once_and_pictures_go_on(lacking: set[int]) -> None:
+    reconstructor = live(coarsest=4, budget_ms=100.0)
+    iterated(reconstructor, photograph(0, 0))
+    lacking.add(2)
+    tried: list[int] = []
+    picture = None
+    while picture is None or picture.binning == 1:
+        taking(reconstructor, fixed_ms=10, step_ms=60)
+        picture = reconstructor.feed(photograph(0.5 * (len(tried) % 2), len(tried)))
+        if reconstructor._coming is not None:
+            tried.append(reconstructor._coming.binning)
+            reconstructor._coming.wait()
+    assert tried == [2, 3]
+    assert picture.binning == 3
+    (told,) = reconstructor.warnings
+    assert "no memory" in told
+    assert "2 x 2" in told
+    assert "go on binned 1 x 1" in told
+    reconstructor.restart()
+    assert reconstructor.warnings == ()
+    assert 2 in reconstructor._pace.levels
+
+
+def test_a_finer_binning_without_memory_is_not_tried_again(
+    lacking: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reconstructor = live(coarsest=4, budget_ms=AMPLE_MS)
+    monkeypatch.setattr("recon.live.reconstructor.AT_ONCE", 500)  # begins coarse
+    lacking.add(1)
+    assert iterated(reconstructor, photograph(0, 0)).binning == 4
+    tried: list[int] = []
+    for n in range(12):
+        picture = reconstructor.feed(photograph(0.5 * (n % 2), n))
+        if reconstructor._coming is not None:
+            tried.append(reconstructor._coming.binning)
+            reconstructor._coming.wait()
+    assert tried == [1]
+    assert (picture.binning, picture.method) == (4, "admm")
+    assert len(reconstructor.warnings) == 1
+
+
+def test_without_memory_for_the_first_solver_a_coarser_one_is_made(lacking: set[int]) -> None:
+    lacking.update((1, 2))
+    reconstructor = live(coarsest=4, budget_ms=AMPLE_MS)
+    for n in range(6):
+        picture = reconstructor.feed(photograph(0, n))
+        assert reconstructor._coming is None or reconstructor._coming.wait()
+    assert (picture.binning, picture.method) == (3, "admm")
+    assert [w.split(":")[0][-5:] for w in reconstructor.warnings] == ["1 x 1", "2 x 2"]
+
+
+def test_without_memory_for_any_solver_the_wiener_filter_goes_on(lacking: set[int]) -> None:
+    lacking.update((1, 2))
+    reconstructor = live(coarsest=2, budget_ms=AMPLE_MS)
+    for n in range(6):
+        picture = reconstructor.feed(photograph(0, n))
+        if reconstructor._coming is not None:
+            reconstructor._coming.wait()
+        assert picture.method == "wiener"
+    assert reconstructor.refine() is None
+    assert len(reconstructor.warnings) == 2
+    assert "Wiener filter's" in reconstructor.warnings[0]
+
+
+def test_an_error_in_making_a_level_is_told_by_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(Level):
+        def __init__(self, *_: object) -> None:
+            raise ValueError("broken")
+
+    monkeypatch.setattr("recon.live.reconstructor.Level", Broken)
     reconstructor = live()
     reconstructor.feed(photograph(0, 0))
     assert reconstructor._coming is not None
     reconstructor._coming.wait()
-    with pytest.raises(MemoryError, match="none left"):
+    with pytest.raises(ValueError, match="broken"):
         reconstructor.feed(photograph(0, 1))
 
 
