@@ -9,7 +9,8 @@ resolution     0.5 over the correlation with the truth on the ring of frequencie
                resolved distance (the resolution has fallen below half of nominal); that distance is the
                shift at which the PSF's autocorrelation is 0.7, and at least two pixels
 spots          share of true points (away from others) without a peak within 1.5 pixels, and of peaks without
-               a point, over 10 %
+               a point, over 10 %; where points are crowded, less what chance finds
+               (:mod:`recon.stability.spots`)
 dip            0.2 over the least dip between neighbouring points (two-point resolution)
 convergence    change of the last iteration over ten times the tolerance, where a limit ended the run
 picture        ``10^((20 - PSNR) / 20)``: a hologram's error over a tenth of its picture's white
@@ -39,12 +40,6 @@ WORST = 99.0
 RING_CORRELATION = 0.5
 RING_WIDTH = 0.2
 """Half width of the ring, relative to its frequency."""
-LOST_SHARE = 0.1
-REACH_PX = 1.5
-APART_PX = 5.0
-"""Nearer points need not be told apart to be found."""
-PEAK_SHARE = 0.25
-"""A peak counts from this share of the median height at the true points."""
 DIP = 0.2
 PSNR_DB = 20.0
 PRECISION = 0.01
@@ -113,49 +108,6 @@ def ring_correlation(found: Image, truth: Image, period_px: float) -> float:
 def resolution_severity(found: Image, truth: Image, resolved_px: float) -> float:
     """Severity of lost resolution; ``resolved_px`` is the distance that the optics resolve."""
     return bounded(RING_CORRELATION / max(ring_correlation(found, truth, 2 * resolved_px), 1e-3))
-
-
-def spot_severity(found: Image, places: npt.NDArray[np.float64], reach_planes: float = REACH_PX) -> float:
-    """Severity of points lost or made up.
-
-    Parameters
-    ----------
-    found : ndarray, (n_z, height, width)
-    places : ndarray, (n, 3)
-        True points: plane, row, column. Those off the grid do not count.
-    reach_planes : float
-        Planes by which a peak may be off: the axial resolution, where that is more than the lateral reach.
-    """
-    from scipy.ndimage import gaussian_filter, maximum_filter
-
-    # A point between pixels is shared by up to four: smooth before peaks are looked for.
-    smooth = gaussian_filter(np.asarray(found, np.float64), 0.7)
-    peaks = (smooth == maximum_filter(smooth, 3)) & (smooth > 0)
-    at = np.argwhere(peaks)
-    if not len(at):
-        return bounded(1 / LOST_SHARE)
-    heights = smooth[tuple(at.T)]
-    inside = ((places > -0.5) & (places < np.array(found.shape) - 0.5)).all(axis=1)
-    scale = np.array([REACH_PX / reach_planes, 1, 1])
-    distance = (np.abs(places[:, None, :] - at[None]) * scale).max(axis=2)
-    alone = inside & _apart(places)
-    if not alone.any():
-        return 0.0
-    nearest = np.where(distance <= REACH_PX, heights[None], 0).max(axis=1)
-    least = PEAK_SHARE * float(np.median(nearest[alone]))
-    if least <= 0:
-        return bounded(1 / LOST_SHARE)
-    lost = float(np.mean(nearest[alone] < least))
-    high = heights >= least
-    made_up = float(np.mean(distance[:, high].min(axis=0) > 2 * REACH_PX)) if high.any() else 1.0
-    return bounded(max(lost, made_up) / LOST_SHARE)
-
-
-def _apart(places: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Points without another one near to them across."""
-    across = np.abs(places[:, None, 1:] - places[None, :, 1:]).max(axis=2)
-    np.fill_diagonal(across, np.inf)
-    return np.asarray(across.min(axis=1) > APART_PX) if len(places) > 1 else np.ones(len(places), bool)
 
 
 def convergence_severity(

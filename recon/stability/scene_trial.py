@@ -16,17 +16,17 @@ from recon.picture import reconstruct
 from recon.result import Reconstruction
 from recon.scenes import SceneSpec, TestScene, make_scene
 from recon.stability.failure import (
-    REACH_PX,
     WORST,
     Failure,
     Severities,
+    bounded,
     convergence_severity,
     relative_error,
     resolution_severity,
-    spot_severity,
     trivial_error,
 )
 from recon.stability.map import Size, Trial
+from recon.stability.spots import REACH_PX, spot_severity
 from recon.volume.model import ModelName
 from recon.volume.reconstruct import reconstruct_volume
 from recon.volume.result import VolumeReconstruction
@@ -162,10 +162,12 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     )
     error = relative_error(seen, wanted) if found.any() else 1.0
     severities = {Failure.TRIVIAL: error / max(trivial_error(back, wanted), 1e-6)}
+    nominal_px = max(resolved_px, LEAST_RESOLVED_PX)
     if scene.spec.family == "beads":
-        severities[Failure.SPOTS] = spot_severity(found, _places(scene, len(found)), _depth_reach(scene, psf))
+        places, reach = _places(scene, len(found)), _depth_reach(scene, psf)
+        spots = spot_severity(found, truth, places, resolved_px=nominal_px, reach_planes=reach)
+        severities[Failure.SPOTS] = bounded(spots)
     elif len(found) == 1:
-        nominal_px = max(resolved_px, LEAST_RESOLVED_PX)
         severities[Failure.RESOLUTION] = resolution_severity(seen[0], wanted[0], nominal_px)
     return error, severities
 

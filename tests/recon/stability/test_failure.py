@@ -14,7 +14,6 @@ from recon.stability.failure import (
     relative_error,
     resolution_severity,
     ring_correlation,
-    spot_severity,
     trivial_error,
     worst,
 )
@@ -52,29 +51,6 @@ def test_resolution_fails_where_the_ring_is_blurred_or_noise() -> None:
     assert resolution_severity(truth, truth, 2.0) == pytest.approx(0.5)
     assert resolution_severity(RNG.random((64, 64)), truth, 2.0) > 1
     assert resolution_severity(np.ones((64, 64)), truth, 2.0) == WORST
-
-
-def test_spots_are_lost_made_up_or_found() -> None:
-    places = np.array([[0, 10, 10], [0, 10, 30], [0, 30, 10], [0, 30, 30]], float)
-    found = np.zeros((1, 41, 41))
-    for _, row, column in places.astype(int):
-        found[0, row, column + 1] = 1.0  # a pixel off is found
-    assert spot_severity(found, places) == 0
-    lost = found.copy()
-    lost[0, 30, 31] = 0
-    assert spot_severity(lost, places) == pytest.approx(0.25 / 0.1)
-    made_up = found.copy()
-    made_up[0, 20, 20] = 1
-    assert spot_severity(made_up, places) == pytest.approx(0.2 / 0.1)
-    assert spot_severity(np.zeros((1, 41, 41)), places) > 1
-
-
-def test_depth_has_a_reach_of_its_own() -> None:
-    found = np.zeros((7, 21, 21))
-    found[5, 10, 10] = 1
-    places = np.array([[2.0, 10, 10]])
-    assert spot_severity(found, places) > 1
-    assert spot_severity(found, places, reach_planes=3) == 0
 
 
 def test_only_a_run_that_a_limit_ended_may_fail_to_converge() -> None:
