@@ -7,16 +7,20 @@ lenslets are fine, so that the whole pattern falls on the sensor over the field.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from instrument.atomic import whole_file
+from instrument.atomic import check_writable, whole_file
 from instrument.errors import FileError
 from instrument.sample_images import SAMPLES
 from recon.chart.calibration import FINE, SCENES, Photographed, Photographs
@@ -24,7 +28,7 @@ from recon.optics.scene import Scene
 from recon.optics.scenes import bead_volume, picture
 from recon.types import Geometry
 
-VERSION = 1
+VERSION = 2
 GREEN = (0.0, 1.0, 0.0)
 Z_UM = 2500.0
 DEPTHS_UM = (2000.0, 10_000 / 3)
@@ -42,11 +46,32 @@ APERTURE_MM = 0.5
 MARGIN = 1.12
 """The diffuser bends light a little beyond the aperture's shadow."""
 
+KEEP_S = 10.0
+"""Seconds of photographs that may be lost to a power cut."""
+_KEEPING_SHARE = 0.05
+"""Part of the time that may go into keeping them."""
+
 Advance = Callable[[int, int], object]
+Floats = npt.NDArray[np.float32]
 
 
-def photographs(size: int, path: Path, advance: Advance) -> Photographs:
-    """Return the photographs, from a file that holds them already, or taken now and kept there.
+class OutOfTimeError(Exception):
+    """There was no time for all photographs; those taken are kept.
+
+    Attributes
+    ----------
+    done, total : int
+    """
+
+    def __init__(self, done: int, total: int) -> None:
+        super().__init__(f"{done} of {total} photographs were taken.")
+        self.done, self.total = done, total
+
+
+def photographs(size: int, path: Path, advance: Advance, *, budget_s: float = np.inf) -> Photographs:
+    """Return the photographs: those that a file holds already, and the others, taken now and kept there.
+
+    They are kept as they are taken, and are the same however often that was interrupted.
 
     Parameters
     ----------
@@ -56,27 +81,119 @@ def photographs(size: int, path: Path, advance: Advance) -> Photographs:
         An ``.npz`` file.
     advance : callable
         Called with how many photographs are done, and how many there are.
+    budget_s : float
+        Seconds after which no other photograph is begun; one is taken in any case.
 
     Raises
     ------
+    OutOfTimeError
+        When the time was not enough: the next call goes on.
     FileError
         When the file holds something else.
     """
     bench = _Bench(size)
+    shots = _shots(bench)
+    kept = _Kept(path, bench.key, shots)
     if path.exists():
-        return _read(path, bench)
-    taken = _taken(bench, advance)
-    with whole_file(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file,
-            key=bench.key,
-            psfs=taken.psfs,
-            places=taken.places,
-            slides=taken.slides,
-            images=np.stack([scene.image for scene in taken.scenes]),
-            truths=np.stack([scene.truth for scene in taken.scenes]),
+        kept.read(bench.size)
+    check_writable(path)
+    ends = time.monotonic() + budget_s
+    rng = np.random.default_rng(0)
+    before = len(kept.images)
+    try:
+        for place, shot in enumerate(shots):
+            # Drawn for those that are kept, too: the others' noise does not depend on interruptions.
+            noise = rng.normal(0, 10 ** (-PSNR_DB / 20), (bench.size, bench.size))
+            if place < before:
+                continue
+            if place > before and time.monotonic() > ends:
+                raise OutOfTimeError(place, len(shots))
+            light = shot.light()
+            truth = bench.truth() if shot.is_scene else None
+            kept.add(np.asarray(light / light.max() + noise, np.float32), truth)
+            advance(place + 1, len(shots))
+    finally:
+        kept.write()
+    return kept.sorted(bench)
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One photograph: of a point at a place (row, column, depth), or else of a slide or scene."""
+
+    light: Callable[[], npt.NDArray[Any]]
+    place: tuple[float, float, float] | None = None
+    is_scene: bool = False
+
+
+class _Kept:
+    """Photographs and truths in the order in which they are taken, and the file that keeps them."""
+
+    def __init__(self, path: Path, key: str, shots: Sequence[_Shot]) -> None:
+        self.path, self.key, self.shots = path, key, shots
+        self.images: list[Floats] = []
+        self.truths: list[Floats] = []
+        self._written = 0
+        self._due = time.monotonic() + KEEP_S
+
+    def add(self, image: Floats, truth: Floats | None) -> None:
+        # The truth first: what is written has one for every scene, wherever an interruption comes.
+        self.truths += [] if truth is None else [truth]
+        self.images.append(image)
+        if time.monotonic() > self._due:
+            self.write()
+
+    def write(self) -> None:
+        if len(self.images) == self._written:
+            return
+        began = time.monotonic()
+        count = len(self.images)
+        truths = np.array(self.truths[: self._scenes(count)])
+        with whole_file(self.path) as temporary, temporary.open("wb") as file:
+            np.savez(file, key=self.key, images=np.stack(self.images), truths=truths)
+        self._written = count
+        spent = time.monotonic() - began
+        self._due = began + spent + max(KEEP_S, spent / _KEEPING_SHARE)
+
+    def read(self, side: int) -> None:
+        try:
+            with self.path.open("rb") as opened, np.load(opened) as file:
+                if str(file["key"]) != self.key:
+                    raise self._unusable("holds photographs of another size or version")
+                images, truths = file["images"], file["truths"]
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise self._unusable(f"holds no photographs ({error})") from error
+        count, fine = len(images), FINE * side
+        scenes = self._scenes(count)
+        fits = 0 < count <= len(self.shots) and len(truths) == scenes
+        if not (
+            fits and images.shape[1:] == (side, side) and (not scenes or truths.shape[1:] == (fine, fine))
+        ):
+            raise self._unusable(
+                f"holds photographs {images.shape} and truths {truths.shape}, which do not fit together"
+            )
+        self.images, self.truths = list(images), list(truths)
+        self._written = count
+
+    def sorted(self, bench: _Bench) -> Photographs:
+        shot = list(zip(self.shots, self.images, strict=True))
+        scenes = [image for s, image in shot if s.is_scene]
+        return Photographs(
+            np.stack([image for s, image in shot if s.place is not None]),
+            np.array([s.place for s in self.shots if s.place is not None]),
+            np.stack([image for s, image in shot if s.place is None and not s.is_scene]),
+            tuple(Photographed(*scene) for scene in zip(SCENES, scenes, self.truths, strict=True)),
+            Z_UM,
+            bench.geometry,
+            bench.window_px,
+            REACH,
         )
-    return taken
+
+    def _scenes(self, count: int) -> int:
+        return sum(shot.is_scene for shot in self.shots[:count])
+
+    def _unusable(self, why: str) -> FileError:
+        return FileError(self.path, f"{why}.", "Delete it, or name another folder with --out.")
 
 
 class _Bench:
@@ -130,72 +247,26 @@ class _Bench:
         return np.array(image[:, left : left + height])
 
 
-def _taken(bench: _Bench, advance: Advance) -> Photographs:
-    rng = np.random.default_rng(0)
-    total = DEPTHS * GRID**2 + AVERAGED - 1 + SLIDES + 2
-    done = 0
-
-    def noisy(image: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        nonlocal done
-        done += 1
-        advance(done, total)
-        noise = rng.normal(0, 10 ** (-PSNR_DB / 20), image.shape)
-        return np.asarray(image / image.max() + noise, np.float32)
-
+def _shots(bench: _Bench) -> list[_Shot]:
+    """Return all photographs, in the order in which they are taken: points, slides, the two scenes."""
     along = np.round(np.linspace(-0.5, 0.5, GRID) * REACH * bench.size)
     depths = 1 / np.linspace(1 / DEPTHS_UM[1], 1 / DEPTHS_UM[0], DEPTHS)
     depths[DEPTHS // 2] = Z_UM  # but for rounding it is that
-    places = [(r, c, z) for z in depths for r in along for c in along]
-    psfs = [noisy(bench.psf(*place)) for place in places]
-    centre = bench.psf(0.0, 0.0, Z_UM)
-    places += [(0.0, 0.0, Z_UM)] * (AVERAGED - 1)
-    psfs += [noisy(centre) for _ in range(AVERAGED - 1)]
+    places = [(float(r), float(c), float(z)) for z in depths for r in along for c in along]
+    shots = [_Shot(partial(bench.psf, *place), place) for place in places]
+    centre = cache(partial(bench.psf, 0.0, 0.0, Z_UM))
+    shots += [_Shot(centre, (0.0, 0.0, Z_UM))] * (AVERAGED - 1)
     field = (bench.field_um, bench.field_um)
-    slides = [
-        noisy(bench.photographed(bead_volume(20, field, (Z_UM, Z_UM), seed=100 + n))) for n in range(SLIDES)
-    ]
-    portrait = SAMPLES["portrait"].load()[:512, :512]
-    flat = noisy(bench.photographed(picture(portrait, Z_UM, bench.field_um)))
-    flat_truth = bench.truth()
+
+    def beads(count: int, field: tuple[float, float], depths: tuple[float, float], seed: int) -> Any:
+        return bench.photographed(bead_volume(count, field, depths, seed=seed))
+
+    def flat() -> Any:
+        portrait = SAMPLES["portrait"].load()[:512, :512]
+        return bench.photographed(picture(portrait, Z_UM, bench.field_um))
+
+    shots += [_Shot(partial(beads, 20, field, (Z_UM, Z_UM), 100 + n)) for n in range(SLIDES)]
     near = bench.field_um * BEADS_UM[0] / Z_UM
-    deep = noisy(bench.photographed(bead_volume(40, (near, near), BEADS_UM, seed=7)))
-    return Photographs(
-        np.stack(psfs),
-        np.array(places),
-        np.stack(slides),
-        (
-            Photographed(SCENES[0], flat, flat_truth),
-            Photographed(SCENES[1], deep, bench.truth()),
-        ),
-        Z_UM,
-        bench.geometry,
-        bench.window_px,
-        REACH,
-    )
-
-
-def _read(path: Path, bench: _Bench) -> Photographs:
-    try:
-        with path.open("rb") as opened, np.load(opened) as file:
-            kept = dict(file)
-        if str(kept["key"]) != bench.key:
-            raise FileError(
-                path, "holds photographs of another size or version.", "Name another folder with --out."
-            )
-        return Photographs(
-            kept["psfs"],
-            kept["places"],
-            kept["slides"],
-            tuple(
-                Photographed(name, image, truth)
-                for name, image, truth in zip(SCENES, kept["images"], kept["truths"], strict=True)
-            ),
-            Z_UM,
-            bench.geometry,
-            bench.window_px,
-            REACH,
-        )
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise FileError(
-            path, f"holds no photographs ({error}).", "Delete it, or name another folder."
-        ) from error
+    shots.append(_Shot(flat, is_scene=True))
+    shots.append(_Shot(partial(beads, 40, (near, near), BEADS_UM, 7), is_scene=True))
+    return shots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 app = command_app()
 
+_LEAST_S = 1.0
+"""For settings, where photographs took all of the budget: so that each call comes further."""
 _OWN = "--calibration (or --psf) and --image"
 
 
@@ -193,7 +196,9 @@ def chart(
             None if slm is None else parse_size(slm),
         )
     elif calibrations:
-        problem, about = _calibrations(size or 90, out)
+        began = time.monotonic()
+        problem, about = _calibrations(size or 90, out, budget_s)
+        budget_s = max(budget_s - (time.monotonic() - began), _LEAST_S)
     else:
         job = _job(calibration, psf, image, dark, crop, binning, volume=volume)
         for name, text in job.notes.items():
@@ -258,15 +263,31 @@ def _job(
     return prepared(calibration, image, dark=level, crop=window, binning=factor)
 
 
-def _calibrations(size: int, out: Path) -> tuple[Problem, dict[str, Any]]:
-    from instrument.chart.bench_photographs import photographs
+def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:
+    from instrument.chart.bench_photographs import OutOfTimeError, photographs
     from recon.chart.calibration import CalibrationProblem
 
     out.mkdir(parents=True, exist_ok=True)
     path = out / "photographs.npz"
-    with saying_what_is_left(path), progress_bar() as bar:
-        task = bar.add_task("photographs", total=None, note="")
-        taken = photographs(size, path, lambda done, total: bar.update(task, completed=done, total=total))
+    counted = ""
+
+    def advance(done: int, total: int) -> None:
+        nonlocal counted
+        counted = f"{done} of {total} photographs are in {path}: the same command goes on."
+        bar.update(task, completed=done, total=total)
+
+    try:
+        with progress_bar() as bar:
+            task = bar.add_task("photographs", total=None, note="")
+            taken = photographs(size, path, advance, budget_s=budget_s)
+    except (KeyboardInterrupt, SystemExit) as interruption:
+        interruption.add_note(counted or "Nothing was written.")
+        raise
+    except OutOfTimeError as error:
+        raise BenchError(
+            f"The budget of {budget_s:g} s was spent on photographs: {error.done} of {error.total} are "
+            "taken and kept. Run the same command again to go on, or give a longer --budget."
+        ) from error
     return CalibrationProblem(taken), {"bench": "simulated microscope", "simulated": True}
 
 

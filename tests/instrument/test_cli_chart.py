@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -205,7 +207,6 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
 
 def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
     import multiprocessing
-    from types import SimpleNamespace
 
     from instrument.chart import process
 
@@ -241,6 +242,80 @@ def test_damaged_photographs_are_refused_by_name(tmp_path, content):
     damaged.write_bytes(content)
     with pytest.raises(FileError, match=r"photographs\.npz.*no photographs"):
         photographs(96, damaged, lambda done, total: None)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Four photographs and two scenes that cost nothing; how often each was taken."""
+    from instrument.chart import bench_photographs as module
+
+    taken = []
+
+    def light(number):
+        taken.append(number)
+        return np.full((30, 30), 1.0) + np.eye(30) * number
+
+    bench = SimpleNamespace(
+        size=30, key="few", geometry=None, window_px=9, truth=lambda: np.full((150, 150), 1.0 + len(taken))
+    )
+    shots = [module._Shot(partial(light, n), (0.0, 0.0, n + 1.0)) for n in range(3)]
+    shots += [module._Shot(partial(light, 3))]
+    shots += [module._Shot(partial(light, n), is_scene=True) for n in (4, 5)]
+    monkeypatch.setattr(module, "_Bench", lambda size: bench)
+    monkeypatch.setattr(module, "_shots", lambda bench: shots)
+    return taken
+
+
+def test_photographs_count_in_the_budget_and_go_on_where_they_stopped(few, tmp_path):
+    from instrument.chart.bench_photographs import OutOfTimeError, photographs
+
+    whole = photographs(30, tmp_path / "whole.npz", lambda *_: None)
+    assert few == [0, 1, 2, 3, 4, 5]
+    few.clear()
+    path = tmp_path / "parts.npz"
+    told = []
+    for done in range(1, 6):  # one at a time, each budget spent at once
+        with pytest.raises(OutOfTimeError, match=f"{done} of 6"):
+            photographs(30, path, lambda *counts: told.append(counts), budget_s=0.0)
+    parts = photographs(30, path, lambda *counts: told.append(counts), budget_s=0.0)
+    assert few == [0, 1, 2, 3, 4, 5]
+    assert told == [(n, 6) for n in range(1, 7)]
+    for name in ("psfs", "places", "slides"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    assert [s.name for s in parts.scenes] == [s.name for s in whole.scenes]
+    for one, other in zip(parts.scenes, whole.scenes, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_array_equal(one.truth, other.truth)
+    again = photographs(30, path, lambda *_: pytest.fail("nothing is left to take"))
+    np.testing.assert_array_equal(again.psfs, whole.psfs)
+
+
+def test_photographs_taken_before_an_interruption_are_kept(few, tmp_path):
+    from instrument.chart.bench_photographs import photographs
+
+    def interrupted(done, _total):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        photographs(30, tmp_path / "p.npz", interrupted)
+    photographs(30, tmp_path / "p.npz", lambda *_: None)
+    assert few == [0, 1, 2, 3, 4, 5]
+
+
+def test_photographs_that_do_not_fit_together_are_refused(few, tmp_path):
+    from instrument.chart.bench_photographs import photographs
+    from instrument.errors import FileError
+
+    path = tmp_path / "p.npz"
+    for images, truths in (((6, 30, 30), (0,)), ((2, 31, 30), (0,)), ((7, 30, 30), (2, 150, 150))):
+        np.savez(path, key="few", images=np.zeros(images), truths=np.zeros(truths))
+        with pytest.raises(FileError, match="do not fit together"):
+            photographs(30, path, lambda *_: None)
+    np.savez(path, key="other", images=np.zeros((1, 30, 30)), truths=np.zeros(0))
+    with pytest.raises(FileError, match="another size or version"):
+        photographs(30, path, lambda *_: None)
+    assert not few
 
 
 def test_what_ends_a_setting_is_told_in_its_row():
