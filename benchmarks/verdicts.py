@@ -33,7 +33,7 @@ from recon.scenes import FAMILIES, SceneSpec, spec_of
 from recon.stability.failure import worst
 from recon.stability.scene_trial import Options, run_scene
 from recon.threads import set_threads
-from recon.verdict.cases import cases_of, group_of, mixed_scenes
+from recon.verdict.cases import cases_of, group_of, is_whole, mixed_scenes, weights_of
 from recon.verdict.evidence import Evidence
 from recon.verdict.judge import verdict_on
 from recon.verdict.verdict import Region
@@ -90,14 +90,14 @@ def scene(index: int) -> tuple[SceneSpec, Options]:
     return spec_of(family, **numbers), handled
 
 
-def run(first: int, count: int, keep: Path) -> None:
+def run(first: int, count: int, keep: Path, *, with_auto: bool) -> None:
     """Reconstruct scenes and append evidence and severity to a file, but for those that it has."""
     done = {(e["index"], e["method"]) for e in read(keep)}
     for index in range(first, first + count):
         spec, handled = scene(index)
         one_depth = spec.is_picture or spec.depths == 1
         for method in PICTURE_METHODS if one_depth else VOLUME_METHODS:
-            if (index, method) in done:
+            if (index, method) in done or (AUTO in method and not with_auto):
                 continue
             name, auto, _ = method.partition(AUTO)
             options = replace(handled, model="auto", estimate_background=None) if auto else handled
@@ -118,14 +118,23 @@ def run(first: int, count: int, keep: Path) -> None:
 
 
 def read(keep: Path) -> list[dict]:
-    """Return what was kept; a last line that an interruption cut off is taken from the file."""
+    """Return what was kept; a last line that an interruption cut off is taken from the file.
+
+    Entries from before something was measured that verdicts ask are left out, and so made again.
+    """
     if not keep.exists():
         return []
     text = keep.read_text(encoding="utf-8")
     whole = text[: text.rfind("\n") + 1]
     if whole != text:
         keep.write_text(whole, encoding="utf-8")
-    return [json.loads(line) for line in whole.splitlines()]
+    entries = [json.loads(line) for line in whole.splitlines()]
+    return [
+        e
+        for e in entries
+        if not e["evidence"]
+        or is_whole(e["evidence"], weights_of(str(group_of(e["method"].partition(AUTO)[0]))))
+    ]
 
 
 def ship(entries: list[dict], path: Path) -> None:
@@ -221,11 +230,12 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200, help="scenes to add")
     parser.add_argument("--first", type=int, default=UNSEEN_FROM, help="the first one's number")
     parser.add_argument("--keep", type=Path, default=Path("verdicts.jsonl"))
+    parser.add_argument("--fixed-only", action="store_true", help="leave out chosen models (auto)")
     parser.add_argument("--cases", type=Path, help="write the scenes that serve as cases")
     parser.add_argument("--out", type=Path, help="write the report")
     a = parser.parse_args()
     set_threads(1)
-    run(a.first, a.count, a.keep)
+    run(a.first, a.count, a.keep, with_auto=not a.fixed_only)
     entries = read(a.keep)
     if a.cases is not None:
         ship(entries, a.cases)

@@ -20,20 +20,6 @@ from recon.stability.shipped import shipped_maps
 
 Floats = npt.NDArray[np.float64]
 
-FEATURES = (
-    "detail",
-    "unexplained",
-    "load",
-    "signal",
-    "similarity",
-    "dimming",
-    "erased",
-    "saturated",
-    "unsettled",
-    "ambiguity",
-    "grain",
-)
-"""Evidence by which cases are alike; ``grain`` is that of edges over lit voxels."""
 FLOOR = {
     "detail": 0.05,
     "unexplained": 0.02,
@@ -43,13 +29,43 @@ FLOOR = {
     "unsettled": 0.05,
     "dimming": 0.01,
     "grain": 0.05,
+    "height": 0.5,
+    "peaks": 1.0,
+    "missed": 0.03,
 }
 """Below these nothing can be told from zero; above, ratios count."""
+DERIVED = ("grain", "missed")
+"""What follows from other evidence, and is not kept with it."""
 NOTHING = 1e-3
 INVISIBLE = ("shift",)
 """Maps whose failures leave no trace in the data: a shifted diffuser gives a good picture elsewhere."""
-WEIGHT = {"similarity": 2.0, "unsettled": 0.3, "signal": 0.5, "ambiguity": 4.0}
-"""How much a feature's difference counts, relative to a ratio of ``e`` in the others."""
+ALIKE: Mapping[str, float] = {
+    "detail": 1.0,
+    "unexplained": 1.0,
+    "load": 1.0,
+    "signal": 0.5,
+    "similarity": 2.0,
+    "dimming": 1.0,
+    "erased": 1.0,
+    "saturated": 1.0,
+    "unsettled": 0.3,
+    "ambiguity": 4.0,
+    "grain": 1.0,
+}
+"""Evidence by which cases are alike, and how much a difference counts, relative to a ratio of ``e``.
+``grain`` is that of edges over lit voxels."""
+ALIKE_VOLUMES: Mapping[str, float] = {
+    **ALIKE,
+    "load": 0.5,
+    "similarity": 3.0,
+    "missed": 3.0,
+    "height": 1.0,
+    "peaks": 2.0,
+    "ends": 2.0,
+}
+"""Likewise of volumes, whose bright points are asked as well (:class:`~recon.verdict.content.Points`).
+``missed`` is the share of the measurement's variance, noise included, that the result does not throw onto the
+sensor."""
 
 RANDOM_LENSLETS = 0.25
 """``ambiguity`` of entries from before it was kept: those maps have random lenslets, 0.17 to 0.33."""
@@ -65,6 +81,11 @@ GROUPS = {
 """Methods that reach the same minimiser, and so fail alike."""
 
 
+def weights_of(group: str) -> Mapping[str, float]:
+    """Return the evidence by which a group's cases are alike, with weights."""
+    return ALIKE_VOLUMES if group.startswith("volume") else ALIKE
+
+
 def group_of(method: str) -> str | None:
     """Return the group of a method, or None where no map has one like it."""
     return next((g for g, methods in GROUPS.items() if method in methods), None)
@@ -76,8 +97,10 @@ class Cases:
 
     Attributes
     ----------
+    weights : mapping
+        The evidence that spans the space in which distances tell how alike they are, see :data:`ALIKE`.
     places : ndarray, (n, n_features)
-        In the space in which distances tell how alike they are.
+        In that space.
     severities : ndarray, (n,)
     scenes : ndarray of int, (n,)
         Numbers of the mixed scenes that they come from; -1 for those of maps.
@@ -85,6 +108,7 @@ class Cases:
         The maps that they come from.
     """
 
+    weights: Mapping[str, float]
     places: Floats
     severities: Floats
     scenes: npt.NDArray[np.int_]
@@ -93,24 +117,31 @@ class Cases:
     def without(self, scene: int) -> Cases:
         """Return the cases but for those of a mixed scene, to judge that scene by the others."""
         kept = self.scenes != scene
-        return Cases(self.places[kept], self.severities[kept], self.scenes[kept], self.maps)
+        return Cases(self.weights, self.places[kept], self.severities[kept], self.scenes[kept], self.maps)
 
 
-def place_of(evidence: Mapping[str, Any]) -> Floats:
+def place_of(evidence: Mapping[str, Any], weights: Mapping[str, float]) -> Floats:
     """Return where evidence lies in the space of :class:`Cases`."""
     coordinates = []
-    # Surfaces have fewer edges than lit voxels, points more: priors fail on them in different ways.
+    signal2 = evidence["signal"] ** 2
     numbers = {
         "ambiguity": RANDOM_LENSLETS,
         **evidence,
+        # Surfaces have fewer edges than lit voxels, points more: priors fail on them in different ways.
         "grain": (evidence["edges"] + NOTHING) / (evidence["lit"] + NOTHING),
+        "missed": min((1 + signal2 * evidence["unexplained"] ** 2) / (1 + signal2), 1.0),
     }
-    for name in FEATURES:
+    for name, weight in weights.items():
         value = float(numbers[name])
         if name in FLOOR:
             value = float(np.log(max(value, 0.0) + FLOOR[name]))
-        coordinates.append(WEIGHT.get(name, 1.0) * value)
+        coordinates.append(weight * value)
     return np.asarray(np.minimum(coordinates, 1e3))
+
+
+def is_whole(evidence: Mapping[str, Any], weights: Mapping[str, float]) -> bool:
+    """Tell whether evidence holds all that is asked; cases from before something was measured do not."""
+    return {*weights} - {*DERIVED, "ambiguity"} <= {*evidence}
 
 
 @cache
@@ -122,6 +153,7 @@ def mixed_scenes() -> tuple[Mapping[str, Any], ...]:
 @cache
 def cases_of(group: str) -> Cases:
     """Return the cases of a group: the shipped maps' and those of mixed scenes."""
+    weights = weights_of(group)
     places, severities, scenes, names = [], [], [], []
     for name, stress in shipped_maps().items():
         if name in INVISIBLE:
@@ -131,17 +163,20 @@ def cases_of(group: str) -> Cases:
             if method.partition(",")[0] not in GROUPS[group]:
                 continue
             for entry in result["evidence"]:
-                places.append(place_of(entry))
+                if not is_whole(entry, weights):
+                    continue
+                places.append(place_of(entry, weights))
                 severities.append(float(entry["severity"]))
                 scenes.append(-1)
                 names.append(name)
     for entry in mixed_scenes():
-        if entry["method"] in GROUPS[group]:
-            places.append(place_of(entry["evidence"]))
+        if entry["method"] in GROUPS[group] and is_whole(entry["evidence"], weights):
+            places.append(place_of(entry["evidence"], weights))
             severities.append(float(entry["severity"]))
             scenes.append(int(entry["scene"]))
     return Cases(
-        np.array(places).reshape(-1, len(FEATURES)),
+        weights,
+        np.array(places).reshape(-1, len(weights)),
         np.array(severities),
         np.array(scenes, int),
         tuple(dict.fromkeys(names)),

@@ -28,6 +28,8 @@ def evidence_of(
     psfs: Array,
     residuals: Sequence[float],
     unsettled: float,
+    *,
+    points: bool = False,
 ) -> Evidence:
     """Measure all channels of a reconstruction.
 
@@ -47,6 +49,8 @@ def evidence_of(
     residuals : sequence of float
         Residual norms in units of the noise: one a channel, or one of all together.
     unsettled : float
+    points : bool
+        Whether to look for the result's bright points as well: of volumes.
     """
     counts = as_channels(measurement, "measurement")
     n = len(data)
@@ -63,6 +67,7 @@ def evidence_of(
                 residual,
                 saturated=saturated_share(counts[c][valid[c]]),
                 unsettled=unsettled,
+                points=points,
             )
         )
     return averaged(channels)

@@ -14,13 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon import fft
+from recon.verdict.content import lit_and_edges, points_of
 
 Array = npt.NDArray[Any]
 
-LIT = 0.05
-"""Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
-difference between neighbours as an edge."""
-MOST_SAMPLES = 4_000_000
 NEAR_PX = 2
 """Shifts up to here belong to the PSF's own sharpness."""
 NO_LESS = 1e-4
@@ -60,6 +57,8 @@ class Evidence:
         Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array.
     unsettled : float
         Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
+    height, peaks, ends : float or None
+        Of the bright points of a volume (:class:`~recon.verdict.content.Points`); None of a picture.
     """
 
     signal: float
@@ -75,10 +74,13 @@ class Evidence:
     dimming: float
     ambiguity: float
     unsettled: float
+    height: float | None = None
+    peaks: float | None = None
+    ends: float | None = None
 
     def as_json(self) -> dict[str, float]:
-        """Return the numbers by name."""
-        return {name: float(value) for name, value in asdict(self).items()}
+        """Return the numbers by name, but for those that were not measured."""
+        return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
 
 def measure(
@@ -91,6 +93,7 @@ def measure(
     *,
     saturated: float,
     unsettled: float,
+    points: bool = False,
 ) -> Evidence:
     """Measure a reconstruction of one channel.
 
@@ -110,11 +113,14 @@ def measure(
     saturated : float
         Share of the valid pixels at full scale.
     unsettled : float
+    points : bool
+        Whether to look for its bright points as well.
     """
     used = data[valid].astype(np.float64)
     signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
     beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
-    lit, edges = _lit_and_edges(volume)
+    lit, edges = lit_and_edges(volume)
+    found = points_of(volume, _norms(psfs) / noise, len(used)) if points else None
     return Evidence(
         signal=float(np.sqrt(signal2)),
         detail=_detail(volume, psfs, noise, len(used)),
@@ -129,28 +135,10 @@ def measure(
         dimming=_dimming(psfs),
         ambiguity=_ambiguity(psfs[len(psfs) // 2]),
         unsettled=unsettled,
+        height=None if found is None else found.height,
+        peaks=None if found is None else found.peaks,
+        ends=None if found is None else found.ends,
     )
-
-
-def _lit_and_edges(volume: Array) -> tuple[float, float]:
-    """Return the shares of lit voxels and of edges, plane by plane: volumes may be as large as the memory."""
-    sample = volume.reshape(-1)[:: max(volume.size // MOST_SAMPLES, 1)]
-    white = float(np.percentile(sample, 99.5))
-    if white <= 0:
-        white = float(volume.max())
-    if white <= 0:
-        return 0.0, 0.0
-    level = LIT * white
-    lit = edges = 0
-    for z, plane in enumerate(volume):
-        step = np.zeros(plane.shape, bool)
-        step[:-1] |= np.abs(np.diff(plane, axis=0)) > level
-        step[:, :-1] |= np.abs(np.diff(plane, axis=1)) > level
-        if z + 1 < len(volume):
-            step |= np.abs(volume[z + 1] - plane) > level
-        lit += int(np.count_nonzero(plane > level))
-        edges += int(np.count_nonzero(step))
-    return lit / volume.size, edges / volume.size
 
 
 def _detail(volume: Array, psfs: Array, noise: float, count: int) -> float:

@@ -11,20 +11,24 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from recon.verdict.cases import FEATURES, Cases, cases_of, group_of, place_of
+from recon.verdict.cases import Cases, cases_of, group_of, place_of
 from recon.verdict.collect import DIVERGED
 from recon.verdict.evidence import Evidence
-from recon.verdict.verdict import LOST, NOISELESS, UNFINISHED, Finding, Region, Verdict
+from recon.verdict.verdict import LOST, NOISELESS, UNFINISHED, Finding, Region, Verdict, reliable_share
 
 Floats = npt.NDArray[np.float64]
 
 NEIGHBOURS = 16
 """Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 134,
 and with a tenth of failures allowed 2 of 165 (the mixed scenes, each judged by the cases of the others)."""
-RELIABLE = 0.05
-"""Share of failures among them up to which a reconstruction is inside."""
+NEIGHBOURS_OF_VOLUMES = 12
+"""There are fewer cases of volumes: sixteen reach too far."""
 FAR = 2.0
-"""Distance beyond which the nearest case is no witness: a factor of about seven in one number."""
+FAR_OF_VOLUMES = 3.0
+"""Distance beyond which the third nearest case is no witness: a factor of about seven in one number. Volumes
+are compared by more numbers. One case in twenty of those known is as far from the others."""
+UNSETTLED = 0.2
+"""``unsettled`` from which a reconstruction is not inside: its last change was twice the tolerance."""
 FEWEST = 40
 """Cases that a group needs to be judged by."""
 
@@ -75,6 +79,22 @@ STRESSES: Mapping[str, tuple[int, str, str]] = {
         "The PSF repeats itself: moved by some pixels it is {value:.0%} alike",
         "A diffuser with elements at random places would help",
     ),
+    "height": (
+        1,
+        "The points found stand {value:.2g} times above the noise",
+        "More light would help (exposure, brighter scene, several frames averaged)",
+    ),
+    "peaks": (
+        -1,
+        "The result is grainy: {value:.2g} bright points for each thousand pixels",
+        "More light or a stronger prior (--tau) would help; a scene of so many points is too dense",
+    ),
+    "ends": (
+        -1,
+        "The outermost depths hold {value:.2g} times their share of the light",
+        "Calibrating beyond the scene on both sides, or subtracting the background, would help: light that "
+        "fits nowhere gathers there",
+    ),
     "unsettled": (
         -1,
         "The iterations were ended while the picture still changed",
@@ -101,27 +121,31 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
         cases = cases_of(group)
     if cases is None or len(cases.severities) < FEWEST:
         return Verdict(Region.UNKNOWN, method, None, (), numbers)
-    place = _no_better_than_any(cases, place_of(numbers))
-    share, nearest = failing_share(cases, place)
+    place = _no_better_than_any(cases, place_of(numbers, cases.weights))
+    of_volumes = str(group).startswith("volume")
+    count, far = (NEIGHBOURS_OF_VOLUMES, FAR_OF_VOLUMES) if of_volumes else (NEIGHBOURS, FAR)
+    share, nearest = failing_share(cases, place, count)
+    reliable = share <= reliable_share(method)
     if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all() or share >= LOST:
         region = Region.OUTSIDE
-    elif nearest > FAR or numbers["signal"] >= NOISELESS:
+    elif nearest > far or numbers["signal"] >= NOISELESS:
         region = Region.UNKNOWN
     else:
-        region = Region.INSIDE if share <= RELIABLE else Region.NEAR
+        settled = numbers["unsettled"] < UNSETTLED
+        region = Region.INSIDE if reliable and settled else Region.NEAR
     mixed = len(set(cases.scenes.tolist()) - {-1})
     basis = (
-        f"{NEIGHBOURS} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)}; "
+        f"{count} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)}; "
         f"{mixed} mixed scenes)"
     )
-    findings = _unfinished_first(_findings(cases, place, numbers, share), numbers)
+    findings = _unfinished_first(_findings(cases, place, numbers, share, count), numbers, reliable)
     return Verdict(region, method, share, findings, numbers, basis)
 
 
 def _no_better_than_any(cases: Cases, place: Floats) -> Floats:
     """Return a place moved to the best case's where it is better: more light than the most is as good."""
     moved = place.copy()
-    for index, name in enumerate(FEATURES):
+    for index, name in enumerate(cases.weights):
         if name in STRESSES:
             column = cases.places[:, index]
             better = STRESSES[name][0]
@@ -129,25 +153,27 @@ def _no_better_than_any(cases: Cases, place: Floats) -> Floats:
     return moved
 
 
-def failing_share(cases: Cases, place: Floats) -> tuple[float, float]:
-    """Return the share of failures among the nearest cases, and the distance of the third nearest.
+def failing_share(cases: Cases, place: Floats, count: int) -> tuple[float, float]:
+    """Return the share of failures among the ``count`` nearest cases, and the distance of the third nearest.
 
     Nearer cases count more.
     """
     distance = np.linalg.norm(cases.places - place, axis=1)
-    order = np.argsort(distance)[:NEIGHBOURS]
+    order = np.argsort(distance)[:count]
     weight = 1 / (0.2 + distance[order])
     failed = cases.severities[order] >= 1
     return float(np.sum(weight * failed) / np.sum(weight)), float(distance[order[2]])
 
 
-def _findings(cases: Cases, place: Floats, numbers: Mapping[str, float], share: float) -> tuple[Finding, ...]:
+def _findings(
+    cases: Cases, place: Floats, numbers: Mapping[str, float], share: float, count: int
+) -> tuple[Finding, ...]:
     """Return the stresses, those first whose removal would lower the share of failures most."""
     good = cases.places[cases.severities < 0.7]
     if len(good) < 5:
         return ()
     findings = []
-    for index, name in enumerate(FEATURES):
+    for index, name in enumerate(cases.weights):
         if name not in STRESSES:
             continue
         better, words, help_ = STRESSES[name]
@@ -156,19 +182,23 @@ def _findings(cases: Cases, place: Floats, numbers: Mapping[str, float], share: 
             continue  # as good as in a good case already
         relieved = place.copy()
         relieved[index] = typical
-        gain = share - failing_share(cases, relieved)[0]
+        gain = share - failing_share(cases, relieved, count)[0]
         if gain > 0:
             findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
     return tuple(sorted(findings, key=lambda f: -f.gain))
 
 
-def _unfinished_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Return the findings, first that the picture had hardly begun to settle where that is so.
+def _unfinished_first(
+    findings: tuple[Finding, ...], numbers: Mapping[str, float], reliable: bool
+) -> tuple[Finding, ...]:
+    """Return the findings, first that a limit ended the run too early where that alone decides.
 
-    It alone puts a reconstruction outside, whatever similar cases say; and what else was measured of such a
-    picture, first of all what the model leaves unexplained, may well come of it.
+    A picture that had hardly begun to settle is outside, whatever similar cases say; and what else was
+    measured of it, first of all what the model leaves unexplained, may well come of it. One that was still
+    changing is not inside, even where similar cases did not fail.
     """
-    if numbers["unsettled"] < UNFINISHED:
+    still_changing = numbers["unsettled"] >= UNSETTLED and reliable
+    if numbers["unsettled"] < UNFINISHED and not still_changing:
         return findings
     _, words, help_ = STRESSES["unsettled"]
     if numbers["unsettled"] >= DIVERGED:

@@ -336,6 +336,7 @@ def _verdict(
         scaled.depths.central,
         [o.history[-1].data_residual for o in outcomes],
         max(unsettled_by(o.history, o.stop_reason, tolerance) for o in outcomes),
+        points=True,
     )
     return verdict_on(evidence, method_name("volume", prior))
 

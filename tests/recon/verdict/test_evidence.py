@@ -114,6 +114,8 @@ def test_every_reconstruction_carries_its_evidence() -> None:
     assert judged.verdict is not None
     assert judged.verdict.evidence["planes"] == 3
     assert 0.5 < judged.verdict.evidence["similarity"] <= 1
+    assert {"height", "peaks", "ends"} <= set(judged.verdict.evidence)
+    assert "height" not in result.verdict.evidence
 
 
 def test_colour_and_misfits_are_judged_by_the_worst_channel() -> None:
@@ -152,7 +154,7 @@ def test_judging_takes_planes_and_never_the_stack_anew() -> None:
 
 
 def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise MemoryError("no room")
 
     monkeypatch.setattr("recon.volume.reconstruct.evidence_of", fail)

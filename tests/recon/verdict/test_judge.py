@@ -120,6 +120,49 @@ def test_a_psf_that_repeats_itself_is_judged_by_those_that_did(monkeypatch: pyte
     assert judge.verdict_on(evidence(30, 0.03), "admm tv").region is Region.INSIDE
 
 
+def test_a_run_that_was_still_changing_is_not_called_reliable() -> None:
+    changing = judge.verdict_on(evidence(30, 0.03, unsettled=0.4), "admm tv")
+    assert changing.region is Region.NEAR
+    assert changing.findings[0].stress == "unsettled"
+    assert "still changed" in changing.sentences[0]
+    assert "%" not in changing.sentences[0]
+    assert "More iterations" in changing.sentences[1]
+    assert judge.verdict_on(evidence(30, 0.03, unsettled=0.1), "admm tv").region is Region.INSIDE
+
+
+def test_volumes_are_judged_by_their_points_and_cases_without_them_take_no_part(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two volumes alike in all else, the one that is grainy and hazy is like those that failed."""
+
+    def entries(with_points: bool) -> list[dict]:
+        made = []
+        for k in range(60):
+            bad = k % 2
+            points = {
+                "height": 2.0 if bad else 20.0,
+                "peaks": 40.0 if bad else 3.0,
+                "ends": 1.6 if bad else 0.4,
+            }
+            numbers = evidence(20 + 0.1 * k, 0.03, planes=4, **(points if with_points else {})).as_json()
+            severity = 2.0 if bad else 0.5
+            made.append({"scene": k, "method": "volume tv", "severity": severity, "evidence": numbers})
+        return made
+
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(True)))
+    cases.cases_of.cache_clear()
+    good = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), "volume tv")
+    assert good.region is Region.INSIDE
+    bad = judge.verdict_on(evidence(22, height=2.0, peaks=40.0, ends=1.6), "volume tv")
+    assert bad.region is Region.OUTSIDE
+    assert {f.stress for f in bad.findings} <= {"height", "peaks", "ends"}
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(False)))
+    cases.cases_of.cache_clear()
+    old = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), "volume tv")
+    assert old.region is Region.UNKNOWN
+    assert old.failing is None
+
+
 def test_a_scene_can_be_judged_without_its_own_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     own = evidence(30, 0.03).as_json()
     entry = {"scene": 7, "method": "admm tv", "severity": 3.0, "evidence": own}
