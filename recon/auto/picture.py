@@ -26,6 +26,7 @@ from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.varying_picture import reconstruct_varying
 from recon.volume.channel import PRIORS
+from recon.volume.field_registration import one_psf
 from recon.volume.model import one_depth, sort_by_depth
 
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -222,8 +223,8 @@ def _at_depth(
 
 
 def _central(calibration: Calibration) -> Calibration:
-    """Return the PSF nearest to the axis alone."""
+    """Return one PSF for the whole field: the one on the axis."""
     positions = calibration.source_positions_um
     nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
     own = slice(nearest, nearest + 1)
-    return replace(calibration, psfs=calibration.psfs[own], source_positions_um=positions[own])
+    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])

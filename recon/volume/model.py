@@ -12,8 +12,9 @@ from recon.checks import select_psf
 from recon.errors import InputError
 from recon.operators.local_convolution import FieldOfPsfs
 from recon.operators.low_rank import principal_psfs
-from recon.registration import Registration, aligned, expected_shift, moved, register
+from recon.registration import moved
 from recon.types import Calibration
+from recon.volume.field_registration import registered_field, shown
 
 Array = npt.NDArray[Any]
 ModelName = Literal["auto", "convolution", "local", "lowrank"]
@@ -27,8 +28,6 @@ SAME_PLACE_UM = 1.0
 """Sources nearer to one another in x and y were calibrated at one place."""
 LOW_RANK_ERROR = 0.03
 """Relative PSF error that the low-rank model is built to."""
-_SEARCH_PX, _SEARCH_PART = 16.0, 0.1
-"""A PSF is looked for this many pixels, and this part of its displacement, about where its source says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +58,12 @@ class Depths:
     z_um : ndarray, (n_z,)
         Nearest last or first as the calibration has it; NaN where not known.
     central : ndarray, float32, (n_z, n_channels, height, width)
-        The PSF nearest to the axis at each depth.
+        The PSF nearest to the axis at each depth; where none is near, what the others show of it.
     fields : list of FieldOfPsfs
         All PSFs of each depth, registered to the central one.
     warnings : tuple of str
-        Which PSFs could not be registered by their images, and were by their sources' places.
+        Which PSFs could not be registered by their images, and were by their sources' places; depths
+        without one near the axis.
     """
 
     z_um: npt.NDArray[np.float64]
@@ -84,9 +84,9 @@ class Depths:
             for psf, (rows, columns) in zip(field.psfs, field.points, strict=True):
                 # There and back between pixels as the registered one came, so that interpolation is no error.
                 seen = moved(moved(central, rows, columns), -rows, -columns)
-                shown = _shown(psf.shape[1:], rows, columns)
-                differences += float(np.sum((psf - seen)[:, shown].astype(np.float64) ** 2))
-                norms += float(np.sum(seen[:, shown].astype(np.float64) ** 2))
+                there = shown(psf.shape[1:], rows, columns)
+                differences += float(np.sum((psf - seen)[:, there].astype(np.float64) ** 2))
+                norms += float(np.sum(seen[:, there].astype(np.float64) ** 2))
         return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
 
     def within(self, window: tuple[int, int]) -> Depths:
@@ -119,98 +119,11 @@ def sort_by_depth(calibration: Calibration) -> Depths:
     z_um = np.array([float(np.mean(positions[group, 2])) for group in members])
     central, fields, warnings = [], [], []
     for group in members:
-        off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
-        reference = psfs[group[int(np.argmin(off_axis))]]
-        central.append(reference)
-        field, unseen = _registered(calibration, group, reference, group[int(np.argmin(off_axis))])
+        on_axis, field, trouble = registered_field(calibration, group)
+        central.append(on_axis)
         fields.append(field)
-        warnings += unseen
-    return Depths(z_um, np.stack(central), fields, tuple(warnings))
-
-
-def _registered(
-    calibration: Calibration, group: npt.NDArray[np.intp], reference: Array, central: int
-) -> tuple[FieldOfPsfs, list[str]]:
-    """Register the PSFs of one depth to the central one, between pixels; say which needed help."""
-    registered, points, warnings = [], [], []
-    for k in group:
-        psf = calibration.psfs[k]
-        if k == central:
-            registered.append(psf)
-            points.append((0.0, 0.0))
-            continue
-        near = _expected(calibration, int(k), central)
-        reach = _SEARCH_PX if near is None else _SEARCH_PX + _SEARCH_PART * float(np.hypot(*near))
-        found = register(psf.mean(axis=0), reference.mean(axis=0), near=near, within_px=reach)
-        if not found.reliable:
-            x, y, z = calibration.source_positions_um[k]
-            trouble = (
-                f"PSF {k} (source at x = {x:g}, y = {y:g}, z = {z:g} um) cannot be registered to PSF "
-                f"{central}: its correlation has no peak that stands out ({found.prominence:.2f} times the "
-                "next)"
-            )
-            if near is None:
-                raise InputError(
-                    f"{trouble}. Leave it out, or take it again with more light or nearer to the axis."
-                )
-            warnings.append(f"{trouble}; it was placed by its source's position (Kuo 2020, Eq. 5.2).")
-            found = replace(found, rows=near[0], columns=near[1])
-        registered.append(_completed(aligned(psf, found), reference, found))
-        points.append((found.rows, found.columns))
-    return FieldOfPsfs(np.stack(registered), points), warnings
-
-
-def _shown(shape: tuple[int, ...], rows: float, columns: float) -> npt.NDArray[np.bool_]:
-    """Tell which pixels of a PSF registered from a displacement were photographed.
-
-    Registration between pixels mixes the outermost row and column with the dark beyond: they do not count.
-    """
-    inside = []
-    for n, by in zip(shape, (rows, columns), strict=True):
-        place = np.arange(n) + by
-        inside.append((place >= (by != round(by))) & (place <= n - 1 - (by != round(by))))
-    return np.asarray(inside[0][:, None] & inside[1])
-
-
-def _completed(psf: Array, reference: Array, found: Registration) -> Array:
-    """Fill in what a registered PSF's photograph did not show: the central one, as bright as the rest says.
-
-    A source at the field's edge throws part of its pattern beside the sensor. Seen from there that part is
-    never missed, but sources between it and the axis, which the local model takes from both, throw it onto
-    the sensor. How bright it is there is a line through the ratio of both PSFs where both show.
-    """
-    height, width = psf.shape[1:]
-    rows, columns = np.arange(height)[:, None], np.arange(width)
-    shown = _shown((height, width), found.rows, found.columns)
-    if shown.all() or not shown.any():
-        return psf
-    terms = np.broadcast_arrays(
-        np.ones(()), rows / height - 0.5, columns / width - 0.5, np.zeros(shown.shape)
-    )
-    completed = psf.copy()
-    for image, central in zip(completed, reference, strict=True):
-        light = image[shown].astype(np.float64)
-        basis = np.stack([t[shown] * central[shown] for t in terms[:3]])
-        power = float(basis[0] @ basis[0])
-        if power == 0:
-            continue
-        mean = max(float(basis[0] @ light) / power, 0.0)
-        coefficients = np.linalg.lstsq(basis.T, light, rcond=1e-3)[0]
-        gain = np.clip(sum(c * t for c, t in zip(coefficients, terms, strict=False)), 0, 1.5 * mean)
-        image[~shown] = (gain * central)[~shown]
-    return completed
-
-
-def _expected(calibration: Calibration, k: int, central: int) -> tuple[float, float] | None:
-    """Displacement of PSF ``k`` from the central one by the sources' places; None where not known."""
-    geometry, positions = calibration.geometry, calibration.source_positions_um[[k, central]]
-    if not geometry.diffuser_distance_mm or not geometry.pixel_pitch_um or not np.isfinite(positions).all():
-        return None
-    (row, column), (row_0, column_0) = (
-        expected_shift((x, y, z), 1e3 * geometry.diffuser_distance_mm, geometry.pixel_pitch_um)
-        for x, y, z in positions.tolist()
-    )
-    return row - row_0, column - column_0
+        warnings += trouble
+    return Depths(z_um, np.stack(central), fields, tuple(dict.fromkeys(warnings)))
 
 
 def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray[np.intp]]:

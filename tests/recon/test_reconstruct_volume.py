@@ -427,20 +427,3 @@ def test_a_background_is_not_negative(prior):
     assert iterations == list(range(1, len(iterations) + 1))
     assert len(seen) == len(iterations) > 60
     assert abs(where(result.volume, BEADS[0])[0] - BEADS[0][2]) <= 1.5
-
-
-def test_what_an_edge_psf_does_not_show_is_taken_from_the_central_one():
-    from recon.registration import Registration
-    from recon.volume.model import _completed
-
-    rng = np.random.default_rng(0)
-    central = rng.random((1, 40, 48)).astype(np.float32)
-    brightness = np.linspace(0.4, 0.8, 48, dtype=np.float32)
-    # Displaced by 10.3 columns: registered, its last 11 columns lie beyond the sensor's edge.
-    photographed = central * brightness
-    photographed[..., 37:] = 0
-    found = Registration(0.0, 10.3, 1.0, 1.0, 10.0)
-    completed = _completed(photographed, central, found)
-    np.testing.assert_allclose(completed[0, 1:-1, 1:], (central * brightness)[0, 1:-1, 1:], rtol=1e-4)
-    whole = central * brightness
-    np.testing.assert_allclose(_completed(whole, central, found)[..., 1:-13], whole[..., 1:-13], rtol=1e-6)
