@@ -31,10 +31,10 @@ from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
 from gui.views.convergence import ConvergenceView
 from gui.views.facts import FactsView
-from gui.views.picture_view import PictureView, as_shown
+from gui.views.picture_view import PictureView
 from gui.views.reconstruct_form import CALIBRATION, PSF, ReconstructForm
 from gui.views.volume_view import VolumeView
-from gui.widgets.colour_maps import table
+from gui.widgets.colour_maps import as_shown
 from gui.widgets.question import Question, choose_path
 from instrument.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.errors import BenchError, FileError
@@ -45,6 +45,9 @@ from instrument.result_export import export_result
 from instrument.result_list import find_results, free_name
 from instrument.stored_result import StoredResult, open_result
 from recon.auto import Choice
+
+Views = dict[Path, npt.NDArray[np.uint8]]
+"""Files of an export with the colours that they show, (height, width, 3)."""
 
 
 class ReconstructionsPanel(Panel):
@@ -221,9 +224,10 @@ class ReconstructionsPanel(Panel):
         """Export the result that the name was chosen for, after asking whether files may be replaced."""
         if not self._still_shown(result):
             return
-        present = [path for path in self._export_files(target) if path.exists()]
+        views = self._views_for(target)  # what is asked about now is what is written after the answer
+        present = [path for path in views or (target,) if path.exists()]
         if not present:
-            self.export_to(target)
+            self.export_to(target, views=views)
             return
         names = ", ".join(path.name for path in present)
         box = Question(QMessageBox.Icon.Question, "Replace?", f"{names}: exists already. Replace it?", self)
@@ -232,7 +236,7 @@ class ReconstructionsPanel(Panel):
 
         def answered() -> None:
             if box.clickedButton() is replace and self._still_shown(result):
-                self.export_to(target, overwrite=True)
+                self.export_to(target, overwrite=True, views=views)
 
         box.finished.connect(answered)
         box.ask()
@@ -244,30 +248,37 @@ class ReconstructionsPanel(Panel):
         self.refused(None, f"{result.path.name} is not open any more: nothing was exported. Open it again.")
         return False
 
-    def _export_files(self, target: Path) -> dict[Path, str]:
-        """Return the files that an export writes, each with the view that it shows ("" for all values)."""
+    def _views_for(self, target: Path) -> Views | None:
+        """Return the files of a ``.png`` export, each with what it shows now; None for all values."""
         if target.suffix.lower() != ".png":
-            return {target: ""}
-        names = list(self._shown())
-        if len(names) == 1:
-            return {target: names[0]}
-        return {target.with_name(f"{target.stem}-{name}.png"): name for name in names}
+            return None
+        shown = self._shown()
+        if len(shown) == 1:
+            return {target: next(iter(shown.values()))}
+        return {target.with_name(f"{target.stem}-{name}.png"): pixels for name, pixels in shown.items()}
 
-    def export_to(self, target: Path, *, overwrite: bool = False) -> Job | None:
-        """Write what is shown (``.png``: one file for each view), or all values, as the name asks for."""
+    def export_to(self, target: Path, *, overwrite: bool = False, views: Views | None = None) -> Job | None:
+        """Write what is shown (``.png``: one file for each view), or all values, as the name asks for.
+
+        ``views`` are the files of a ``.png`` as they were when the name was chosen; default: as they are now.
+        """
         result = self.result
         if result is None:
             return None
-        if target.suffix.lower() == ".png":
-            views = self._shown()
-            shown = {path: views[name] for path, name in self._export_files(target).items()}
+        views = self._views_for(target) if views is None else views
+        if views is not None:
+            if not views:
+                self.refused(
+                    None, "The volume's views are still being read. Export them when they are shown."
+                )
+                return None
 
             def draw(_context: JobContext) -> list[Path]:
-                for path, pixels in shown.items():
+                for path, pixels in views.items():
                     if path.exists() and not overwrite:
                         raise BenchError(f"{path}: exists already and was left as it is.")
                     write_image(path, pixels)
-                return list(shown)
+                return list(views)
 
             job = self.jobs.compute(f"Exporting {target.name}", draw)
         else:
@@ -290,15 +301,11 @@ class ReconstructionsPanel(Panel):
         """Return the views in their colours, 8 bit."""
         view = self.picture if self.viewers.currentWidget() is self.picture else self.volume
         low, high = view.levels.levels
-        colours = table(view.levels.colour_map, mark_saturation=False)
+        colours = view.levels.colour_map
         if isinstance(view, PictureView):
-            return {"picture": as_shown(view.shown, low, high, colours)}
+            return {} if view.shown is None else {"picture": as_shown(view.shown, low, high, colours)}
         return {
-            name: (
-                np.clip(255 * image, 0, 255).astype(np.uint8)
-                if name == "depth"
-                else as_shown(image, low, high, colours)
-            )
+            name: as_shown(image, *((0.0, 1.0) if name == "depth" else (low, high)), colours)
             for name, image in view.images.items()
         }
 

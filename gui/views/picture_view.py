@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtWidgets import QHBoxLayout, QPushButton, QVBoxLayout, QWidget
@@ -93,11 +91,3 @@ class _ScaledImage(ImageView):
 
 def _length(um: float) -> str:
     return f"{um:.3g} µm" if abs(um) < 1000 else f"{um / 1000:.3g} mm"
-
-
-def as_shown(image: Any, low: float, high: float, table: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the 8-bit colours of an image as a view shows it, (height, width, 3)."""
-    scaled = np.clip((np.asarray(image, np.float32) - low) * (254 / max(high - low, 1e-12)), 0, 254)
-    indices = scaled.astype(np.uint8)
-    shown: npt.NDArray[np.uint8] = table[indices] if indices.ndim == 2 else indices
-    return shown

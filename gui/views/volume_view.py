@@ -296,7 +296,7 @@ class VolumeView(QWidget):
     def _show(self) -> None:
         if self._source is None:
             return
-        for view in (self.front, self.side, self.top):
+        for view in (self.front, self.side, self.top, self.coloured):
             view.set_colour_map(self.levels.colour_map)
         if self.mode == "slices":
             self._show_slices()

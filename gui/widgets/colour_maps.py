@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from instrument.frame_view import SATURATED
 
+_SIGNAL = SATURATED - 1
 _SATURATED_RGB = {"grey": (255, 40, 40), "red": (255, 120, 90)}
 _STOPS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "grey": ((0, 0, 0), (255, 255, 255)),
@@ -42,3 +44,29 @@ def table(name: str, *, mark_saturation: bool = True) -> npt.NDArray[np.uint8]:
     result[SATURATED] = _SATURATED_RGB.get(name, (255, 255, 255)) if mark_saturation else result[254]
     result.flags.writeable = False
     return result
+
+
+def spares_hues(name: str) -> bool:
+    """Whether a map has one hue for everything: coloured images go through it too, by their brightness."""
+    return name == "red"
+
+
+def indices_of(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.float32]:
+    """Return an image's places in a map, 0 to 254; what is no number is darkest."""
+    scaled = (np.asarray(image, np.float32) - np.float32(low)) * np.float32(_SIGNAL / max(high - low, 1e-12))
+    places: npt.NDArray[np.float32] = np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
+    return places
+
+
+def grey_indices(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.float32]:
+    """Return the same of a coloured image (height, width, 3), by the mean of its channels."""
+    return indices_of(image, low, high).mean(axis=2)
+
+
+def as_shown(image: npt.NDArray[Any], low: float, high: float, name: str) -> npt.NDArray[np.uint8]:
+    """Return the 8-bit colours of an image as a view shows it in a map, (height, width, 3)."""
+    if image.ndim == 2 or spares_hues(name):
+        places = indices_of(image, low, high) if image.ndim == 2 else grey_indices(image, low, high)
+        mapped: npt.NDArray[np.uint8] = table(name, mark_saturation=False)[places.astype(np.uint8)]
+        return mapped
+    return np.round(indices_of(image, low, high) * (255 / _SIGNAL)).astype(np.uint8)

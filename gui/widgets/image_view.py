@@ -13,12 +13,11 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from gui.theme import colours
 from gui.widgets.arrow_keys import ArrowKeys
-from gui.widgets.colour_maps import table
+from gui.widgets.colour_maps import grey_indices, indices_of, spares_hues, table
 from instrument.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 
-_SIGNAL = SATURATED - 1
 _PAN = 0.05
 """An arrow key moves what is shown by this part of it, where arrows mean nothing else."""
 
@@ -28,7 +27,8 @@ class ImageView(QWidget):
 
     Integer images go through one look-up table from counts to 8-bit indices, made when levels change, and are
     shrunk on the way to what the screen can show, so that a frame costs one pass; saturated counts get an
-    index (and colour) of their own, which survives the shrinking.
+    index (and colour) of their own, which survives the shrinking. The red map, made for a dark room, shows
+    coloured images too: by the mean of their channels.
 
     Signals
     -------
@@ -72,6 +72,8 @@ class ImageView(QWidget):
         self._mouse: QPointF | None = None
         """The last place of the mouse in the scene."""
         self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
+        self._levels: tuple[float, float, int | None] = (0.0, 1.0, None)
+        """What the image is shown with: low, high, full scale."""
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
         layout = QVBoxLayout(self)
@@ -94,9 +96,13 @@ class ImageView(QWidget):
 
     def set_colour_map(self, name: str) -> None:
         """Choose another colour map."""
-        self._colour_map = name
-        if self.image is not None:
+        before, self._colour_map = self._colour_map, name
+        if self.image is None:
+            return
+        if self.image.ndim == 2:
             self.item.setLookupTable(table(name))
+        elif spares_hues(before) != spares_hues(name):
+            self.show_image(self.image, *self._levels)
 
     def restyle(self) -> None:
         """Take over the background and the colour map of the theme in use."""
@@ -119,16 +125,19 @@ class ImageView(QWidget):
         self.image = image
         if first:
             self.whole()
+        self._levels = (low, high, full_scale)
         step = self._step(image)
-        shape = (image.shape[0] // step, image.shape[1] // step, *image.shape[2:])
+        size = (image.shape[0] // step, image.shape[1] // step)
+        mapped = image.ndim == 2 or spares_hues(self._colour_map)
+        shape = size if mapped else (*size, *image.shape[2:])
         if self._indices.shape != shape:
             self._indices = np.empty(shape, np.uint8)
         self._fill(image, low, high, full_scale, step)
-        lut = table(self._colour_map) if image.ndim == 2 else None
+        lut = table(self._colour_map) if mapped else None
         self.item.setImage(self._indices, autoLevels=False, levels=None, lut=lut)
-        if (shape, step) != self._placed:
-            self._placed = (shape, step)
-            self.item.setRect(QRectF(0, 0, shape[1] * step, shape[0] * step))
+        if (size, step) != self._placed:
+            self._placed = (size, step)
+            self.item.setRect(QRectF(0, 0, size[1] * step, size[0] * step))
 
     def whole(self) -> None:
         """Show the whole image."""
@@ -150,6 +159,13 @@ class ImageView(QWidget):
         return max(1, min(step, int(image.shape[0]), int(image.shape[1])))
 
     def _fill(self, image: Image, low: float, high: float, full_scale: int | None, step: int) -> None:
+        if image.ndim > self._indices.ndim:
+            height, width = self._indices.shape
+            shown = image[::step, ::step][:height, :width]
+            self._indices[...] = grey_indices(shown, low, high)
+            if full_scale is not None:
+                self._indices[(shown >= full_scale).any(axis=2)] = SATURATED
+            return
         if image.dtype in (np.uint8, np.uint16):
             key = (image.dtype, low, high, full_scale)
             if key != self._table_key:
@@ -163,11 +179,7 @@ class ImageView(QWidget):
                 self._indices[(self._indices == SATURATED).any(axis=2)] = table("grey")[SATURATED]
             return
         height, width = self._indices.shape[:2]
-        image = image[::step, ::step][:height, :width]
-        span = max(high - low, 1e-12)
-        scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(_SIGNAL / span)
-        np.clip(np.nan_to_num(scaled, copy=False), 0, _SIGNAL, out=scaled)
-        self._indices[...] = scaled
+        self._indices[...] = indices_of(image[::step, ::step][:height, :width], low, high)
 
     # Keys ----------------------------------------------------------------------------------------
     def _zoom(self, factor: float) -> None:

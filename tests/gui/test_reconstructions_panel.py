@@ -346,6 +346,28 @@ def test_another_result_is_not_exported_under_the_name_of_the_first(
     assert target.read_bytes() == b"kept"
 
 
+def test_the_views_exported_are_those_that_were_asked_about(
+    qtbot: QtBot, panel: ReconstructionsPanel, tmp_path
+) -> None:
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).random((4, 20, 30), np.float32))
+    panel.open(tmp_path / "v.npy")
+    qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
+    (tmp_path / "view-front.png").write_bytes(b"old")
+    qtbot.mouseClick(panel.export_button, Qt.MouseButton.LeftButton)
+    (dialogue,) = panel.findChildren(QFileDialog)
+    dialogue.fileSelected.emit(str(tmp_path / "view.png"))
+    dialogue.close()
+    (question,) = panel.findChildren(Question)
+    panel.volume.set_mode("slices")  # by a key, behind the question
+    (replace,) = (button for button in question.buttons() if button.text() == "Replace")
+    qtbot.mouseClick(replace, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: len(list(tmp_path.glob("view-*.png"))) == 4, timeout=WAIT_MS)
+    names = sorted(p.name for p in tmp_path.glob("view-*.png"))
+    assert names == ["view-depth.png", "view-front.png", "view-side.png", "view-top.png"]
+    qtbot.waitUntil(lambda: not panel.session.jobs.jobs, timeout=WAIT_MS)
+    assert read_image(tmp_path / "view-front.png").pixels.shape == (20, 30, 3)
+
+
 def test_levels_by_typing_and_automatic(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:
     write_image(tmp_path / "p.tif", np.linspace(0, 10, 400, dtype=np.float32).reshape(20, 20))
     panel.open(tmp_path / "p.tif")

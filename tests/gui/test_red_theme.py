@@ -14,6 +14,7 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.log import LogPanel
 from gui.theme import DARK, RED, colours
+from gui.widgets.colour_maps import as_shown
 from gui.widgets.image_view import ImageView
 
 WAIT_MS = 60_000
@@ -37,8 +38,8 @@ def red_window(qtbot: QtBot, window: MainWindow) -> Iterator[MainWindow]:
     for name in PANELS:
         window.show_panel(name)
         qtbot.wait(30)
-    for view in window.findChildren(ImageView):  # white pictures, made under the other theme
-        view.show_image(np.full((40, 60), 200, np.uint8), 0, 200)
+    for n, view in enumerate(window.findChildren(ImageView)):  # white pictures, made under the other theme
+        view.show_image(np.full((40, 60) if n % 2 else (40, 60, 3), 200, np.uint8), 0, 200)
     qtbot.keyClick(
         window, Qt.Key.Key_2, Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
     )
@@ -55,6 +56,31 @@ def test_every_panel_is_red_also_what_was_there_before(qtbot: QtBot, red_window:
         red_window.show_panel(name)
         qtbot.wait(30)
         assert _not_red(red_window) < 2e-3, name
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_a_coloured_picture_is_shown_by_its_brightness_in_the_red_map(qtbot: QtBot, dtype: type) -> None:
+    picture = np.zeros((40, 60, 3), dtype)
+    picture[:, :20, 1] = 120
+    picture[:, 20:40] = 120
+    picture[0, 0, 2] = 255  # one channel of one pixel is saturated
+    view = ImageView("grey")
+    qtbot.addWidget(view)
+    view.show_image(picture, 0, 200, 255)
+    assert view.item.image.shape == (40, 60, 3)
+    view.set_colour_map("red")
+    places = view.item.image
+    assert places.ndim == 2
+    assert int(places[20, 30]) == pytest.approx(3 * int(places[20, 10]), abs=2)
+    assert places[20, 50] == 0
+    assert places[0, 0] == 255
+    red = as_shown(picture, 0, 200, "red")
+    assert red.shape == (40, 60, 3)
+    assert red[20, 30, 0] > red[20, 10, 0] > 0
+    assert not red[..., 1:].any()
+    assert (as_shown(picture, 0, 120, "grey")[20, 10] == (0, 255, 0)).all()
+    view.set_colour_map("grey")
+    assert view.item.image.shape == (40, 60, 3)
 
 
 def test_a_line_of_the_log_keeps_what_its_colour_says(window: MainWindow) -> None:
