@@ -117,13 +117,26 @@ def free_bytes(folder: Path) -> int:
     Raises
     ------
     FileError
-        When nothing can be kept there: its path leads through a file, or may not be written to.
+        When nothing can be kept there: its path leads to no disk or through a file, or may not be written to.
     """
-    there = folder.absolute()
-    while not there.exists():
-        there = there.parent
+    there = there_now(folder)
     if not there.is_dir():
         raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
     if not os.access(there, os.W_OK):
         raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
     return shutil.disk_usage(there).free
+
+
+def there_now(folder: Path) -> Path:
+    """Return what there is of a path already: itself, or the nearest folder above it.
+
+    Raises
+    ------
+    FileError
+        When there is nothing of it, not even its disk.
+    """
+    path = folder.absolute()
+    for there in (path, *path.parents):
+        if there.exists():
+            return there
+    raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")

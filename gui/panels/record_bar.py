@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
 from typing import cast
 
 from PySide6.QtCore import QTimer
@@ -10,7 +14,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QLineEdit, QProgressBar, QPus
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.widgets.number_edit import NumberEdit
-from instrument.acquire import free_bytes
+from instrument.acquire import free_bytes, there_now
 from instrument.errors import FileError
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.recorder import Recorder, RecordingStatus
@@ -20,6 +24,8 @@ from instrument.store import Run
 from instrument.words import size
 
 _DISK_MS = 5000
+_SILENT_S = 4.0
+"""A disk that takes longer is told as one that is silent."""
 
 
 class RecordBar(QWidget):
@@ -37,6 +43,8 @@ class RecordBar(QWidget):
         self._session = panel.session
         self._recorder: Recorder | None = None
         self.job: Job | None = None
+        self._looking: Job | None = None
+        self._asked_s = 0.0
         self.button = QPushButton("● Record")
         self.button.setToolTip("Record every frame to the disk; again ends it (Ctrl+R)")
         self.button.clicked.connect(self.toggle)
@@ -49,6 +57,8 @@ class RecordBar(QWidget):
         self.gauge = QProgressBar()
         self.gauge.setToolTip("How full the disk is")
         self.gauge.setFixedWidth(150)
+        self.gauge.setRange(0, 1000)
+        self.gauge.setFormat("…")
         self.note = QLabel()
         layout = QHBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
@@ -133,23 +143,58 @@ class RecordBar(QWidget):
         self._look_at_disk()
 
     def _look_at_disk(self) -> None:
-        folder = self._session.runs_folder.absolute()
-        import shutil
-
-        self.gauge.setRange(0, 1000)
-        try:
-            while not folder.exists():
-                folder = folder.parent
-            usage, free = shutil.disk_usage(folder), free_bytes(self._session.runs_folder)
-        except (OSError, FileError) as error:  # no such place, a drive taken away, a server that is silent
-            self.gauge.setValue(0)
-            self.gauge.setFormat("disk not known")
-            self.gauge.setToolTip(f"{folder}: {error.strerror}" if isinstance(error, OSError) else str(error))
+        """Ask how full the disk is, in a job: one of a server that is silent would hold the window up."""
+        if self._looking is not None:
+            if time.monotonic() - self._asked_s > _SILENT_S:
+                self._not_known(f"{self._session.runs_folder}: its disk has not answered yet.")
             return
-        # Some file systems of servers and user space tell no size.
-        self.gauge.setValue(round(1000 * (1 - usage.free / usage.total)) if usage.total else 0)
-        self.gauge.setFormat(f"{size(free)} free" if usage.total else "disk not known")
+        folder = self._session.runs_folder
+        self._asked_s = time.monotonic()
+        job = self._session.jobs.compute("Looking at the disk", lambda _: _disk_of(folder))
+        job.quiet = True
+        self._looking = job
+        job.succeeded.connect(self._show_disk)
+        job.failed.connect(self._not_known)
+        job.ended.connect(self._looked)
+
+    def _looked(self) -> None:
+        self._looking = None
+
+    def _show_disk(self, value: object) -> None:
+        disk = cast(_Disk, value)
+        if disk.problem:
+            self._not_known(disk.problem)
+            return
+        self.gauge.setValue(round(1000 * disk.full))
+        self.gauge.setFormat(f"{size(disk.free)} free")
         self.gauge.setToolTip(f"How full the disk is that holds {self._session.runs_folder}")
+
+    def _not_known(self, why: str) -> None:
+        self.gauge.setValue(0)
+        self.gauge.setFormat("disk not known")
+        self.gauge.setToolTip(why)
+
+
+@dataclass(frozen=True, slots=True)
+class _Disk:
+    """A disk's full share and free bytes, or why they are not known."""
+
+    full: float = 0.0
+    free: int = 0
+    problem: str = ""
+
+
+def _disk_of(folder: Path) -> _Disk:
+    try:
+        free = free_bytes(folder)
+        total = shutil.disk_usage(there_now(folder)).total
+    except OSError as error:  # no such place, a drive taken away
+        return _Disk(problem=f"{folder}: {error.strerror or error}")
+    except FileError as error:
+        return _Disk(problem=str(error))
+    if not total:  # as some file systems of servers and user space have it
+        return _Disk(problem=f"{folder}: its file system tells no size.")
+    return _Disk(1 - free / total, free)
 
 
 def _duration(seconds: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections import namedtuple
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ from PySide6.QtWidgets import QSplitter
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
+from gui.panels import record_bar
 from gui.panels.live import LivePanel
+from instrument.acquire import free_bytes
+from instrument.errors import FileError
 from instrument.store import Run
 
 WAIT_MS = 60_000
@@ -149,9 +153,16 @@ def test_a_recording_does_not_begin_with_the_photograph_of_before(qtbot: QtBot, 
 _Usage = namedtuple("_Usage", "total used free")
 
 
+def _ask_the_disk(qtbot: QtBot, live: LivePanel) -> None:
+    bar = live.record_bar
+    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+    bar._look_at_disk()
+    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+
+
 @pytest.mark.parametrize("answer", [_Usage(0, 0, 0), OSError(5, "Input/output error")])
 def test_a_disk_that_tells_no_size_takes_nothing_but_the_gauge(
-    live: LivePanel, monkeypatch: pytest.MonkeyPatch, answer: Any
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch, answer: Any
 ) -> None:
     def usage(_: Path) -> _Usage:
         if isinstance(answer, OSError):
@@ -159,16 +170,47 @@ def test_a_disk_that_tells_no_size_takes_nothing_but_the_gauge(
         return answer
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
-    live.record_bar._look_at_disk()
+    _ask_the_disk(qtbot, live)
     assert live.record_bar.gauge.format() == "disk not known"
 
 
 def test_a_folder_whose_disk_was_taken_away_takes_nothing_but_the_gauge(
-    live: LivePanel, monkeypatch: pytest.MonkeyPatch
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def exists(_: Path) -> bool:
         raise OSError(107, "Transport endpoint is not connected")
 
     monkeypatch.setattr(Path, "exists", exists)
-    live.record_bar._look_at_disk()
+    _ask_the_disk(qtbot, live)
     assert live.record_bar.gauge.format() == "disk not known"
+
+
+def test_a_server_that_is_silent_holds_up_nothing_but_the_gauge(
+    qtbot: QtBot, live: LivePanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bar = live.record_bar
+    qtbot.waitUntil(lambda: bar._looking is None, timeout=WAIT_MS)
+    answered = threading.Event()
+    asked: list[Path] = []
+
+    def usage(path: Path) -> _Usage:
+        asked.append(path)
+        answered.wait(WAIT_MS / 1000)
+        return _Usage(100, 50, 50)
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    monkeypatch.setattr(record_bar, "_SILENT_S", 0.0)
+    bar._look_at_disk()
+    qtbot.waitUntil(lambda: bool(asked), timeout=WAIT_MS)
+    bar._look_at_disk()  # the timer's next turn: asks no second time
+    assert bar.gauge.format() == "disk not known"
+    assert "not answered" in bar.gauge.toolTip()
+    assert len(asked) == 1
+    answered.set()
+    qtbot.waitUntil(lambda: bar.gauge.format() == "50 bytes free", timeout=WAIT_MS)
+
+
+def test_a_path_of_which_nothing_is_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "exists", lambda _: False)  # a drive that is not connected
+    with pytest.raises(FileError, match="not even its disk"):
+        free_bytes(Path("somewhere/else"))
