@@ -16,6 +16,9 @@ from recon.result import Reconstruction
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 
+MOST_ITERATIONS = 200
+"""It mostly settles before."""
+
 
 def full_picture(
     image: npt.NDArray[Any],
@@ -54,6 +57,7 @@ def full_picture(
         calibration,
         z_um=z_um,
         background=background,
+        iterations=MOST_ITERATIONS,
         callback=callback,
         cancel=cancel,
     )

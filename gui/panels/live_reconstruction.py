@@ -30,10 +30,11 @@ from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.question import choose_path
 from instrument.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.full_picture import full_picture
+from instrument.full_picture import MOST_ITERATIONS, full_picture
 from instrument.live import LiveResult
 from instrument.reconstruction_job import find_calibration
 from instrument.snapshot import Light, light_of
+from instrument.words import duration
 from recon.live import LiveReconstructor
 from recon.result import Reconstruction
 from recon.types import Calibration
@@ -58,6 +59,8 @@ class _Loaded:
 @dataclass(frozen=True, slots=True)
 class _SoFar:
     iteration: int
+    most_left_s: float
+    """Time to the last iteration allowed: the picture mostly settles before."""
     image: npt.NDArray[np.float32]
 
 
@@ -138,7 +141,7 @@ class LiveReconstructionPanel(Panel):
     def as_python(self) -> str:
         """Return lines that reconstruct live with the same calibration."""
         path = self.session.config.path
-        calibration = self.file.text() or "calibration"
+        calibration = "calibration" if self.loaded is None else str(self.loaded.path)
         return (
             "from instrument.bench import open_bench\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
@@ -187,24 +190,15 @@ class LiveReconstructionPanel(Panel):
         if job is not self._reading:
             return
         path, calibration = cast(tuple[Path, Calibration], value)
-        self.accepted(self.file)
-        self.file.setText(str(path))
-        depths = np.unique(calibration.source_positions_um[:, 2])
-        depths = depths[np.isfinite(depths)]
-        self.plane.clear()
-        if len(depths) > 1:
-            for z_um in depths:
-                self.plane.addItem(f"z {z_um / 1e3:.4g} mm", float(z_um))
-            self.plane.setCurrentIndex(len(depths) // 2)
-        self.plane.setVisible(len(depths) > 1)
-        self._build(path, calibration)
+        depths = _depths_um(calibration)
+        self._build(path, calibration, depths[len(depths) // 2] if depths else None)
 
     def _rebuild(self) -> None:
         if self.loaded is not None:
-            self._build(self.loaded.path, self.loaded.calibration)
+            self._build(self.loaded.path, self.loaded.calibration, self.z_um)
 
-    def _build(self, path: Path, calibration: Calibration) -> None:
-        z_um, budget_ms = self.z_um, self.budget.value or _BUDGET_MS
+    def _build(self, path: Path, calibration: Calibration, z_um: float | None) -> None:
+        budget_ms = self.budget.value or _BUDGET_MS
 
         def work(_: JobContext) -> _Loaded:
             self.follower.stop()
@@ -225,11 +219,9 @@ class LiveReconstructionPanel(Panel):
             return
         loaded = self.loaded
         if loaded is not None:
-            place = -1 if loaded.z_um is None else self.plane.findData(loaded.z_um)
-            if place >= 0:
-                self.plane.setCurrentIndex(place)
-            where = self.plane.currentText() if place >= 0 else str(loaded.path)
-            why = f"{why} The preview goes on as before: {where}."
+            self._show_depths(loaded)
+            depth = f", {self.plane.currentText()}" if self.plane.count() else ""
+            why = f"{why} The preview goes on as before: {loaded.path}{depth}."
         else:
             self.status.setText(_NO_CALIBRATION)
         self.refused(self.file, why)
@@ -242,8 +234,22 @@ class LiveReconstructionPanel(Panel):
         if job is not self._loading:
             return  # another depth was chosen meanwhile
         self.loaded = cast(_Loaded, value)
+        self.accepted(self.file)
+        self.file.setText(str(self.loaded.path))
+        self._show_depths(self.loaded)
         self.follower.use(self.loaded.reconstructor)
         self.status.setText("Waiting for a frame …")
+
+    def _show_depths(self, loaded: _Loaded) -> None:
+        """List the depths of the calibration in use, with the one that is used."""
+        depths = _depths_um(loaded.calibration)
+        if [self.plane.itemData(i) for i in range(self.plane.count())] != depths:
+            self.plane.clear()
+            for z_um in depths:
+                self.plane.addItem(f"z {z_um / 1e3:.4g} mm", z_um)
+        if loaded.z_um is not None:
+            self.plane.setCurrentIndex(self.plane.findData(loaded.z_um))
+        self.plane.setVisible(bool(depths))
 
     def _browse(self) -> None:
         start = self.file.text() or str(self.session.runs_folder)
@@ -349,7 +355,9 @@ class LiveReconstructionPanel(Panel):
                 nonlocal shown_s
                 if not context.cancel.is_set() and time.monotonic() - shown_s > _PROGRESS_S:
                     shown_s = time.monotonic()
-                    context.report(_SoFar(record.iteration, np.array(present())))
+                    left = max(MOST_ITERATIONS - record.iteration, 0)
+                    left_s = left * record.seconds / record.iteration
+                    context.report(_SoFar(record.iteration, left_s, np.array(present())))
 
             return full_picture(image, loaded.calibration, z_um=z_um, callback=watch, cancel=context.cancel)
 
@@ -365,7 +373,8 @@ class LiveReconstructionPanel(Panel):
     def _refined_so_far(self, value: object) -> None:
         so_far = cast(_SoFar, value)
         self._show_picture(so_far.image)
-        self.status.setText(f"Refining: iteration {so_far.iteration}")
+        left = f"at most {duration(so_far.most_left_s)} left"
+        self.status.setText(f"Refining: iteration {so_far.iteration} of at most {MOST_ITERATIONS}, {left}")
 
     def _refined(self, value: object) -> None:
         result = cast(Reconstruction, value)
@@ -381,3 +390,10 @@ class LiveReconstructionPanel(Panel):
     def _refining_ended(self) -> None:
         self._refining = None
         self.refine_button.setText("Back to the preview" if self._holds else "Refine")
+
+
+def _depths_um(calibration: Calibration) -> list[float]:
+    """Return the depths to choose from, ascending; none where there is but one, or none is known."""
+    depths = np.unique(calibration.source_positions_um[:, 2])
+    depths = depths[np.isfinite(depths)]
+    return [float(z_um) for z_um in depths] if len(depths) > 1 else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -99,6 +100,27 @@ def test_refining_holds_its_picture_until_the_preview_is_wanted_again(
     qtbot.waitUntil(lambda: "latency" in panel.status.text(), timeout=WAIT_MS)
 
 
+def test_refining_tells_how_long_it_takes_at_most(
+    qtbot: QtBot, panel: LiveReconstructionPanel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_reconstruction, "_PROGRESS_S", 0.0)
+    qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
+    told: list[str] = []
+
+    def listen(so_far: Any) -> None:
+        panel._refined_so_far(so_far)
+        told.append(panel.status.text())
+
+    qtbot.mouseClick(panel.refine_button, Qt.MouseButton.LeftButton)
+    assert panel._refining is not None
+    panel._refining.progressed.connect(listen)
+    qtbot.waitUntil(lambda: bool(told) or panel._refining is None, timeout=WAIT_MS)
+    assert re.fullmatch(r"Refining: iteration \d+ of at most 200, at most [\d.]+ (s|min|h) left", told[0])
+    if panel._refining is not None:
+        panel.refine()
+    qtbot.waitUntil(lambda: panel._refining is None, timeout=WAIT_MS)
+
+
 def test_a_folder_without_a_calibration_is_refused_at_the_field(
     qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path
 ) -> None:
@@ -155,9 +177,36 @@ def test_a_depth_that_cannot_be_prepared_is_told_and_the_one_before_goes_on(
     panel.plane.setCurrentIndex(0)
     panel.plane.activated.emit(0)
     qtbot.waitUntil(lambda: "This PSF is dark." in panel.file.toolTip(), timeout=WAIT_MS)
-    assert "goes on as before: z 200 mm" in panel.file.toolTip()
+    assert "goes on as before:" in panel.file.toolTip()
+    assert "two, z 200 mm" in panel.file.toolTip()
     assert panel.z_um == 2e5
     qtbot.waitUntil(lambda: panel.follower.is_following, timeout=WAIT_MS)
+
+
+def test_after_another_calibration_failed_the_depths_are_still_those_of_the_one_in_use(
+    qtbot: QtBot, panel: LiveReconstructionPanel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = load_calibration(tmp_path / "calibration")
+
+    def load(name: str, *depths_um: float) -> None:
+        psfs = np.repeat(one.psfs, len(depths_um), axis=0)
+        places = np.array([[0.0, 0.0, z_um] for z_um in depths_um])
+        panel.file.setText(str(save_calibration(Calibration(psfs, places), tmp_path / name)))
+        panel.load()
+
+    load("good", 1e5, 2e5)
+    qtbot.waitUntil(lambda: panel.z_um == 2e5 and panel._loading is None, timeout=WAIT_MS)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise InputError("This PSF is dark.")
+
+    monkeypatch.setattr(live_reconstruction, "LiveReconstructor", refuse)
+    load("bad", 3e5, 4e5, 5e5)
+    qtbot.waitUntil(lambda: "This PSF is dark." in panel.file.toolTip(), timeout=WAIT_MS)
+    assert [panel.plane.itemText(i) for i in range(panel.plane.count())] == ["z 100 mm", "z 200 mm"]
+    assert panel.z_um == 2e5
+    assert f"{Path('good')}" in panel.as_python()
+    assert "bad" not in panel.as_python()
 
 
 def test_a_first_calibration_that_cannot_be_prepared_leaves_words_for_what_to_do(
