@@ -55,6 +55,8 @@ class LedPanel(Panel):
         self.spots.sigClicked.connect(self._clicked)
         self.plot.addItem(self.spots)
         self._drawn: LedPattern | None = None
+        self._dimmed: tuple[LedPattern, LedPattern] | None = None
+        """The pattern that was dimmed last, and the one whose hues it has: faint levels keep no hue."""
         self._positions: Any = None
         self.now = QLabel("–")
         self.now.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
@@ -238,10 +240,12 @@ class LedPanel(Panel):
 
         def work(_: object) -> None:
             now = leds.pattern
-            lit = tuple((i, _of_brightness(rgb, top)) for i, rgb in now.levels if max(rgb) > 0)
+            hues = self._dimmed[1] if self._dimmed is not None and self._dimmed[0] == now else now
+            lit = tuple((i, _of_brightness(rgb, top)) for i, rgb in hues.levels if max(rgb) > 0)
             if lit and lit != now.levels:
-                what = now.description.partition(" rgb ")[0].partition(" at ")[0]
+                what = hues.description.partition(" rgb ")[0].partition(" at ")[0]
                 leds.set_pattern(LedPattern(f"{what} at {top} of 255", lit))
+                self._dimmed = leds.pattern, hues
 
         self._start(f"LED array: brightness {top}", work)
 

@@ -6,6 +6,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
+from drivers.led_array import LedPattern
 from gui.main_window import MainWindow
 from gui.panels.holograms import HologramsPanel
 from gui.panels.led_array import LedPanel
@@ -46,6 +47,22 @@ def test_the_slider_dims_what_is_lit_each_led_in_its_colour_and_lights_nothing(
     qtbot.keyClick(leds.brightness, Qt.Key.Key_End)
     qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (255, 0, 0), 7: (0, 0, 255)}, timeout=WAIT_MS)
     assert array.pattern.description == "LED 3, 7 at 255 of 255"
+
+
+def test_a_hue_that_was_dimmed_to_the_faintest_comes_back(
+    qtbot: QtBot, window: MainWindow, leds: LedPanel
+) -> None:
+    array = window.session.bench.led_array
+    assert array is not None
+    window.session.device_job(
+        "orange", lambda _: array.set_pattern(LedPattern("LED 3", ((3, (250, 120, 10)),))), {"led_array"}
+    )
+    qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (250, 120, 10)}, timeout=WAIT_MS)
+    leds.brightness.setFocus()
+    qtbot.keyClick(leds.brightness, Qt.Key.Key_Home)
+    qtbot.waitUntil(lambda: max(dict(array.pattern.levels)[3]) == 1, timeout=WAIT_MS)
+    leds.brightness.setValue(250)
+    qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (250, 120, 10)}, timeout=WAIT_MS)
 
 
 def test_a_pattern_is_not_lit_with_an_aperture_that_makes_no_sense(
