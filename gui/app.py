@@ -14,8 +14,9 @@ from PySide6.QtWidgets import QApplication
 from gui.main_window import MainWindow, theme_of
 from gui.session import BenchSession
 from gui.theme import apply_theme
+from gui.widgets.message import TextWindow
 from instrument.config import BenchConfig
-from instrument.errors import BenchError
+from instrument.errors import BenchError, in_words
 
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""
@@ -57,6 +58,28 @@ def run(config: BenchConfig) -> int:
         for number, handler in before.items():
             signal.signal(number, handler)
     return status
+
+
+def show_mistake(error: BenchError) -> None:
+    """Show why the program does not start in a window of its own, until that is closed.
+
+    Does nothing where nobody would see it: without a screen.
+    """
+    if not _has_viewer():
+        return
+    app = application()
+    apply_theme(app, theme_of(QSettings("diffuserbench", "diffuserbench")))
+    window = TextWindow("diffuserbench cannot start", in_words(error) or str(error))
+    window.show()
+    app.exec()
+
+
+def _has_viewer() -> bool:
+    try:
+        require_screen()
+    except BenchError:
+        return False
+    return application().platformName() not in ("offscreen", "minimal")
 
 
 def require_screen() -> None:

@@ -32,7 +32,11 @@ def gui(
 
     Closing the window, Ctrl-C and SIGTERM end it safely: light off, motion stopped, runs closed.
     """
-    config = load_and_say(bench)
+    try:
+        config = load_and_say(bench)
+    except BenchError as error:
+        _show_too(error)
+        raise
     try:
         from gui.app import run
     except ModuleNotFoundError as error:
@@ -47,3 +51,12 @@ def gui(
             "libxkbcommon0 libfontconfig1 libdbus-1-3 libxcb-cursor0 libxcb-icccm4 libxcb-keysyms1"
         ) from None
     raise typer.Exit(run(config))
+
+
+def _show_too(error: BenchError) -> None:
+    """Show a mistake in a window: started from a menu, there is no terminal where it would be read."""
+    try:
+        from gui.app import show_mistake
+    except ImportError:  # the terminal tells it
+        return
+    show_mistake(error)

@@ -13,6 +13,7 @@ from PySide6.QtCore import QSettings, QTimer
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow
+from gui.widgets.message import TextWindow
 from instrument.cli import main
 
 
@@ -27,6 +28,31 @@ def test_a_wrong_bench_is_told_before_a_window_opens(
     file = tmp_path / "bench.toml"
     file.write_text('[camera]\ndriver = "simulatd"\n')
     assert main(["gui", str(file)]) == 2
+    assert "Did you mean" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("qapp")
+def test_a_wrong_bench_is_told_in_a_window_too(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "bench.toml"
+    file.write_text('[camera]\ndriver = "simulatd"\n')
+    shown: list[str] = []
+
+    def read_and_close() -> None:
+        for window in QApplication.topLevelWidgets():
+            if isinstance(window, TextWindow) and window.isVisible():
+                shown.append(window.view.toPlainText())
+                window.close()
+                return
+        QTimer.singleShot(50, read_and_close)
+
+    monkeypatch.setattr("gui.app._has_viewer", lambda: True)  # the platform of tests has none
+    QTimer.singleShot(0, read_and_close)
+    assert main(["gui", str(file)]) == 2
+    (text,) = shown
+    assert "bench.toml:2" in text
+    assert "Did you mean" in text
     assert "Did you mean" in capsys.readouterr().err
 
 
