@@ -12,6 +12,7 @@ import numpy.typing as npt
 from instrument.atomic import whole_file
 from instrument.errors import FileError
 from instrument.images import write_image
+from instrument.plane_steps import middle_step_um
 from instrument.reconstruction_file import preview
 from instrument.stored_result import StoredResult
 from instrument.volume_source import VolumeSource
@@ -117,7 +118,7 @@ def _to_tiff(result: StoredResult, source: VolumeSource, target: Path, advance: 
     metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX"}
     if (planes := result.planes_um) is not None and n_z > 1:
         z_um, pitch_um = planes
-        spacing, pitch = abs(float(z_um[n_z // 2] - z_um[n_z // 2 - 1])), float(pitch_um[n_z // 2])
+        spacing, pitch = middle_step_um(z_um), float(pitch_um[n_z // 2])
         metadata |= {"PhysicalSizeX": pitch, "PhysicalSizeY": pitch, "PhysicalSizeZ": spacing}
         metadata |= {f"PhysicalSize{axis}Unit": "µm" for axis in "XYZ"}
 

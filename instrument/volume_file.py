@@ -14,6 +14,7 @@ import numpy as np
 from instrument.atomic import whole_file, write_text
 from instrument.figures import save_figure
 from instrument.plain_json import plain
+from instrument.plane_steps import middle_step_um, uneven_steps
 from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_job import Job
 from instrument.volume_zarr import is_zarr_name, write_volume_zarr
@@ -68,6 +69,7 @@ def volume_record(result: VolumeReconstruction, job: Job) -> dict[str, Any]:
         "stop_reasons": [str(reason) for reason in result.stop_reasons],
         "seconds": result.seconds,
         "warnings": [*job.warnings, *result.warnings],
+        "uneven_steps": uneven_steps(result.grid.z_um),
         "verdict": None if result.verdict is None else result.verdict.as_json(),
         "grid": {
             "shape": result.grid.shape,
@@ -93,7 +95,7 @@ def _voxel_size(grid: VolumeGrid) -> dict[str, Any]:
     sizes = {
         "X": float(grid.pitch_um[middle]),
         "Y": float(grid.pitch_um[middle]),
-        "Z": float(grid.spacing_um[middle]),
+        "Z": middle_step_um(grid.z_um),
     }
     lengths = {f"PhysicalSize{axis}": value for axis, value in sizes.items()}
     return lengths | {f"PhysicalSize{axis}Unit": "µm" for axis in sizes}

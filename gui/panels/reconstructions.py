@@ -39,6 +39,7 @@ from gui.widgets.question import Question, choose_path
 from instrument.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.errors import BenchError, FileError
 from instrument.images import write_image
+from instrument.plane_steps import uneven_steps
 from instrument.reconstruction_job import find_calibration
 from instrument.reconstruction_request import VolumeRequest
 from instrument.result_export import export_result
@@ -292,9 +293,15 @@ class ReconstructionsPanel(Panel):
                 return [target]
 
             job = self.jobs.compute(f"Exporting {target.name}", write)
-        self.tells(job).succeeded.connect(
-            lambda files: self.session.log("info", f"Wrote {', '.join(map(str, files))}")
-        )
+        planes_um = None if views is not None or target.suffix.lower() == ".npy" else result.planes_um
+        steps = "" if planes_um is None else uneven_steps(planes_um[0])
+
+        def told(files: list[Path]) -> None:
+            self.session.log("info", f"Wrote {', '.join(map(str, files))}")
+            if steps:
+                self.session.log("warning", f"{target.name}: {steps}")
+
+        self.tells(job).succeeded.connect(told)
         return job
 
     def _shown(self) -> dict[str, npt.NDArray[np.uint8]]:

@@ -11,6 +11,7 @@ from instrument.cli.app import command_app, examples
 from instrument.cli.progress import one_task, progress_bar
 from instrument.errors import BenchError
 from instrument.export import export as export_run
+from instrument.plane_steps import uneven_steps
 from instrument.result_export import export_result
 from instrument.store import Run
 from instrument.stored_result import open_result
@@ -91,9 +92,12 @@ def _export_result(path: Path, target: Path) -> None:
     try:
         with one_task("Planes") as advance:
             export_result(result, target, advance=advance)
+        steps = "" if result.planes_um is None else uneven_steps(result.planes_um[0])
     finally:
         result.close()
     typer.echo(f"Wrote {target}")
+    if steps and target.suffix.lower() != ".npy":
+        typer.echo(f"{'Planes':<12}{steps}")
 
 
 def _slice(text: str | None) -> slice:

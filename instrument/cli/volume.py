@@ -11,6 +11,7 @@ from instrument.cli.picture import tell_choice
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
 from instrument.kept_request import checkpoint_for, settle_checkpoint
+from instrument.plane_steps import uneven_steps
 from instrument.reconstruction_file import Outputs
 from instrument.reconstruction_request import VOLUME_ITERATIONS, VolumeRequest
 from instrument.volume_file import write_volume
@@ -60,6 +61,8 @@ def reconstruct_to_volume(
         for warning in (*job.warnings, *result.warnings):
             typer.echo(f"Warning: {warning}", err=True)
         write_volume(outputs, result, job)
+        if steps := uneven_steps(result.grid.z_um):
+            typer.echo(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
