@@ -60,7 +60,8 @@ def indices_of(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[
 
 def grey_indices(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.float32]:
     """Return the same of a coloured image (height, width, 3), by the mean of its channels."""
-    return indices_of(image, low, high).mean(axis=2)
+    places: npt.NDArray[np.float32] = indices_of(image, low, high).mean(axis=2)
+    return places
 
 
 def as_shown(image: npt.NDArray[Any], low: float, high: float, name: str) -> npt.NDArray[np.uint8]:
