@@ -26,7 +26,8 @@ from instrument.reconstruction_job import (
 from instrument.volume_job import volume_job
 from recon.auto import Choice, Wishes, choose, choose_picture
 from recon.gpu.namespace import DEVICES, Device
-from recon.picture import reconstruct
+from recon.options import require_options
+from recon.picture import reconstruct, require_prior
 from recon.preparation import Precision
 from recon.result import Reconstruction
 from recon.solvers.base import Keeper
@@ -115,6 +116,17 @@ class Settings:
     wishes: Wishes | None = None
     precision: Precision | None = None
 
+    def require(self, *, z_um: float | None = None) -> None:
+        """Check what can be checked before any file is read; InputError says what is wrong."""
+        require_options(
+            iterations=self.iterations,
+            time_s=self.time_s,
+            tolerance=self.tolerance,
+            tau=self.tau,
+            z_um=z_um,
+            noise=None if isinstance(self.noise, str) else self.noise,
+        )
+
     def exactness(self, *, all_chosen: bool) -> tuple[Wishes | None, Precision]:
         """Return wishes and precision: where all is chosen, the precision is one of the wishes."""
         if not all_chosen or self.precision is None:
@@ -173,14 +185,19 @@ class PictureRequest:
         return next((option for option, prevents in options.items() if prevents), None)
 
     def prepare(self) -> Job:
-        """Read the files and bring them together.
+        """Read the files and bring them together; the options are checked first.
 
         Raises
         ------
+        InputError
+            When an option cannot be.
         FileError, BenchError
             When a file cannot be used, or the files do not belong together.
         """
         given = self.settings
+        given.require(z_um=self.z_um)
+        if given.prior is not None:
+            require_prior(given.prior)
         if given.wishes is not None:
             _require_choice("--choose", self.nothing_chosen_by)
         rules = (given.iterations, given.time_s, given.tolerance, given.stop_at_noise or None)
@@ -327,6 +344,7 @@ class VolumeRequest:
     def prepare(self) -> Job:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
         given = self.settings
+        given.require()
         known_volume_prior(given.prior or "tv")
         if given.wishes is not None:
             _require_choice("--choose", self.nothing_chosen_by)

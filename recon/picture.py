@@ -13,6 +13,7 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.methods import Problem, method_named, method_names
 from recon.noise import NoiseModel
+from recon.options import require_options
 from recon.preparation import Field, Precision, Prepared, prepare, require_precision
 from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
 from recon.result import Reconstruction
@@ -144,7 +145,11 @@ def reconstruct(
     """
     if method not in method_names():
         raise InputError(_unknown("method", method, method_names()))
+    require_prior(prior)
     require_precision(precision)
+    require_options(
+        iterations=iterations, time_s=time_s, tolerance=tolerance, tau=tau, z_um=z_um, noise=noise
+    )
     prevented = _no_choice(calibration, model, method, prior, initial, keeper, precision)
     if prevented is None:
         from recon.auto.picture import reconstruct_chosen
@@ -211,8 +216,6 @@ def reconstruct(
     peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
     given_tau = tau
     tau = max(NOISE_WEIGHT / peak if peak > 0 else 0.0, LEAST_TAU) if tau is None else float(tau)
-    if not 0 <= tau < np.inf:
-        raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
     name, penalty = _named(prior, tau * peak)
     try:
         rules = StoppingRules(
@@ -354,11 +357,15 @@ def _varying_model(
     return model_of(calibration, z_um, model)
 
 
+def require_prior(prior: str | Prior) -> None:
+    """Raise InputError for what is neither a prior nor the name of one."""
+    if not isinstance(prior, Prior) and prior not in PRIORS:
+        raise InputError(_unknown("prior", prior, tuple(PRIORS)))
+
+
 def _named(prior: str | Prior, weight: float) -> tuple[str, Prior]:
     if isinstance(prior, Prior):
         return "+".join(type(t).__name__ for t in prior.terms()), prior
-    if prior not in PRIORS:
-        raise InputError(_unknown("prior", prior, tuple(PRIORS)))
     return prior, PRIORS[prior](weight)
 
 
@@ -374,6 +381,6 @@ def _start(initial: Reconstruction, problem: Prepared) -> Array:
 
 
 def _unknown(what: str, name: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(name, known, 1)
+    near = difflib.get_close_matches(str(name), known, 1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"The {what} {name!r} is not known. Choose one of {', '.join(known)}.{hint}"

@@ -12,6 +12,7 @@ from recon.checks import as_channels, check_psf, saturated_share, select_psf
 from recon.errors import InputError
 from recon.noise import NoiseModel, estimate_deviation
 from recon.operators import Erasures, LinearOperator, PadCropConvolution
+from recon.options import require_options
 from recon.result import ImageGrid
 from recon.types import Calibration, Geometry
 
@@ -106,6 +107,7 @@ def prepare(
 ) -> Prepared:
     """Check, subtract the background, scale. Parameters as :func:`recon.reconstruct`."""
     require_precision(precision)
+    require_options(z_um=z_um, noise=noise)
     dtype = np.dtype(precision)
     data, valid, saturated = data_of(measurement, background, erasures)
     if isinstance(calibration, Calibration):
@@ -155,7 +157,7 @@ def data_of(
     """Return data (n_channels, height, width) less background, which of it is valid, and warnings."""
     counts = as_channels(measurement, "measurement")
     data = counts if background is None else counts - like_data(background, counts, "background")
-    valid = np.ones(data.shape, bool) if erasures is None else like_data(erasures, data, "erasures") == 0
+    valid = np.ones(data.shape, bool) if erasures is None else ~_mask(erasures, data)
     if not valid.any(axis=(1, 2)).all():
         raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
     warnings = []
@@ -176,6 +178,19 @@ def data_of(
     return data, valid, warnings
 
 
+def _mask(erasures: npt.ArrayLike, data: Floats) -> npt.NDArray[np.bool_]:
+    """Return erasures as a mask of the data's shape."""
+    given = np.asarray(erasures)
+    expected = "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
+    if given.ndim == 0:
+        raise InputError(f"erasures is {erasures!r}: {expected}.")
+    mask = like_data(given, data, "erasures")
+    if not np.isin(mask, (0, 1)).all():
+        raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
+    erased: npt.NDArray[np.bool_] = mask != 0
+    return erased
+
+
 def require_same_pixels(psfs: Array, data: Array) -> None:
     """Raise InputError when PSFs and data (n_channels, height, width) differ in size."""
     if psfs.shape[1:] != data.shape[1:]:
@@ -190,9 +205,8 @@ def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: NoiseModel 
     if isinstance(noise, NoiseModel):
         deviation = noise.deviation(data[valid])
     elif noise is not None:
+        require_options(noise=noise)
         deviation = float(noise)
-        if not deviation >= 0:
-            raise InputError(f"The noise's standard deviation must not be negative; got {noise}.")
     else:
         deviation = estimate_deviation(data, valid)
     size = float(np.sqrt(np.mean(data[valid].astype(np.float64) ** 2)))

@@ -16,6 +16,7 @@ from recon.errors import InputError
 from recon.gpu.namespace import Device
 from recon.noise import NoiseModel
 from recon.operators.local_convolution import field_of
+from recon.options import require_options
 from recon.preparation import (
     Field,
     Precision,
@@ -153,6 +154,7 @@ def reconstruct_volume(
     if prior not in PRIORS:
         raise InputError(f"The prior {prior!r} is not known for volumes. Choose one of {', '.join(PRIORS)}.")
     require_precision(precision)
+    require_options(iterations=iterations, time_s=time_s, tolerance=tolerance, tau=tau, noise=noise)
     preventing = {
         f"model={model!r}": model != "auto",
         f"device={device!r}": device != "cpu",

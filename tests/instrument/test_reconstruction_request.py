@@ -164,3 +164,20 @@ def test_a_checkpoint_leaves_nothing_to_choose(picture_files, option, tmp_path, 
     files = ["--psf", str(picture_files["psf"]), "--image", str(picture_files["image"])]
     assert main(["reconstruct", *files, option, "--checkpoint", str(tmp_path / "kept")]) != 0
     assert "does not with --checkpoint" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"settings": Settings(tau=-1.0)}, "tau must be 0 or more"),
+        ({"settings": Settings(noise=-1.0)}, "noise must be"),
+        ({"settings": Settings(iterations=0)}, "iterations must be a whole number"),
+        ({"settings": Settings(tolerance=-1.0)}, "tolerance must be 0 or more"),
+        ({"settings": Settings(prior="tb")}, "'tb' is not known"),
+        ({"z_um": -5.0}, "z_um must be above 0"),
+    ],
+)
+def test_options_are_checked_before_any_file_is_read(tmp_path, changes, said):
+    missing = {"image": tmp_path / "none.tif", "psf": tmp_path / "none too.tif"}
+    with pytest.raises(InputError, match=said):
+        PictureRequest(**missing, **changes).prepare()

@@ -213,13 +213,17 @@ def test_plan_counts_the_volumes():
         ({"model": "exact"}, "model 'exact' is not known"),
         ({"model": "local"}, "several places of the field"),
         ({"tau": -1.0}, "tau must be 0 or more"),
+        ({"tolerance": -1.0}, "tolerance must be 0 or more"),
+        ({"iterations": 2.5}, "iterations must be a whole number"),
+        ({"noise": "x"}, "noise must be a NoiseModel"),
+        ({"erasures": 0.5}, "erasures is 0.5"),
         ({"field": "all"}, "field must be"),
         ({"erasures": np.ones((SIZE, SIZE), bool)}, "leave no pixel"),
     ],
 )
 def test_refuses_in_words(change, words):
     with pytest.raises(InputError, match=words):
-        reconstruct_volume(measurement(), calibration(), iterations=1, **change)
+        reconstruct_volume(measurement(), calibration(), **{"iterations": 1, **change})
 
 
 def test_refuses_unusable_calibrations():
