@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from recon.chart.even import even_with_best
 from recon.chart.scored import KINDS, Kind, KindName, Point, fronts, is_known
 
 SCHEMA = 2
@@ -49,6 +50,12 @@ class ChartData:
         """Return the points of all fronts."""
         return [p for front in self.fronts().values() for p in front]
 
+    def even(self) -> tuple[Point, ...]:
+        """Return the best by held-out pixels and what these cannot tell from it; empty with a truth."""
+        if self.kind.score_of(self.points).key != "held_out":
+            return ()
+        return even_with_best(self.points)
+
     def to_json(self) -> dict[str, Any]:
         """Return all of it."""
         return {
@@ -61,6 +68,7 @@ class ChartData:
                 for g, front in self.fronts().items()
                 for p in front
             ],
+            "even_with_best": [{"setting": p.setting, "iterations": p.iterations} for p in self.even()],
             "failed": dict(self.failed),
             "missing": list(self.missing),
         }
@@ -70,7 +78,8 @@ class ChartData:
         names = [
             f.name
             for f in fields(Point)
-            if any(is_known(p, f.name) and getattr(p, f.name) != "" for p in self.points)
+            if f.name != "held_out_parts"
+            and any(is_known(p, f.name) and getattr(p, f.name) != "" for p in self.points)
         ]
         front = {(p.group, p.setting, p.iterations) for p in self.front()}
         text = io.StringIO()

@@ -84,4 +84,4 @@ def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
 
 def _point(record: dict[str, Any]) -> Point:
     values: dict[str, Any] = {k: float("nan") if v is None else v for k, v in record.items()}
-    return Point(**values)
+    return Point(**{**values, "held_out_parts": tuple(values.get("held_out_parts", ()))})

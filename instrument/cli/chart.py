@@ -21,9 +21,11 @@ from instrument.errors import BenchError
 from instrument.reconstruction_words import parse_binning, parse_dark
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from instrument.chart.data import ChartData
     from instrument.reconstruction_job import Job
-    from recon.chart.scored import Named, Problem
+    from recon.chart.scored import Named, Point, Problem
 
 app = command_app()
 
@@ -305,6 +307,29 @@ def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float
         return make_chart(problem, about, record, budget_s=budget_s, told=told)
 
 
+def _tell_even(even: Sequence[Point]) -> None:
+    """Say what the held-out pixels cannot tell from the best setting."""
+    if not even:
+        return
+    from recon.chart.even import SETTLED_ITERATIONS
+
+    best, others = even[0], sorted({p.setting for p in even[1:]} - {even[0].setting})
+    typer.echo(f"{'Held out':<12}best after {SETTLED_ITERATIONS} iterations or more: {_told(best)}")
+    if not others:
+        typer.echo(f"{'':<12}no other setting is even with it")
+        return
+    typer.echo(
+        f"{'':<12}even with it, as far as these pixels tell: {len(others)} other settings (differences below "
+        f"twice their scatter); the quickest: {_told(min(even, key=lambda p: p.seconds))}"
+    )
+
+
+def _told(point: Point) -> str:
+    from instrument.chart.words import in_words
+
+    return f"{in_words(point)} ({point.held_out:.3f}, {point.seconds:.3g} s)"
+
+
 def _tell(data: ChartData) -> None:
     """Print the fronts, what failed, and what there was no time for."""
     score, cost = data.kind.score_of(data.points), data.kind.costs[0]
@@ -315,6 +340,7 @@ def _tell(data: ChartData) -> None:
         for p in front:
             paid, value = getattr(p, cost.key), getattr(p, score.key)
             typer.echo(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
+    _tell_even(data.even())
     for why in data.about.get("left_out", ()):
         typer.echo(f"{'Not charted':<12}{why}")
     for setting, why in data.failed.items():

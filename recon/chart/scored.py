@@ -120,8 +120,8 @@ class Point:
     residual : float
         Norm of the residual over that of the noise, on the pixels that were used.
     held_out : float
-        Root mean square error of the predicted held-out blocks' means, in units of these means' noise;
-        the blocks are those of the coarsest binning.
+        Root mean square error of the predicted held-out blocks' means, in units of these means' noise,
+        as :mod:`recon.chart.judge` has it; the blocks are those of the coarsest binning.
     psnr_db, ssim, nrmse : float
         Against the truth.
     peak_mib : float
@@ -134,6 +134,8 @@ class Point:
         Settings of one family share a colour.
     group : str
         Only settings of one group compete.
+    held_out_parts : tuple of float
+        Mean squares of the held-out blocks' errors, apart for parts of them that all settings share.
     """
 
     setting: str
@@ -150,6 +152,7 @@ class Point:
     images: float = NAN
     family: str = ""
     group: str = ""
+    held_out_parts: tuple[float, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return it with None for what is not known."""

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from recon.chart.even import even_with_best
+from recon.chart.judge import Judge
 from recon.chart.reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
 from recon.chart.scored import Point, pareto
 from recon.errors import InputError, StructureError
@@ -38,9 +42,7 @@ def test_held_out_pixels_were_not_looked_at():
     garbled = ChartProblem(
         whole.measurement + np.float32(0), whole.calibration, False, None, whole.noise, whole.truth
     )
-    from recon.chart.reconstruction import _Judge
-
-    judge = _Judge(garbled, Setting("admm", "convolution", "nonnegative"), 0)
+    judge = Judge(garbled, Setting("admm", "convolution", "nonnegative"), 0)
     assert 0.02 < judge.held.mean() < 0.1
     spoilt = whole.measurement.copy()
     spoilt[judge.held] = 1e5
@@ -59,18 +61,17 @@ def test_held_out_pixels_were_not_looked_at():
 @pytest.mark.parametrize("shape", [(102, 98), (100, 97), (96, 110), (99, 103)])
 def test_held_out_scores_are_of_the_same_light_at_every_binning(shape, monkeypatch):
     from recon.auto.reduced import binned
-    from recon.chart.reconstruction import _Judge
 
     rng = np.random.default_rng(0)
     psf = np.zeros((1, 1, *shape), np.float32)
     psf[0, 0, shape[0] // 2, shape[1] // 2] = 1
     measurement = (100 + rng.normal(0, 3, shape)).astype(np.float32)
     case = ChartProblem(measurement, Calibration(psf, np.array([[0, 0, 1e4]])), False, None, 3.0)
-    monkeypatch.setattr(_Judge, "_predict", lambda judge, _: np.float32(100))
-    one = _Judge(case, Setting("admm", "convolution", "tv"), 0)
+    monkeypatch.setattr(Judge, "_predict", lambda judge, _: np.full_like(judge.measurement, 100))
+    one = Judge(case, Setting("admm", "convolution", "tv"), 0)
     scores = []
     for factor in (1, 2, 4):
-        judge = _Judge(case, Setting("admm", "convolution", "tv", factor), 0)
+        judge = Judge(case, Setting("admm", "convolution", "tv", factor), 0)
         share = binned(one.held.astype(np.float32), factor)
         assert set(np.unique(share)) == {0.0, 1.0}  # whole pixels, none half held out
         np.testing.assert_array_equal(judge.held, share > 0.5)
@@ -97,6 +98,49 @@ def test_what_is_not_charted_is_said():
     assert "one PSF a depth" not in varying
     assert "too few pixels" in varying
     assert "wiener" in varying
+
+
+@pytest.mark.parametrize("family", ["sparse-picture", "dense-picture"])
+def test_brightness_and_slow_waves_do_not_count_on_held_out_pixels(family, monkeypatch):
+    case = replace(problem(family), truth=None)
+    judge = Judge(case, Setting("admm", "convolution", "tv"), 0)
+    rng = np.random.default_rng(1)
+    wrong = rng.normal(0, 3 * judge.noise, judge.measurement.shape).astype(np.float32)
+    slow = 50 * judge.noise * np.cos(np.pi * (np.arange(32) + 0.5) / 32)[:, None]
+
+    def scored(predicted):
+        monkeypatch.setattr(Judge, "_predict", lambda *_: predicted.astype(np.float32))
+        point = judge.point(np.zeros(judge.measurement.shape), 1, 1.0)
+        assert np.sqrt(np.mean(point.held_out_parts)) == pytest.approx(point.held_out, rel=0.1)
+        return point.held_out
+
+    right = scored(judge.measurement)
+    assert right < 1e-3
+    assert scored(judge.measurement / 3) == pytest.approx(right, abs=1e-3)
+    assert scored(judge.measurement + slow) == pytest.approx(right, abs=1e-3)
+    worse = scored(judge.measurement + wrong)
+    assert 1.5 < worse < 4
+    assert scored(judge.measurement + wrong + slow) == pytest.approx(worse, rel=1e-3)
+
+
+def test_scores_that_scatter_more_than_they_differ_are_even():
+    rng = np.random.default_rng(0)
+    common = rng.uniform(1, 3, 12)  # noise of the pixels, which all settings share
+
+    def made(name, worse, scatter, iterations=40, seconds=1.0):
+        parts = common + worse + scatter * rng.normal(size=12)
+        return Point(
+            name, iterations, seconds, held_out=float(np.mean(parts)) ** 0.5, held_out_parts=tuple(parts)
+        )
+
+    best = made("best", 0.0, 0.0)
+    even = made("even", 0.05, 0.2, seconds=0.1)
+    apart = made("apart", 0.05, 0.01)
+    early = made("early", 0.0, 0.0, iterations=5)
+    found = even_with_best([early, apart, even, best, Point("other", 40, 1.0, held_out=1.0)])
+    assert {p.setting for p in found} == {"best", "even"}
+    assert found[0].held_out == min(p.held_out for p in found)
+    assert even_with_best([Point("other", 40, 1.0, held_out=1.0)]) == ()
 
 
 def test_settings_fit_the_problem():

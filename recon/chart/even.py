@@ -1,0 +1,48 @@
+"""Which settings the held-out pixels cannot tell from the best: scores that differ less than they scatter.
+
+The same pixels are held out for every setting, so that their noise is common to all scores. What scatters is
+the difference of two of them, told by how much it differs from one part of the pixels to the next. Where
+most settings are even, the score says little, and the quickest of them is as good a choice as the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from recon.chart.scored import Point, is_known
+
+SETTLED_ITERATIONS = 30
+"""Before these a run's error is of another kind: it is not bright or sharp yet, whatever it will come to."""
+_SCATTERS = 2.0
+"""Standard errors of the difference within which two scores are even."""
+_LEAST_PARTS = 4
+
+
+def even_with_best(points: Iterable[Point]) -> tuple[Point, ...]:
+    """Return the settled point with the best score on held-out pixels, and those even with it, best first.
+
+    Points of fewer than :data:`SETTLED_ITERATIONS` iterations do not take part, but for one-shot methods.
+    Empty where no point tells its scatter.
+    """
+    told = [
+        p
+        for p in points
+        if is_known(p, "held_out")
+        and len(p.held_out_parts) >= _LEAST_PARTS
+        and (p.iterations == 0 or p.iterations >= SETTLED_ITERATIONS)
+    ]
+    if not told:
+        return ()
+    best = min(told, key=lambda p: p.held_out)
+    even = [p for p in told if p is best or _is_even(p, best)]
+    return tuple(sorted(even, key=lambda p: p.held_out))
+
+
+def _is_even(point: Point, best: Point) -> bool:
+    if len(point.held_out_parts) != len(best.held_out_parts):
+        return False  # other pixels: there is nothing that both have in common
+    apart = np.subtract(point.held_out_parts, best.held_out_parts)
+    scatter = float(np.std(apart, ddof=1)) / len(apart) ** 0.5
+    return bool(np.mean(apart) <= _SCATTERS * scatter)
