@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from recon.chart.even import even_with_best
+from recon.chart.even import SETTLED_ITERATIONS, even_with_best
 from recon.chart.scored import KINDS, Kind, KindName, Point, fronts, is_known
 
 SCHEMA = 2
@@ -50,11 +50,15 @@ class ChartData:
         """Return the points of all fronts."""
         return [p for front in self.fronts().values() for p in front]
 
-    def even(self) -> tuple[Point, ...]:
-        """Return the best by held-out pixels and what these cannot tell from it; empty with a truth."""
+    def even(self) -> dict[str, tuple[Point, ...]]:
+        """Return each group's best by held-out pixels and what is even with it; with a truth none."""
         if self.kind.score_of(self.points).key != "held_out":
-            return ()
-        return even_with_best(self.points)
+            return {}
+        # Calibrations are scored at the end of a run, reconstructions on the way.
+        least = SETTLED_ITERATIONS if self.kind_name == "reconstruction" else 0
+        groups = dict.fromkeys(p.group for p in self.points)
+        found = {g: even_with_best((p for p in self.points if p.group == g), least) for g in groups}
+        return {g: even for g, even in found.items() if even}
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it."""
@@ -68,7 +72,11 @@ class ChartData:
                 for g, front in self.fronts().items()
                 for p in front
             ],
-            "even_with_best": [{"setting": p.setting, "iterations": p.iterations} for p in self.even()],
+            "even_with_best": [
+                {"group": g, "setting": p.setting, "iterations": p.iterations}
+                for g, even in self.even().items()
+                for p in even
+            ],
             "failed": dict(self.failed),
             "missing": list(self.missing),
         }

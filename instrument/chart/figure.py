@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _LEAST = {"seconds": 1e-4, "peak_mib": 0.1}
 """Smaller ones are drawn here: what costs next to nothing has no place on a logarithmic axis."""
+_NARROW = 3.0
+"""Times the least value up to which an axis is linear, whatever it should be."""
 _MOST_NAMES = 12
 """Names of a front that fit beside a panel; of more, the cheapest are left out."""
 
@@ -105,9 +107,9 @@ def _draw(
         label="Pareto front",
     )
     axes.set(xlabel=cost.words, ylabel=score.words)
-    if cost.logarithmic and known:
+    if cost.logarithmic and _is_wide([_x(p, cost) for p in known]):
         axes.set_xscale("log")
-    if score.logarithmic:
+    if score.logarithmic and _is_wide([float(getattr(p, score.key)) for p in known]):
         axes.set_yscale("log")
     axes.grid(alpha=0.25)
     axes.margins(0.07, 0.1)
@@ -144,6 +146,11 @@ def _together(axes: Axes, places: Sequence[tuple[float, float]]) -> list[tuple[i
             runs.append((number, number))
         before = at
     return runs
+
+
+def _is_wide(values: Sequence[float]) -> bool:
+    """Tell whether a logarithmic axis has ticks to show: over a narrow range it has hardly any."""
+    return bool(values) and max(values) > _NARROW * min(values)
 
 
 def _x(point: Point, cost: Axis) -> float:

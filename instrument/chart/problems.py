@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from instrument.images import read_image
 from instrument.reconstruction_job import Job
 from instrument.sample_images import SAMPLES
 from recon.chart.hologram import HologramProblem
+from recon.chart.own_calibrations import OwnCalibration, OwnCalibrationsProblem
 from recon.chart.reconstruction import ChartProblem, left_out
 from recon.errors import InputError
 from recon.noise import NoiseModel
@@ -69,6 +70,53 @@ def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[Chart
     )
     about = {"inputs": dict(job.provenance), "simulated": job.simulated}
     return problem, {**about, "left_out": list(left_out(problem))}
+
+
+def problem_of_calibrations(
+    jobs: Mapping[Path, Job], z_um: float | None, *, volume: bool
+) -> tuple[OwnCalibrationsProblem, dict[str, Any]]:
+    """Return calibrations to compare on one photograph, by their folders, and what to say of them.
+
+    Raises
+    ------
+    BenchError
+        When they do not bring the photograph to the same pixels.
+    """
+    own = []
+    for folder, job in jobs.items():
+        problem, _ = problem_of_job(job, z_um, volume=volume)
+        calibration = job.calibration
+        slides = calibration.quality.get("beads_found")
+        sweep = calibration.provenance.get("sweep") or {}
+        own.append(
+            OwnCalibration(
+                _label(folder, jobs),
+                problem,
+                len(slides) / len(calibration.psfs) if slides else float(sweep.get("average", 1)),
+                whole=bool(slides),
+            )
+        )
+    first = next(iter(jobs.values()))
+    about = {
+        "calibrations": [str(folder) for folder in jobs],
+        "inputs": dict(first.provenance),
+        "simulated": any(job.simulated for job in jobs.values()),
+    }
+    try:
+        return OwnCalibrationsProblem(tuple(own)), about
+    except InputError as error:
+        raise BenchError(str(error)) from error
+
+
+def _label(folder: Path, others: Iterable[Path]) -> str:
+    """Return the name of a calibration's folder, or of the run it lies in; the path where that is no name."""
+
+    def short(path: Path) -> str:
+        whole = path.resolve()
+        return whole.parent.name if whole.name == "calibration" else whole.name
+
+    name = short(folder)
+    return name if [short(other) for other in others].count(name) == 1 else str(folder)
 
 
 def _noise_of_mean(job: Job) -> NoiseModel | float | None:

@@ -39,7 +39,7 @@ def subject_of(kind: str, about: Mapping[str, Any]) -> str:
     """Return the scene, picture, photograph or bench that was charted."""
     if kind == "hologram":
         return ", ".join(Path(str(p)).name for p in about.get("pictures", ())) + " on the SLM"
-    if kind == "calibration":
-        return "the simulated microscope"
     inputs = about.get("inputs") or {}
+    if kind == "calibration" and not inputs:
+        return "the simulated microscope"
     return Path(str(about.get("scene") or (inputs.get("image") or {}).get("path", "photograph"))).name

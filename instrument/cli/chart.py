@@ -32,6 +32,7 @@ app = command_app()
 _LEAST_S = 1.0
 """For settings, where photographs took all of the budget: so that each call comes further."""
 _OWN = "--calibration (or --psf) and --image"
+_COMPARED = "--calibrations with --calibration and --image"
 
 
 @app.command(
@@ -43,6 +44,7 @@ _OWN = "--calibration (or --psf) and --image"
         "diffuserbench chart --calibration axial/calibration --image photo.tif --volume",
         "diffuserbench chart --hologram picture.png --slm 135x240 --out hologram-chart",
         "diffuserbench chart --calibrations --out calibration-chart",
+        "diffuserbench chart --calibrations -c grid/calibration -c beads/calibration -i photo.tif --z-mm 30",
         "diffuserbench chart --hologram near.png --hologram far.png --z-mm 0 --z-mm 40",
     )
 )
@@ -58,12 +60,13 @@ def chart(
         ),
     ] = None,
     calibration: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             "--calibration",
             "-c",
             metavar="FOLDER",
-            help="Your calibration; with --volume PSF images of several depths will do.",
+            help="Your calibration; with --volume PSF images of several depths will do. With --calibrations: "
+            "one or more, to be compared.",
             show_default=False,
         ),
     ] = None,
@@ -89,7 +92,8 @@ def chart(
         bool,
         typer.Option(
             "--calibrations",
-            help="Calibrations of a simulated microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
+            help="Calibrations: your own (--calibration, --image), whole and thinned; else of a simulated "
+            "microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
         ),
     ] = False,
     z_mm: Annotated[
@@ -160,21 +164,23 @@ def chart(
     error of what is reconstructed with them. Run the same command again to go on where it stopped.
     """
     subject = _only(
+        calibrations and bool(calibration or image),
         {
             "--scene": scene is not None,
             _OWN: any(path is not None for path in (calibration, psf, image)),
             "--hologram": bool(hologram),
             "--calibrations": calibrations,
-        }
+        },
     )
     _refuse(
         subject,
         {
-            "--volume": (volume, (_OWN,)),
-            "--dark": (dark != "auto", (_OWN,)),
-            "--crop": (crop is not None, (_OWN,)),
-            "--bin": (binning != "auto", (_OWN,)),
-            "--z-mm": (bool(z_mm), (_OWN, "--hologram")),
+            "--volume": (volume, (_OWN, _COMPARED)),
+            "--dark": (dark != "auto", (_OWN, _COMPARED)),
+            "--crop": (crop is not None, (_OWN, _COMPARED)),
+            "--bin": (binning != "auto", (_OWN, _COMPARED)),
+            "--psf": (psf is not None, (_OWN,)),
+            "--z-mm": (bool(z_mm), (_OWN, _COMPARED, "--hologram")),
             "--expansion": (bool(expansion), ("--hologram",)),
             "--frames": (bool(frames), ("--hologram",)),
             "--slm": (slm is not None, ("--hologram",)),
@@ -183,7 +189,12 @@ def chart(
         },
     )
     from instrument.chart.figure import write_charts
-    from instrument.chart.problems import problem_of_job, problem_of_pictures, problem_of_scene
+    from instrument.chart.problems import (
+        problem_of_calibrations,
+        problem_of_job,
+        problem_of_pictures,
+        problem_of_scene,
+    )
 
     problem: Problem
     if scene is not None:
@@ -197,17 +208,28 @@ def chart(
             frames or (1, 2, 3),
             None if slm is None else parse_size(slm),
         )
-    elif calibrations:
+    elif calibrations and subject != _COMPARED:
         began = time.monotonic()
         problem, about = _calibrations(size or 90, out, budget_s)
         budget_s = max(budget_s - (time.monotonic() - began), _LEAST_S)
     else:
-        job = _job(calibration, psf, image, dark, crop, binning, volume=volume)
-        for name, text in job.notes.items():
-            typer.echo(f"{name:<12}{text}")
         if len(z_mm or ()) > 1 or (z_mm and volume):
             raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
-        problem, about = problem_of_job(job, 1e3 * z_mm[0] if z_mm else None, volume=volume)
+        z_um = 1e3 * z_mm[0] if z_mm else None
+        compared = subject == _COMPARED
+        jobs = {
+            folder: _job(folder, psf, image, dark, crop, binning, volume=volume)
+            for folder in _folders(calibration, compared=compared)
+        }
+        prepared = list(jobs.values())
+        prepared = prepared or [_job(None, psf, image, dark, crop, binning, volume=volume)]
+        for job in prepared:
+            for name, text in job.notes.items():
+                typer.echo(f"{name:<12}{text}")
+        if compared:
+            problem, about = problem_of_calibrations(jobs, z_um, volume=volume)
+        else:
+            problem, about = problem_of_job(prepared[0], z_um, volume=volume)
     if about.get("simulated"):
         typer.echo("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
@@ -222,7 +244,20 @@ def chart(
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")
 
 
-def _only(given: dict[str, bool]) -> str:
+def _folders(given: list[Path] | None, *, compared: bool) -> list[Path]:
+    folders = given or []
+    if compared and not folders:
+        raise BenchError("--calibrations with --image compares your own: give --calibration, once or more.")
+    if not compared and len(folders) > 1:
+        raise BenchError("Several --calibration are compared with --calibrations; else give one.")
+    if repeated := [str(folder) for folder in folders if folders.count(folder) > 1]:
+        raise BenchError(f"--calibration {repeated[0]} is given twice.")
+    return folders
+
+
+def _only(compared: bool, given: dict[str, bool]) -> str:
+    if compared and not given["--scene"] and not given["--hologram"]:
+        return _COMPARED
     chosen = [name for name, is_given in given.items() if is_given]
     if len(chosen) != 1:
         found = f"; {' and '.join(chosen)} exclude each other" if chosen else ""
@@ -307,20 +342,21 @@ def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float
         return make_chart(problem, about, record, budget_s=budget_s, told=told)
 
 
-def _tell_even(even: Sequence[Point]) -> None:
+def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
     """Say what the held-out pixels cannot tell from the best setting."""
-    if not even:
-        return
     from recon.chart.even import SETTLED_ITERATIONS
 
     best, others = even[0], sorted({p.setting for p in even[1:]} - {even[0].setting})
-    typer.echo(f"{'Held out':<12}best after {SETTLED_ITERATIONS} iterations or more: {_told(best)}")
+    when = f"after {SETTLED_ITERATIONS} iterations or more" if on_the_way else group
+    typer.echo(f"{'Held out':<12}best {when}: {_told(best)}")
+    cheap = "quickest" if on_the_way else "one with the fewest photographs"
+    least = min(even, key=lambda p: p.seconds if on_the_way else p.images)
     if not others:
         typer.echo(f"{'':<12}no other setting is even with it")
         return
     typer.echo(
         f"{'':<12}even with it, as far as these pixels tell: {len(others)} other settings (differences below "
-        f"twice their scatter); the quickest: {_told(min(even, key=lambda p: p.seconds))}"
+        f"twice their scatter); the {cheap}: {_told(least)}"
     )
 
 
@@ -340,7 +376,8 @@ def _tell(data: ChartData) -> None:
         for p in front:
             paid, value = getattr(p, cost.key), getattr(p, score.key)
             typer.echo(f"{p.setting:<44}{p.iterations:>10}{paid:>9.3g}{p.peak_mib:>8.3g}  {value:.3f}")
-    _tell_even(data.even())
+    for group, even in data.even().items():
+        _tell_even(group, even, on_the_way=data.kind_name == "reconstruction")
     for why in data.about.get("left_out", ()):
         typer.echo(f"{'Not charted':<12}{why}")
     for setting, why in data.failed.items():

@@ -20,10 +20,10 @@ _SCATTERS = 2.0
 _LEAST_PARTS = 4
 
 
-def even_with_best(points: Iterable[Point]) -> tuple[Point, ...]:
+def even_with_best(points: Iterable[Point], least_iterations: int = SETTLED_ITERATIONS) -> tuple[Point, ...]:
     """Return the settled point with the best score on held-out pixels, and those even with it, best first.
 
-    Points of fewer than :data:`SETTLED_ITERATIONS` iterations do not take part, but for one-shot methods.
+    Points of fewer than ``least_iterations`` do not take part, but for one-shot methods.
     Empty where no point tells its scatter.
     """
     told = [
@@ -31,7 +31,7 @@ def even_with_best(points: Iterable[Point]) -> tuple[Point, ...]:
         for p in points
         if is_known(p, "held_out")
         and len(p.held_out_parts) >= _LEAST_PARTS
-        and (p.iterations == 0 or p.iterations >= SETTLED_ITERATIONS)
+        and (p.iterations == 0 or p.iterations >= least_iterations)
     ]
     if not told:
         return ()

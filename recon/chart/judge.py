@@ -76,11 +76,7 @@ class Judge:
         )
         self._scored = self._blocks(self.held & self.kept) > 0.5
         used = self._blocks(~self.erasures) > 1 - 1e-6
-        waves = [
-            max(1, min(most, count // _PIXELS_A_WAVE))
-            for most, (_, count) in zip(BACKGROUND_FREQUENCIES, spans, strict=True)
-        ]
-        self._waves = BackgroundRemoval((1, *used.shape), (waves[0], waves[1]), used, dtype=np.float64)
+        self._waves, self._block_waves = _slow_waves(~self.erasures), _slow_waves(used)
         self._camera: ChannelProblem | None = None
 
     def _blocks(self, image: Array) -> Array:
@@ -102,8 +98,9 @@ class Judge:
         """Score a picture or volume of the full field."""
         planes = found[None] if found.ndim == 2 else found
         predicted = self._predict(planes)
-        used = (self.measurement - predicted)[~self.erasures] / self.noise
-        error = self._held_out(predicted)
+        used = _misfit(self.measurement, predicted, self._waves)[~self.erasures] / self.noise
+        seen, shown = self._blocks(self.measurement), self._blocks(predicted)
+        error = _misfit(seen, shown, self._block_waves)[self._scored] / self._block_noise
         count = min(PARTS, error.size)
         point = Point(
             self.setting.name,
@@ -121,19 +118,6 @@ class Judge:
         truth = self.problem.truth
         marks = score(shown if self.problem.volume else shown[0], truth, volume=self.problem.volume)
         return replace(point, psnr_db=marks.psnr_db, ssim=marks.ssim, nrmse=marks.nrmse)
-
-    def _held_out(self, predicted: Array) -> npt.NDArray[np.float64]:
-        """Return the held-out blocks' errors in units of their noise."""
-        seen = self._blocks(self.measurement).astype(np.float64)[None]
-        shown = self._blocks(predicted).astype(np.float64)[None]
-        waves = self._waves
-        shape = waves.forward(shown)
-        power = float(np.vdot(shape, shape))
-        # A prediction that is nothing but slow waves has no brightness of its own to be fitted.
-        tells = power > 1e-12 * float(np.vdot(shown, shown))
-        gain = max(float(np.vdot(shape, waves.forward(seen))) / power, 0.0) if tells else 1.0
-        rest = seen - gain * shown
-        return np.asarray((rest - waves.background(rest))[0][self._scored] / self._block_noise)
 
     def _on_sensor(self, planes: Array) -> Array:
         height, width = self.measurement.shape
@@ -172,6 +156,27 @@ class Judge:
                 weights=np.ones((len(scaled.depths.z_um), 3)),
             )
         return self._camera
+
+
+def _slow_waves(used: npt.NDArray[np.bool_]) -> BackgroundRemoval:
+    """Return what takes slow waves out of an image (height, width), fitted where it was used."""
+    rows, columns = (
+        max(1, min(most, count // _PIXELS_A_WAVE))
+        for most, count in zip(BACKGROUND_FREQUENCIES, used.shape, strict=True)
+    )
+    return BackgroundRemoval((1, *used.shape), (rows, columns), used, dtype=np.float64)
+
+
+def _misfit(seen: Array, shown: Array, waves: BackgroundRemoval) -> npt.NDArray[np.float64]:
+    """Return what a prediction misses at its best brightness, slow waves aside."""
+    image, prediction = (np.asarray(a, np.float64)[None] for a in (seen, shown))
+    shape = waves.forward(prediction)
+    power = float(np.vdot(shape, shape))
+    # A prediction that is nothing but slow waves has no brightness of its own to be fitted.
+    tells = power > 1e-12 * float(np.vdot(prediction, prediction))
+    gain = max(float(np.vdot(shape, waves.forward(image))) / power, 0.0) if tells else 1.0
+    rest = image - gain * prediction
+    return np.asarray((rest - waves.background(rest))[0])
 
 
 def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:

@@ -45,6 +45,8 @@ MEMORY = Axis("peak_mib", "memory beyond the input's, at the peak (MiB)", logari
 IMAGES = Axis("images", "photographs taken for the calibration", logarithmic=True)
 SSIM = Axis("ssim", "SSIM", more_is_better=True)
 NRMSE = Axis("nrmse", "NRMSE")
+HELD_OUT = Axis("held_out", "error on held-out pixels (noise = 1)", logarithmic=True)
+RESIDUAL = Axis("residual", "residual (noise = 1)", logarithmic=True)
 
 KindName = Literal["reconstruction", "hologram", "calibration"]
 
@@ -82,8 +84,8 @@ KINDS: dict[str, Kind] = {
                 Axis("psnr_db", "PSNR (dB)", more_is_better=True),
                 SSIM,
                 NRMSE,
-                Axis("held_out", "error on held-out pixels (noise = 1)", logarithmic=True),
-                Axis("residual", "residual (noise = 1)", logarithmic=True),
+                HELD_OUT,
+                RESIDUAL,
             ),
         ),
         Kind(
@@ -99,7 +101,13 @@ KINDS: dict[str, Kind] = {
         Kind(
             "calibration",
             (IMAGES, SECONDS, MEMORY),
-            (Axis("psnr_db", "PSNR of the reconstruction (dB)", more_is_better=True), SSIM, NRMSE),
+            (
+                Axis("psnr_db", "PSNR of the reconstruction (dB)", more_is_better=True),
+                SSIM,
+                NRMSE,
+                HELD_OUT,
+                RESIDUAL,
+            ),
         ),
     )
 }
@@ -118,7 +126,7 @@ class Point:
     seconds : float
         Wall time of the solver up to here.
     residual : float
-        Norm of the residual over that of the noise, on the pixels that were used.
+        Norm of the residual over that of the noise, on the pixels that were used, as ``held_out``.
     held_out : float
         Root mean square error of the predicted held-out blocks' means, in units of these means' noise,
         as :mod:`recon.chart.judge` has it; the blocks are those of the coarsest binning.

@@ -328,3 +328,72 @@ def test_what_ends_a_setting_is_told_in_its_row():
     assert isinstance(found, str)
     assert "Error" in found
     assert "status" not in found
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Two calibrations and a photograph."""
+    import tifffile
+
+    from instrument.calibration_file import save_calibration
+    from recon.scenes import make_scene
+
+    for grid, name in ((5, "fine"), (1, "one")):
+        scene = make_scene("sparse-picture", size=24, grid=grid, fall_off_deg=20.0, seed=3)
+        save_calibration(scene.calibration, tmp_path / name)
+    tifffile.imwrite(tmp_path / "photo.tif", np.clip(scene.measurement + 20, 0, 65535).astype(np.uint16))
+    tifffile.imwrite(tmp_path / "small.tif", np.arange(400, dtype=np.uint16).reshape(20, 20))
+    return tmp_path
+
+
+def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
+    import instrument.chart.job as job
+    import recon.chart.own_calibrations as module
+
+    monkeypatch.setattr(module, "ITERATIONS", 3)
+    monkeypatch.setattr(job, "in_own_process", lambda problem, setting, limit_s: problem.run(setting))
+    folders = ("--calibration", own / "fine", "--calibration", own / "one")
+    out = tmp_path / "chart"
+    result = run("--calibrations", *folders, "--image", own / "photo.tif", "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "even with it" in result.output
+    record = json.loads((out / "chart.json").read_text())
+    assert record["kind"] == "calibration"
+    names = {(p["setting"], p["images"]) for p in record["points"]}
+    assert names == {("one, 1 PSF", 1), ("fine, 1 PSF", 1), ("fine, 9 PSFs", 9), ("fine, 25 PSFs", 25)}
+    assert len(record["points"]) == 8  # of an extended and a sparse scene
+    assert all(p["held_out"] > 0 and p["psnr_db"] is None for p in record["points"])
+    assert record["even_with_best"]
+    assert (out / "chart.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--calibrations", "-i", "photo.tif"), "give --calibration, once or more"),
+        (("-c", "fine", "-c", "one", "-i", "photo.tif"), "compared with --calibrations"),
+        (("--calibrations", "-c", "fine", "-c", "fine", "-i", "photo.tif"), "given twice"),
+        (("--calibrations", "-c", "fine"), "needs --image"),
+        (("--calibrations", "-c", "fine", "-i", "photo.tif", "--size", 40), "--size goes with"),
+        (("-c", "nothing", "-i", "photo.tif"), "nothing"),
+        (("-c", "fine", "-i", "nothing.tif"), "nothing.tif"),
+        (("-c", "fine", "-i", "small.tif"), "20 x 20"),
+    ],
+)
+def test_mistakes_with_own_files_are_named(own, monkeypatch, arguments, said):
+    monkeypatch.chdir(own)
+    result = run(*arguments, "--out", own / "c")
+    assert result.exit_code != 0
+    assert said in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{}", '{"about": 3}', '{"about": {"fingerprint": "x"}, "points": [{"nonsense": 1}]}']
+)
+def test_a_damaged_chart_is_refused_by_name(quick, tmp_path, content):
+    (tmp_path / "chart.json").write_text(content)
+    result = run("--scene", "sparse-picture", "--size", 32, "--out", tmp_path)
+    assert result.exit_code != 0
+    assert "chart.json" in str(result.exception)
+    assert not quick
+    assert (tmp_path / "chart.json").read_text() == content
