@@ -355,8 +355,8 @@ def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
         typer.echo(f"{'':<12}no other setting is even with it")
         return
     typer.echo(
-        f"{'':<12}even with it, as far as these pixels tell: {len(others)} other settings (differences below "
-        f"twice their scatter); the {cheap}: {_told(least)}"
+        f"{'':<12}even with it, as far as these pixels tell, apart by less than twice the scatter: "
+        f"{len(others)}; the {cheap}: {_told(least)}"
     )
 
 

@@ -2,7 +2,9 @@
 
 The same pixels are held out for every setting, so that their noise is common to all scores. What scatters is
 the difference of two of them, told by how much it differs from one part of the pixels to the next. Where
-most settings are even, the score says little, and the quickest of them is as good a choice as the best.
+most settings are even, the score says little, and the quickest of them is as good a choice as the best. That
+is for settings of one binning: blocks as large as the coarsest pixels are predicted as well by these, which
+show less all the same.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ def even_with_best(points: Iterable[Point], least_iterations: int = SETTLED_ITER
     """Return the settled point with the best score on held-out pixels, and those even with it, best first.
 
     Points of fewer than ``least_iterations`` do not take part, but for one-shot methods.
-    Empty where no point tells its scatter.
+    All have the best one's binning. Empty where no point tells its scatter.
     """
     told = [
         p
@@ -36,8 +38,12 @@ def even_with_best(points: Iterable[Point], least_iterations: int = SETTLED_ITER
     if not told:
         return ()
     best = min(told, key=lambda p: p.held_out)
-    even = [p for p in told if p is best or _is_even(p, best)]
+    even = [p for p in told if p is best or (_binning(p) == _binning(best) and _is_even(p, best))]
     return tuple(sorted(even, key=lambda p: p.held_out))
+
+
+def _binning(point: Point) -> float:
+    return point.binning if is_known(point, "binning") else 1.0
 
 
 def _is_even(point: Point, best: Point) -> bool:

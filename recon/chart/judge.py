@@ -109,6 +109,7 @@ class Judge:
             float(np.sqrt(np.mean(used**2))),
             float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
             family=self.setting.family,
+            binning=self.setting.binning,
             held_out_parts=tuple(float(np.mean(error[k::count] ** 2)) for k in range(count)),
         )
         if self.problem.truth is None:

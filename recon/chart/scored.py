@@ -142,6 +142,8 @@ class Point:
         Settings of one family share a colour.
     group : str
         Only settings of one group compete.
+    binning : float
+        Of the pixels that were computed with.
     held_out_parts : tuple of float
         Mean squares of the held-out blocks' errors, apart for parts of them that all settings share.
     """
@@ -160,6 +162,7 @@ class Point:
     images: float = NAN
     family: str = ""
     group: str = ""
+    binning: float = NAN
     held_out_parts: tuple[float, ...] = ()
 
     def to_json(self) -> dict[str, Any]:

@@ -137,7 +137,8 @@ def test_scores_that_scatter_more_than_they_differ_are_even():
     even = made("even", 0.05, 0.2, seconds=0.1)
     apart = made("apart", 0.05, 0.01)
     early = made("early", 0.0, 0.0, iterations=5)
-    found = even_with_best([early, apart, even, best, Point("other", 40, 1.0, held_out=1.0)])
+    coarser = replace(best, setting="coarser", binning=2.0)
+    found = even_with_best([early, apart, even, best, coarser, Point("other", 40, 1.0, held_out=1.0)])
     assert {p.setting for p in found} == {"best", "even"}
     assert found[0].held_out == min(p.held_out for p in found)
     assert even_with_best([Point("other", 40, 1.0, held_out=1.0)]) == ()
