@@ -6,7 +6,7 @@ Which stress limits is asked the same way: were this one number as good as a goo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -138,7 +138,10 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
         f"{count} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)}; "
         f"{mixed} mixed scenes)"
     )
-    findings = _unfinished_first(_findings(cases, place, numbers, share, count), numbers, reliable)
+    if region is Region.UNKNOWN:
+        findings = _setting_apart(cases, place, numbers)
+    else:
+        findings = _unfinished_first(_findings(cases, place, numbers, share, count), numbers, reliable)
     return Verdict(region, method, share, findings, numbers, basis)
 
 
@@ -169,6 +172,26 @@ def _findings(
     cases: Cases, place: Floats, numbers: Mapping[str, float], share: float, count: int
 ) -> tuple[Finding, ...]:
     """Return the stresses, those first whose removal would lower the share of failures most."""
+
+    def gain(relieved: Floats) -> float:
+        return share - failing_share(cases, relieved, count)[0]
+
+    return _relieved(cases, place, numbers, gain)
+
+
+def _setting_apart(cases: Cases, place: Floats, numbers: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Return the stresses, those first without which cases would be nearest."""
+
+    def nearest(to: Floats) -> float:
+        return float(np.sort(np.linalg.norm(cases.places - to, axis=1))[2])
+
+    return _relieved(cases, place, numbers, lambda relieved: nearest(place) - nearest(relieved))
+
+
+def _relieved(
+    cases: Cases, place: Floats, numbers: Mapping[str, float], gain_of: Callable[[Floats], float]
+) -> tuple[Finding, ...]:
+    """Return the stresses that are worse than in good cases, by what is gained where one is as in those."""
     good = cases.places[cases.severities < 0.7]
     if len(good) < 5:
         return ()
@@ -182,7 +205,7 @@ def _findings(
             continue  # as good as in a good case already
         relieved = place.copy()
         relieved[index] = typical
-        gain = share - failing_share(cases, relieved, count)[0]
+        gain = gain_of(relieved)
         if gain > 0:
             findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
     return tuple(sorted(findings, key=lambda f: -f.gain))

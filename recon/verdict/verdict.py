@@ -58,7 +58,8 @@ class Finding:
     value : float
         What was measured.
     gain : float
-        By how much the share of failing cases would fall, were this one as in a good case.
+        By how much the share of failing cases would fall, were this one as in a good case; where no case is
+        much like it, by how much nearer the nearest would be.
     words, help : str
         What it is, and what would help.
     """
@@ -111,6 +112,8 @@ class Verdict:
             said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
         if self.region in (Region.NEAR, Region.OUTSIDE):
             said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
+        elif self.region is Region.UNKNOWN and said[0] != COMPUTED:
+            said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
         return tuple(f"{s}." for s in said)
 
     @property

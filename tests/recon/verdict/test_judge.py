@@ -69,6 +69,9 @@ def test_what_no_map_saw_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, 0.03), "admm nonnegative").region is Region.UNKNOWN
     strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
     assert strange.region is Region.UNKNOWN
+    # What sets it apart is named, with what would help.
+    assert strange.findings[0].stress == "load"
+    assert strange.sentences[1].startswith("What sets it apart: 40 unknowns")
     # More light than any case had is as good as the most.
     assert judge.verdict_on(evidence(500, 0.03), "admm tv").region is Region.INSIDE
     assert judge.verdict_on(evidence(30, unsettled=20), "admm tv").region is Region.OUTSIDE
