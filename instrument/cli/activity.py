@@ -74,6 +74,13 @@ def activity(
         raise FileError(out, "is no folder.")
     with saying_what_is_left(out):
         pictures = _video(video, psf, calibration, z_mm, binning, out, force)
+        warm = pictures.attributes.get("diffuserbench", {}).get("warm_iterations")
+        if warm is not None and warm < WARM_ITERATIONS:
+            typer.echo(
+                f"Warning: this video has {warm} warm iterations a frame. With fewer than {WARM_ITERATIONS} "
+                f"some of what is active is missed: reconstruct it with --warm {WARM_ITERATIONS}.",
+                err=True,
+            )
         settings = ActivitySettings(
             window_s=window_s,
             percentile=percentile,

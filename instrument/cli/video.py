@@ -8,6 +8,7 @@ import typer
 
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.video.block import BlockReport
+from instrument.video.crew import require_crew
 from instrument.video.reconstruction import (
     PreparedVideo,
     VideoRequest,
@@ -22,6 +23,7 @@ def reconstruct_to_video(
     request: VideoRequest, *, workers: int | None, scheduler: str | None, force: bool
 ) -> None:
     """Prepare or take up again, solve with a progress bar, finish; exit code 130 where interrupted."""
+    require_crew(workers=workers, scheduler=scheduler)  # before anything is written
     prepared = prepare_video(request, force=force)
     for name, text in prepared.notes.items():
         typer.echo(f"{name:<12}{text}")
@@ -54,6 +56,11 @@ def reconstruct_to_video(
             err=True,
         )
         raise typer.Exit(130)
+    if unlit := prepared.job.unlit():
+        typer.echo(
+            f"Warning: {unlit} of {len(plan.frames)} frames hold nothing but noise: was the scene lit?",
+            err=True,
+        )
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, finish_video(prepared)))}")
 
 

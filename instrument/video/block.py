@@ -14,6 +14,7 @@ from instrument.store.frame_array import FrameArray
 from instrument.store.layout import FRAMES
 from instrument.video.job import VideoJob
 from instrument.video.output import VideoPictures
+from instrument.video.source import has_light
 from recon.threads import set_threads
 from recon.video import VideoSolver
 from recon.video.joint import solve_together
@@ -25,12 +26,16 @@ _kept = threading.local()
 
 @dataclass(frozen=True, slots=True)
 class BlockReport:
-    """What a worker did: a block's number, how many frames it solved and wrote, and in how long."""
+    """What a worker did: a block's number, how many frames it solved and wrote, and in how long.
+
+    ``unlit`` is how many of its frames hold nothing but noise.
+    """
 
     block: int
     solved: int
     written: int
     seconds: float
+    unlit: int = 0
 
 
 class CancelledError(Exception):
@@ -78,13 +83,21 @@ def solve_block(
     block = job.blocks[number]
     together_in = None if len(block) == 1 else plan.over_time
     written = 0
+    unlit = 0
+
+    def measured() -> Iterator[Floats]:
+        nonlocal unlit
+        reduction, deviation = job.reduction, job.camera.deviation
+        for index in block:
+            frame = reduction.apply(frames.read(index))
+            unlit += not has_light(frame, deviation)
+            yield frame
+
     if together_in is None:
         job, solver = _solver_for(job)
-        reduction = job.reduction
-        solved = _one_by_one(solver, (reduction.apply(frames.read(index)) for index in block))
+        solved = _one_by_one(solver, measured())
     else:
-        reduction = job.reduction
-        stack = np.stack([reduction.apply(frames.read(index)) for index in block])
+        stack = np.stack(list(measured()))
         together = solve_together(
             job.camera, stack, together_in, iterations=plan.cold_iterations, ended=ended
         )
@@ -96,8 +109,8 @@ def solve_block(
         if not pictures.is_written(index):
             pictures.write(index, np.ascontiguousarray(np.rot90(picture, plan.rotate_deg // 90)))
             written += 1
-    job.mark_done(number)
-    return BlockReport(number, len(block), written, time.perf_counter() - began_s)
+    job.mark_done(number, unlit)
+    return BlockReport(number, len(block), written, time.perf_counter() - began_s, unlit)
 
 
 def _one_by_one(solver: VideoSolver, frames: Iterable[Floats]) -> Iterator[Floats]:

@@ -101,23 +101,9 @@ def cluster(*, workers: int | None = None, scheduler: str | None = None) -> Iter
     BenchError
         When Dask is not installed, or there is no scheduler at the address.
     """
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError as error:
-        raise BenchError(
-            "Workers need Dask, which is not installed: pip install 'diffuserbench[cluster]'."
-        ) from error
-    # Its own configuration says INFO, and silence_logs below is taken back before the last messages come.
-    logging.getLogger("distributed").setLevel(logging.WARNING)
+    distributed = _dask()
     if scheduler is not None:
-        try:
-            client = distributed.Client(scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:
-            raise BenchError(
-                f"No Dask scheduler answers at {scheduler}: {error}. Start one with 'dask scheduler', and "
-                "workers that see the same files with 'dask worker ADDRESS'."
-            ) from error
-        with client:
+        with _client_of(distributed, scheduler) as client:
             yield client
         return
     with (
@@ -127,3 +113,34 @@ def cluster(*, workers: int | None = None, scheduler: str | None = None) -> Iter
         distributed.Client(local) as client,
     ):
         yield client
+
+
+def require_crew(*, workers: int | None = None, scheduler: str | None = None) -> None:
+    """Raise what :func:`cluster` would, before any work is begun; does nothing without a cluster."""
+    if workers is None and scheduler is None:
+        return
+    distributed = _dask()
+    if scheduler is not None:
+        _client_of(distributed, scheduler).close()
+
+
+def _dask() -> Any:
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError as error:
+        raise BenchError(
+            "Workers need Dask, which is not installed: pip install 'diffuserbench[cluster]'."
+        ) from error
+    # Its own configuration says INFO; silence_logs of a local cluster is taken back too early.
+    logging.getLogger("distributed").setLevel(logging.WARNING)
+    return distributed
+
+
+def _client_of(distributed: Any, scheduler: str) -> Any:
+    try:
+        return distributed.Client(scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise BenchError(
+            f"No Dask scheduler answers at {scheduler}: {error}. Start one with 'dask scheduler', and "
+            "workers that see the same files with 'dask worker ADDRESS'."
+        ) from error

@@ -4,7 +4,7 @@
 
     job.json      the recording, the frames, the blocks, every setting
     camera.npz    PSFs, dark level, noise, the prior's weight: settled once, so that all workers agree
-    done/         an empty file for each block whose pictures are on the disk
+    done/         a file for each block whose pictures are on the disk: how many of its frames had no light
 
 A worker needs the job's folder and a block's number, nothing else: it reads frames and writes pictures.
 A block that was cut off is computed again from its start, as its pictures hang together; those that are on
@@ -154,9 +154,13 @@ class VideoJob:
         """Whether a block's pictures are on the disk."""
         return (self.folder / _DONE / str(block)).exists()
 
-    def mark_done(self, block: int) -> None:
-        """Note that a block's pictures are on the disk."""
-        (self.folder / _DONE / str(block)).touch()
+    def unlit(self) -> int:
+        """Return how many frames of the blocks that are done hold nothing but noise."""
+        return sum(int(path.read_text() or 0) for path in (self.folder / _DONE).iterdir())
+
+    def mark_done(self, block: int, unlit: int = 0) -> None:
+        """Note that a block's pictures are on the disk, and how many of its frames had no light."""
+        (self.folder / _DONE / str(block)).write_text(str(unlit))
         sync_folder(self.folder / _DONE)
 
     # What workers need -----------------------------------------------------------------------------

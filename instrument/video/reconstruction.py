@@ -27,6 +27,7 @@ from instrument.video.crew import cluster, in_process, on_cluster
 from instrument.video.job import VideoJob, VideoPlan
 from instrument.video.mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
 from instrument.video.output import VideoPictures, create_output
+from instrument.video.source import has_light, require_video
 from instrument.volume_zarr import is_zarr_name
 from recon.video import PRIORS, VideoCamera, video_camera
 from recon.video.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
@@ -134,10 +135,10 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         When something cannot be used, or the output holds another video.
     """
     _check(request)
+    request.settings.require(z_um=request.z_um)
     run = Run.open(request.run)
+    require_video(run)
     frames = tuple(sorted(run.records))
-    if not frames:
-        raise FileError(run.path, "has no frames to reconstruct.")
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
     settings = request.settings
@@ -178,6 +179,8 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     warnings = list(picture.warnings)
     if saturated:
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
+    if not has_light(picture.measurement, camera.deviation):
+        warnings.append("The first frame holds nothing but noise: was the scene lit?")
     if missing := run.n_frames - len(frames):
         warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
     notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames"}
@@ -236,7 +239,8 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
         shown = (as_shown(pictures.read(index), black, white) for index in plan.frames)
         write_mp4(request.film_path, shown, fps)
         written.append(request.film_path)
-    record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run}
+    unlit = prepared.job.unlit()
+    record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
     write_text(request.record_path, json.dumps(record, indent=1, sort_keys=True))
     prepared.job.remove()
     return [*written, request.record_path]
@@ -389,6 +393,7 @@ def _create(request: VideoRequest, run: Run, plan: VideoPlan, picture: Job) -> N
         attributes={
             **plan.settings,
             "run": plan.run,
+            "warm_iterations": None if plan.over_time else plan.warm_iterations,
             "missing": sorted(set(range(plan.n_frames)) - set(plan.frames)),
         },
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zarr
 
 from instrument.activity import COPIES, ActivitySettings, find_activity
 from instrument.cli import main
@@ -65,6 +66,16 @@ def test_the_command_writes_what_it_found(
     record = json.loads((out / "activity.json").read_text())
     assert record["regions"] == 1
     assert record["simulated"]
+
+
+@pytest.mark.parametrize(("warm", "warned"), [(4, True), (6, False)])
+def test_a_video_of_few_warm_iterations_is_warned_of(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], warm: int, warned: bool
+) -> None:
+    group = zarr.open_group(film, mode="r+")
+    group.attrs["diffuserbench"] = {"simulated": True, "warm_iterations": warm}
+    assert main(["activity", str(film), "--out", str(tmp_path / "found"), "--window", "6"]) == 0
+    assert ("reconstruct it with --warm 6" in capsys.readouterr().err) == warned
 
 
 def test_results_are_not_replaced_and_mistakes_are_said(

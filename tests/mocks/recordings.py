@@ -28,13 +28,14 @@ def write_recording(
     frames: Mapping[int, np.ndarray],
     *,
     period_s: float = 0.04,
-    led: str = "off",
+    led: str | Mapping[int, str] = "off",
     plan: Plan | None = None,
     saturated: float = 0.0,
 ) -> Path:
     """Write frames, uint16, by their number; numbers left out are gaps. Returns the run's folder.
 
-    With a plan they are the frames of its steps, and those left out are missing.
+    With a plan they are the frames of its steps, and those left out are missing. ``led`` is the light of all,
+    or of each.
     """
     with RunWriter.create(parent, label="recording", bench=BENCH, plan=plan) as writer:
         expected = 0
@@ -55,7 +56,7 @@ def write_recording(
                 black_level=0.0,
                 roi=(0, 0, *image.shape[:2]),
                 binning=1,
-                led_pattern=led,
+                led_pattern=led if isinstance(led, str) else led[index],
                 saturated_fraction=saturated,
             )
             writer.write([FrameToStore(index, image.astype(np.uint16), metadata)])

@@ -20,6 +20,7 @@ from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
 from instrument.errors import BenchError, FileError
+from instrument.plan import Part, Plan
 from instrument.reconstruction_request import Settings
 from instrument.video import block as block_module
 from instrument.video.block import BlockReport
@@ -33,6 +34,7 @@ from instrument.video.reconstruction import (
     prepare_video,
     solve_video,
 )
+from instrument.video.source import has_light
 from recon import reconstruct
 from recon.metrics import psnr
 from tests.mocks.recordings import write_recording
@@ -327,6 +329,67 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("instrument.video.crew.CONNECT_S", 1)
     with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
         pass
+
+
+def test_an_unknown_scheduler_leaves_nothing_behind(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("instrument.video.crew.CONNECT_S", 1)
+    arguments = ["reconstruct", str(recording), "--video", "--psf", str(recording.parent / "psf.npy")]
+    out = ["--out", str(tmp_path / "s.ome.zarr"), "--scheduler", "tcp://127.0.0.1:9"]
+    assert main([*arguments, "--dark", "20", *out]) == 2
+    assert "No Dask scheduler answers" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_run_of_a_plan_is_no_video_unless_its_frames_are_alike(recording: Path, tmp_path: Path) -> None:
+    frames = {t: scene(t) for t in range(4)}
+    plan = Plan(label="lapse", parts=(Part(label="a", repeats=4, interval_s=1.0),))
+    lit = {t: "off" if t < 2 else "source" for t in range(4)}
+    (tmp_path / "different").mkdir()
+    different = write_recording(tmp_path / "different", frames, plan=plan, led=lit)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(FileError, match=r"no video: its frames differ in light.*diffuserbench record"):
+        prepare_video(request(recording, tmp_path / "out", run=different))
+    assert not list((tmp_path / "out").iterdir())
+    (tmp_path / "alike").mkdir()
+    alike = write_recording(tmp_path / "alike", frames, plan=plan)
+    assert prepare_video(request(recording, tmp_path / "out", run=alike)).left == [0]
+    (alike / "calibration").mkdir()
+    (alike / "calibration" / "calibration.json").write_text("{}")
+    with pytest.raises(FileError, match=r"holds a calibration.*were the two swapped"):
+        prepare_video(request(recording, tmp_path / "other", run=alike, out=tmp_path / "w.ome.zarr"))
+
+
+def test_frames_without_light_are_told(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    dark = {t: np.clip(rng.normal(20, 2, SHAPE), 0, 4095).round().astype(np.uint16) for t in range(8)}
+    (tmp_path / "runs").mkdir()
+    run = write_recording(
+        tmp_path / "runs", {**{t: scene(t) for t in range(5)}, **{t: dark[t] for t in (5, 6)}}
+    )
+    psf = str(recording.parent / "psf.npy")
+    out = tmp_path / "v.ome.zarr"
+    arguments = ["reconstruct", str(run), "--video", "--psf", psf, "--out", str(out), "--dark", "20"]
+    assert main([*arguments, "--iterations", "2", "--warm", "1", "--block", "4", "--no-mp4"]) == 0
+    assert "2 of 7 frames hold nothing but noise" in capsys.readouterr().err
+    assert json.loads((tmp_path / "v.json").read_text())["frames_unlit"] == 2
+    (tmp_path / "unlit").mkdir()
+    unlit = write_recording(tmp_path / "unlit", dark)
+    prepared = prepare_video(request(recording, tmp_path, run=unlit, out=tmp_path / "u.ome.zarr"))
+    assert any("first frame holds nothing but noise" in warning for warning in prepared.warnings)
+
+
+@pytest.mark.parametrize("photons", [3, 30, 3000])
+def test_light_is_told_from_noise_however_faint(photons: float) -> None:
+    rng = np.random.default_rng(1)
+    light = cast([(0, 0, 1.0), (5, -8, 0.7)])
+    light *= photons / light.max()
+    deviation = np.array([np.sqrt(light.mean() + 1)])
+    assert has_light(rng.poisson(light) + rng.normal(0, 1, SHAPE), deviation)
+    assert not has_light(rng.normal(0, deviation[0], SHAPE), deviation)
 
 
 @pytest.mark.parametrize("over_time", ["tv", "lowrank"])

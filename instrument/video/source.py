@@ -1,0 +1,85 @@
+"""Whether a run is a video: frames that follow one another, of one scene, with light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.frame import FrameMetadata
+from instrument.calibration_file import is_calibration
+from instrument.errors import FileError
+from instrument.store import Run
+
+_BLOCK = 8
+"""Pixels along a side over which light is averaged to tell it from noise."""
+
+LIT = 2.0
+"""Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
+
+_SAME: dict[str, Callable[[FrameMetadata], object]] = {
+    "stage position": lambda m: tuple(sorted((axis, round(at, 1)) for axis, at in m.stage_position.items())),
+    "light": lambda m: m.led_pattern,
+    "pattern on the SLM": lambda m: m.slm_image_hash,
+    "exposure": lambda m: m.exposure_ms,
+    "gain": lambda m: m.gain,
+}
+"""What all frames of a planned run must share to be a video of one scene."""
+
+
+def require_video(run: Run) -> None:
+    """Refuse a run that is no video: frames of a plan that moves or lights something, or a calibration.
+
+    A recording is one; so is a plan that takes the same photograph again and again.
+
+    Raises
+    ------
+    FileError
+        With what differs from frame to frame, and what to do.
+    """
+    if not run.records:
+        raise FileError(run.path, "has no frames to reconstruct.")
+    planned = run.plan is not None
+    if is_calibration(run.path) or (planned and any(run.path.glob("*/calibration.json"))):
+        raise FileError(
+            run.path,
+            "holds a calibration: it is no video of a scene.",
+            "Give the recording as RUN and this as --calibration: were the two swapped?",
+        )
+    if not planned:
+        return
+    frames = [record.metadata for record in run.records.values()]
+    differing = [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
+    if differing:
+        raise FileError(
+            run.path,
+            f"is the run of a plan, no video: its frames differ in {' and '.join(differing)}.",
+            "Record a video with 'diffuserbench record'. Single frames: 'diffuserbench export' writes them, "
+            "'reconstruct --image' takes each.",
+        )
+
+
+def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
+    """Tell whether there is more in a frame than noise.
+
+    Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
+    variance of the means of 8 x 8 pixels is compared with what noise leaves of it.
+
+    Parameters
+    ----------
+    frame : ndarray, (height, width) or (height, width, n_channels)
+        Counts less dark.
+    deviation : ndarray, (n_channels,)
+        Of the noise, counts.
+    """
+    channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
+    height, width = (n // _BLOCK for n in channels.shape[1:])
+    if min(height, width) < 2:
+        return True  # too few blocks to tell
+    cut = channels[:, : height * _BLOCK, : width * _BLOCK].astype(np.float64)
+    means = cut.reshape(len(cut), height, _BLOCK, width, _BLOCK).mean(axis=(2, 4))
+    noise = np.maximum(np.asarray(deviation, np.float64).reshape(-1), np.finfo(np.float64).tiny)
+    ratio = means.var(axis=(1, 2)) * _BLOCK**2 / noise**2
+    return bool((ratio > LIT).any())
