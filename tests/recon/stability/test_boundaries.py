@@ -157,6 +157,7 @@ BOUNDARIES = [
     ("drift", "admm tv", (1, 3, 5, 8), 0.001, 5.2, 1.5),
     ("depth-error", "admm l1", (2, 4, 6, 9), 3000, 4.6, 1.5),
     ("background", "admm tv", (1, 10, 40), 1000, 19.0, 2.2),
+    ("density-voxels", "volume l1", (0.001, 0.003, 0.01, 0.03), 4, 0.0073, 1.5),
     ("mask-moved", "4 mask pixels an SLM pixel", (0.1, 0.25, 0.5, 1), 0.0, 0.32, 1.5),
     ("mask-defocus", "16 mask pixels an SLM pixel", (10, 25, 50, 100), 0.0, 28.0, 1.6),
 ]
