@@ -2,9 +2,9 @@
 
 The same pixels are held out for every setting, so that their noise is common to all scores. What scatters is
 the difference of two of them, told by how much it differs from one part of the pixels to the next. Where
-most settings are even, the score says little, and the quickest of them is as good a choice as the best. That
-is for settings of one binning: blocks as large as the coarsest pixels are predicted as well by these, which
-show less all the same.
+most settings are even, the score says little, and the quickest of them is as good a choice as the best. They
+are settings of one binning, compared pixel by pixel: the blocks on which settings of different binnings are
+scored are far fewer, and do not see what is finer.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def even_with_best(points: Iterable[Point], least_iterations: int = SETTLED_ITER
     ]
     if not told:
         return ()
-    best = min(told, key=lambda p: p.held_out)
-    even = [p for p in told if p is best or (_binning(p) == _binning(best) and _is_even(p, best))]
-    return tuple(sorted(even, key=lambda p: p.held_out))
+    chosen = _binning(min(told, key=lambda p: p.held_out))
+    alike = sorted((p for p in told if _binning(p) == chosen), key=lambda p: float(np.mean(p.held_out_parts)))
+    return tuple(p for p in alike if p is alike[0] or _is_even(p, alike[0]))
 
 
 def _binning(point: Point) -> float:

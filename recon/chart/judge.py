@@ -35,7 +35,7 @@ Array = npt.NDArray[Any]
 
 HELD_SHARE = 0.05
 PARTS = 12
-"""Of the held-out blocks, scored apart: how much they differ tells how much the score scatters."""
+"""Of the held-out pixels, scored apart: how much they differ tells how much the score scatters."""
 _PIXELS_A_WAVE = 4
 """Blocks along an axis for each slow wave that is fitted, at least."""
 
@@ -98,10 +98,11 @@ class Judge:
         """Score a picture or volume of the full field."""
         planes = found[None] if found.ndim == 2 else found
         predicted = self._predict(planes)
-        used = _misfit(self.measurement, predicted, self._waves)[~self.erasures] / self.noise
+        fine = _misfit(self.measurement, predicted, self._waves) / self.noise
+        used, held = fine[~self.erasures], fine[self.held & self.kept]
         seen, shown = self._blocks(self.measurement), self._blocks(predicted)
         error = _misfit(seen, shown, self._block_waves)[self._scored] / self._block_noise
-        count = min(PARTS, error.size)
+        count = min(PARTS, held.size)
         point = Point(
             self.setting.name,
             iterations,
@@ -110,7 +111,7 @@ class Judge:
             float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
             family=self.setting.family,
             binning=self.setting.binning,
-            held_out_parts=tuple(float(np.mean(error[k::count] ** 2)) for k in range(count)),
+            held_out_parts=tuple(float(np.mean(held[k::count] ** 2)) for k in range(count)),
         )
         if self.problem.truth is None:
             return point

@@ -145,7 +145,8 @@ class Point:
     binning : float
         Of the pixels that were computed with.
     held_out_parts : tuple of float
-        Mean squares of the held-out blocks' errors, apart for parts of them that all settings share.
+        Mean squares of the errors on held-out pixels, each by itself and not in blocks, apart for parts of
+        them that all settings of one binning share.
     """
 
     setting: str
