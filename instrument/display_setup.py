@@ -11,6 +11,7 @@ import numpy as np
 from instrument.config import BenchConfig
 from instrument.errors import BenchError, FileError
 from recon.holography import DcTerm, Display, ScatteringMask, random_mask
+from recon.holography.display import greatest_defocus_mm
 
 if TYPE_CHECKING:
     from drivers.slm import Slm
@@ -86,6 +87,18 @@ def bench_display(
         dc=DcTerm(table.dc_power, table.dc_phase_rad),
         mask_fill=table.mask_fill,
     )
+
+
+def depth_limit_mm(
+    config: BenchConfig, size: tuple[tuple[int, int], float], *, expansion: int | None = None
+) -> float:
+    """Return how far out of focus a plane may lie for :func:`bench_display`, without making its mask."""
+    table = config.display
+    k = expansion_side(expansion or table.expansion)
+    (height, width), pitch_um = size
+    binning = table.slm_binning
+    shape = (height // binning * k, width // binning * k)
+    return greatest_defocus_mm(shape, pitch_um * binning / k, table.wavelength_nm, table.focal_mm)
 
 
 def expansion_side(expansion: int) -> int:

@@ -51,12 +51,14 @@ from gui.views.view_grid import ViewGrid
 from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
+from instrument.display_setup import depth_limit_mm
 from instrument.errors import BenchError
 from instrument.hologram_job import HologramRequest, HologramResult, field_picture
 from instrument.images import read_image
 from instrument.result_list import free_name
 from recon.errors import InputError
 from recon.holography import Budget, Scores
+from recon.holography.display import require_defocus
 
 _IMAGES = "Pictures (*.png *.tif *.tiff *.jpg *.bmp *.npy)"
 _PREVIEW_ITERATIONS = 8
@@ -84,10 +86,10 @@ class HologramsPanel(Panel):
         self.srgb = QCheckBox("sRGB-coded")
         self.srgb.setToolTip("The picture's values are decoded to intensities first")
         self.z_mm = Entry(
-            depth_mm, tip="Depth behind the focal plane in mm", placeholder="0 mm: the focal plane"
+            self._depth_mm, tip="Depth behind the focal plane in mm", placeholder="0 mm: the focal plane"
         )
         self.further = Entry(
-            further_planes,
+            self._further_planes,
             tip="Pictures in other planes: FILE @ DEPTH mm; several are separated by semicolons",
             placeholder="none (FILE @ 40 mm; …)",
         )
@@ -242,6 +244,8 @@ class HologramsPanel(Panel):
         for entry in self._entries():
             entry.refused.connect(lambda why, field=entry: self.refused(field, why))
         self.picture.understood.connect(self._picture_changed)
+        for depths in (self.z_mm, self.further):  # the expansion sets how far they reach
+            self.expansion.understood.connect(depths.check)
         self.fit.currentTextChanged.connect(lambda _: self._picture_changed())
         self.srgb.toggled.connect(lambda _: self._picture_changed())
         self.weights_mode.currentTextChanged.connect(lambda _: self._show_mode())
@@ -283,6 +287,32 @@ class HologramsPanel(Panel):
             further=self.further.value(),
             request=request,
         )
+
+    def _depth_mm(self, text: str) -> float:
+        z_mm = depth_mm(text)
+        self._require_reach(z_mm)
+        return z_mm
+
+    def _further_planes(self, text: str) -> tuple[tuple[Path, float], ...]:
+        planes = further_planes(text)
+        for _, z_mm in planes:
+            self._require_reach(z_mm)
+        return planes
+
+    def _require_reach(self, z_mm: float) -> None:
+        """Refuse a depth that the display cannot show; without its SLM that is not known."""
+        slm = self.session.bench.slm
+        if slm is None or not self.session.is_open("slm"):
+            return
+        try:
+            q = self.expansion.value()
+        except BenchError:
+            return  # refused at its own field
+        limit_mm = depth_limit_mm(self.session.config, (slm.shape, slm.pixel_pitch_um), expansion=q)
+        try:
+            require_defocus(z_mm, limit_mm)
+        except InputError as error:
+            raise BenchError(str(error)) from error
 
     def as_python(self) -> str:
         """Return lines that compute and write this hologram."""

@@ -120,15 +120,13 @@ class Display:
             When the factor turns by more than pi between mask pixels at the aperture's edge: the plane
             would be aliased.
         """
+        require_defocus(
+            z_mm, greatest_defocus_mm(self.mask.shape, self.mask_pitch_um, self.wavelength_nm, self.focal_mm)
+        )
         curvature = np.pi * z_mm / (self.wavelength_nm * 1e-6 * self.focal_mm**2)
         factors = []
         for n in self.mask.shape:
             x_mm = (np.arange(n) - (n - 1) / 2) * self.mask_pitch_um * 1e-3
-            if abs(curvature) * 2 * x_mm[-1] * self.mask_pitch_um * 1e-3 > np.pi:
-                limit = abs(z_mm) * np.pi / (abs(curvature) * 2 * x_mm[-1] * self.mask_pitch_um * 1e-3)
-                raise InputError(
-                    f"A plane {z_mm:g} mm out of focus is too far for this display (limit {limit:.3g} mm)."
-                )
             factors.append(np.exp(1j * curvature * x_mm**2))
         return factors[0], factors[1]
 
@@ -136,3 +134,21 @@ class Display:
         """Return the mask pixels' intensity envelope over the field, in FFT order, as two factors."""
         y, x = (np.sinc(self.mask_fill * np.fft.fftfreq(n)) ** 2 for n in shape)
         return y, x
+
+
+def greatest_defocus_mm(
+    mask_shape: tuple[int, int], mask_pitch_um: float, wavelength_nm: float, focal_mm: float
+) -> float:
+    """Return how far out of focus a plane may lie: there its Fresnel factor turns by pi a mask pixel."""
+    extent_mm = (max(mask_shape) - 1) * mask_pitch_um * 1e-3
+    if extent_mm == 0:
+        return float("inf")
+    return wavelength_nm * 1e-6 * focal_mm**2 / (extent_mm * mask_pitch_um * 1e-3)
+
+
+def require_defocus(z_mm: float, limit_mm: float) -> None:
+    """Raise InputError for a plane farther out of focus than a display's limit."""
+    if abs(z_mm) > limit_mm:
+        raise InputError(
+            f"A plane {z_mm:g} mm out of focus is too far for this display (limit {limit_mm:.3g} mm)."
+        )

@@ -20,8 +20,11 @@ from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
 from gui.views.view_grid import best_columns
+from instrument.config_file import parse_config
+from instrument.display_setup import bench_display, depth_limit_mm
 from instrument.images import read_image, write_image
 from instrument.slm_image import levels_phase, read_slm_image
+from recon.errors import InputError
 
 WAIT_MS = 60_000
 
@@ -385,3 +388,40 @@ def test_a_picture_is_read_once_and_not_in_the_windows_thread(
     panel.picture.setText(str(tmp_path / "words.png"))
     qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: bool(panel.picture.property("refused")), timeout=WAIT_MS)
+
+
+def test_a_depth_out_of_reach_is_refused_at_its_field(
+    qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
+) -> None:
+    slm = panel.session.bench.slm
+    limit_mm = depth_limit_mm(panel.session.config, (slm.shape, slm.pixel_pitch_um))
+    for depth, field in (
+        (f"{1.02 * limit_mm:.6g}", panel.z_mm),
+        (f"{tmp_path / 'picture.png'} @ {-1.02 * limit_mm:.6g} mm", panel.further),
+    ):
+        field.setText(depth)
+        qtbot.keyClick(field, Qt.Key.Key_Return)
+        assert field.property("refused")
+        assert "too far for this display" in field.toolTip()
+    panel.further.setText("")
+    panel.z_mm.setText(f"{0.9 * limit_mm:.6g}")
+    qtbot.keyClick(panel.z_mm, Qt.Key.Key_Return)
+    assert not panel.z_mm.property("refused")
+    panel.expansion.setText("16")  # finer mask pixels reach farther
+    qtbot.keyClick(panel.expansion, Qt.Key.Key_Return)
+    wide_mm = depth_limit_mm(panel.session.config, (slm.shape, slm.pixel_pitch_um), expansion=16)
+    panel.z_mm.setText(f"{0.98 * wide_mm:.6g}")
+    assert panel.z_mm.check() == (wide_mm > 0)
+    panel.expansion.setText("4")
+    qtbot.keyClick(panel.expansion, Qt.Key.Key_Return)
+    assert bool(panel.z_mm.property("refused")) == (0.98 * wide_mm > limit_mm)
+
+
+def test_the_depth_limit_is_that_of_the_display_itself() -> None:
+    config = parse_config(aligned(), None)
+    size = ((40, 60), 32.0)
+    limit_mm = depth_limit_mm(config, size)
+    display = bench_display(config, size)
+    display.defocus(0.999 * limit_mm)
+    with pytest.raises(InputError, match="too far for this display"):
+        display.defocus(-1.001 * limit_mm)
