@@ -240,10 +240,13 @@ def main() -> None:
         ship(entries, a.cases)
     shipped = [{**e, "index": e["scene"]} for e in mixed_scenes()]
     unseen = [e for e in entries if e["index"] >= UNSEEN_FROM]
+    numbers = {e["index"] for e in unseen}
+    chosen = {e["index"] for e in unseen if AUTO in e["method"]}
     report = [
         "# How often verdicts are wrong",
         "",
-        "    python benchmarks/verdicts.py --first 2000 --count 200 --out docs/benchmarks/verdicts.md",
+        f"    python benchmarks/verdicts.py --first {UNSEEN_FROM} --count {len(numbers)} "
+        "--out docs/benchmarks/verdicts.md",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}. Simulated scenes of five families that are in",
         "no stability map: other seeds, random and regular lenslets and smooth diffusers, several stresses",
@@ -252,11 +255,11 @@ def main() -> None:
         "is known of how far that is to be trusted.",
     ]
     if unseen:
-        scenes = len({e["index"] for e in unseen})
         report += [
             "",
-            f"## {scenes} unseen scenes",
+            f"## {len(numbers)} unseen scenes",
             "None of these is among the cases that verdicts ask, and no constant was set on them.",
+            *([f"Models were chosen (`auto`) for {len(chosen)} of them."] if chosen < numbers else []),
             "",
             *said(unseen),
         ]
@@ -264,8 +267,9 @@ def main() -> None:
     report += [
         "",
         f"## {scenes} scenes that come with the program",
-        "These serve as cases; each is judged here by the cases of the others. The number of cases that are",
-        "asked and the weight of `ambiguity` among what makes them alike were chosen on them.",
+        "These serve as cases; each is judged here by the cases of the others. The numbers of cases that are",
+        "asked, the share of failures allowed among them and the weights of what makes them alike were",
+        "chosen on them.",
         "",
         *said(shipped),
     ]

@@ -29,6 +29,10 @@ FAR_OF_VOLUMES = 3.0
 are compared by more numbers. One case in twenty of those known is as far from the others."""
 UNSETTLED = 0.2
 """``unsettled`` from which a reconstruction is not inside: its last change was twice the tolerance."""
+CLIPPED = 0.02
+"""Share of the used pixels at full scale from which that is named first."""
+OF_LIGHT = ("detail", "signal", "height")
+"""Stresses that more light relieves."""
 FEWEST = 40
 """Cases that a group needs to be judged by."""
 
@@ -134,14 +138,14 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
         settled = numbers["unsettled"] < UNSETTLED
         region = Region.INSIDE if reliable and settled else Region.NEAR
     mixed = len(set(cases.scenes.tolist()) - {-1})
-    basis = (
-        f"{count} nearest of {len(cases.severities)} simulated cases (maps {', '.join(cases.maps)}; "
-        f"{mixed} mixed scenes)"
-    )
+    sources = [f"maps {', '.join(cases.maps)}"] if cases.maps else []
+    sources += [f"{mixed} mixed scenes"] if mixed else []
+    basis = f"{count} nearest of {len(cases.severities)} simulated cases ({'; '.join(sources)})"
     if region is Region.UNKNOWN:
         findings = _setting_apart(cases, place, numbers)
     else:
-        findings = _unfinished_first(_findings(cases, place, numbers, share, count), numbers, reliable)
+        findings = _findings(cases, place, numbers, share, count)
+    findings = _unfinished_first(_clipped_first(findings, numbers), numbers, reliable)
     return Verdict(region, method, share, findings, numbers, basis)
 
 
@@ -209,6 +213,20 @@ def _relieved(
         if gain > 0:
             findings.append(Finding(name, numbers[name], gain, words.format(value=numbers[name]), help_))
     return tuple(sorted(findings, key=lambda f: -f.gain))
+
+
+def _clipped_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Return the findings, first that pixels are at full scale where many are, and none that asks for light.
+
+    Similar cases hardly fail of it alone, but more light would make it worse, and it is what can be mended.
+    """
+    if numbers["saturated"] < CLIPPED:
+        return findings
+    _, words, help_ = STRESSES["saturated"]
+    value = numbers["saturated"]
+    gain = next((f.gain for f in findings if f.stress == "saturated"), 0.0)
+    first = Finding("saturated", value, gain, words.format(value=value), help_)
+    return (first, *(f for f in findings if f.stress not in ("saturated", *OF_LIGHT)))
 
 
 def _unfinished_first(

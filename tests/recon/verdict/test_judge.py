@@ -65,6 +65,14 @@ def test_the_limiting_stress_is_named_with_what_helps() -> None:
     assert len(judge.verdict_on(evidence(30, 0.03), "admm tv").sentences) == 1
 
 
+def test_who_overexposed_is_not_told_to_give_more_light() -> None:
+    clipped = judge.verdict_on(evidence(1, 0.03, saturated=0.2), "admm tv")
+    assert clipped.findings[0].stress == "saturated"
+    assert "20% of the pixels used are at full scale" in clipped.sentences[1]
+    assert "More light" not in " ".join(clipped.sentences)
+    assert "More light" in " ".join(judge.verdict_on(evidence(1, 0.03, saturated=1e-3), "admm tv").sentences)
+
+
 def test_what_no_map_saw_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, 0.03), "admm nonnegative").region is Region.UNKNOWN
     strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
