@@ -1,7 +1,7 @@
 """Which settings the held-out pixels cannot tell from the best: scores that differ less than they scatter.
 
 The same pixels are held out for every setting, so that their noise is common to all scores. What scatters is
-the difference of two of them, told by how much it differs from one part of the pixels to the next. Where
+the ratio of two of them, told by how much it differs from one part of the pixels to the next. Where
 most settings are even, the score says little, and the quickest of them is as good a choice as the best. They
 are settings of one binning, compared pixel by pixel: the blocks on which settings of different binnings are
 scored are far fewer, and do not see what is finer.
@@ -18,8 +18,10 @@ from recon.chart.scored import Point, is_known
 SETTLED_ITERATIONS = 30
 """Before these a run's error is of another kind: it is not bright or sharp yet, whatever it will come to."""
 _SCATTERS = 2.0
-"""Standard errors of the difference within which two scores are even."""
+"""Standard errors of the mean ratio within which two scores are even."""
 _LEAST_PARTS = 4
+_LEAST = 1e-12
+"""Mean square below which parts do not differ, in units of the noise'."""
 
 
 def even_with_best(points: Iterable[Point], least_iterations: int = SETTLED_ITERATIONS) -> tuple[Point, ...]:
@@ -49,6 +51,8 @@ def _binning(point: Point) -> float:
 def _is_even(point: Point, best: Point) -> bool:
     if len(point.held_out_parts) != len(best.held_out_parts):
         return False  # other pixels: there is nothing that both have in common
-    apart = np.subtract(point.held_out_parts, best.held_out_parts)
+    # Ratios: of differences one bright pixel that both miss would make most of the scatter.
+    mine, its = (np.log(np.maximum(p.held_out_parts, _LEAST)) for p in (point, best))
+    apart = mine - its
     scatter = float(np.std(apart, ddof=1)) / len(apart) ** 0.5
     return bool(np.mean(apart) <= _SCATTERS * scatter)

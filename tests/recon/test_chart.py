@@ -144,6 +144,13 @@ def test_scores_that_scatter_more_than_they_differ_are_even():
     assert even_with_best([Point("other", 40, 1.0, held_out=1.0)]) == ()
 
 
+def test_one_bright_pixel_does_not_make_settings_even():
+    best = Point("best", 40, 1.0, held_out=10.0, held_out_parts=(1200.0, *np.linspace(1, 2, 11)))
+    worse = [3 * p for p in best.held_out_parts]
+    found = even_with_best([best, Point("worse", 40, 0.1, held_out=17.3, held_out_parts=tuple(worse))])
+    assert found == (best,)
+
+
 def test_settings_fit_the_problem():
     single = settings_for(problem())
     for method in {s.method for s in single}:
