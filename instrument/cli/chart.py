@@ -363,7 +363,9 @@ def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
 def _told(point: Point) -> str:
     from instrument.chart.words import in_words
 
-    return f"{in_words(point)} ({point.held_out:.3f}, {point.seconds:.3g} s)"
+    # Pixel by pixel, as settings were compared; points are drawn by blocks, which every binning has.
+    error = (sum(point.held_out_parts) / len(point.held_out_parts)) ** 0.5
+    return f"{in_words(point)} (error {error:.3g} a pixel, {point.seconds:.3g} s)"
 
 
 def _tell(data: ChartData) -> None:
