@@ -334,7 +334,7 @@ ToleranceOption = Annotated[
         min=0.0,
         metavar="X",
         help="Stop when the relative change an iteration falls below X (and residuals below 10 X). Default: "
-        "2e-3 (fista 5e-4; volumes, --model local or lowrank 1e-3; varying PSFs by auto 8e-3). 0: never.",
+        "2e-3 (fista 5e-4; volumes, --model local or lowrank 1e-3; auto, PSFs vary: 2e-3, 3e-3). 0: never.",
         show_default=False,
     ),
 ]

@@ -17,15 +17,14 @@ from recon.auto.extent import binning_of, field_of
 from recon.auto.planes import planes_of
 from recon.auto.precision import precision_of
 from recon.auto.probe import (
-    COARSE_ITERATIONS,
     COARSE_PX,
     VARYING_ITERATIONS,
     CoarsePass,
+    camera_cost,
     coarse_passes,
-    operator_seconds,
 )
 from recon.auto.reduced import binned, reduced_calibration
-from recon.auto.solving import SETTLED, USUAL_ITERATIONS, SmoothLight, background_of, is_stray, iterations_of
+from recon.auto.solving import USUAL_ITERATIONS, SmoothLight, background_of, is_stray, iterations_of
 from recon.auto.wishes import Wishes
 from recon.errors import InputError
 from recon.noise import NoiseModel
@@ -91,32 +90,37 @@ def choose(
         for c in range(len(data))
     ]
     kind: Literal["tv", "l1"] = "tv" if prior.startswith("tv") else "l1"
-    model, why, variation = model_of(depths, wishes)
+    costs = {m: camera_cost(coarse[0], m) for m in candidates(depths)}
+    contrast = None if kind == "l1" or len(depths.z_um) == 1 else _contrast(data, valid, deviation)
+    model, why, variation = model_of(depths, wishes, contrast, lambda m: costs[m].fft_pixels)
     # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
     even = [replace(c, depths=c.depths.divided(plane_gains(c.depths))) for c in coarse]
     sparse = coarse_passes(even, "l1", background=True)
-    light = _smooth_light(coarse, even, sparse, prior, model)
+    light = _smooth_light(coarse, sparse, prior, model)
     given = background is not None
     smooth = background_of(light, kind, wishes, given=given)
     estimated = smooth.value == "estimated"
     planes, dropped = planes_of(sparse, depths, wishes)
     between, added = between_of(calibration, depths, planes, wishes)
-    times = {m: operator_seconds(coarse[0], m) for m in candidates(depths)}
     binning = binning_of(depths, wishes, whole=whole)
-    haze = is_stray(light.share) and not estimated and not given
+    # A background of a few numbers takes what light from beyond the field has of them, not all of it.
+    haze = is_stray(light.share) and not given and not (estimated and kind == "l1")
     window, reach, field = field_of(depths, wishes, model, haze=haze)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
     side = max(data.shape[1:]) // int(binning.numbers["binning"])
     precise = precision_of(wishes, usual, side)
+    tolerance, end = iterations_of(
+        model, wishes, picture=len(depths.z_um) == 1, merged=merge.value == "merged"
+    )
     decisions = (
-        model_decision(model, why, variation, depths, times, wishes),
+        model_decision(model, why, variation, depths, {m: c.seconds for m, c in costs.items()}, wishes),
         dropped,
         *([added] if len(depths.z_um) > 1 else []),
         field,
         binning,
         merge,
         smooth,
-        iterations_of(model, wishes),
+        end,
         precise,
     )
     return Choice(
@@ -130,9 +134,7 @@ def choose(
         precision="float64" if precise.value == "float64" else "float32",
         psf_window=window,
         acceptance_px=reach,
-        tolerance=SETTLED["convolution" if model == "convolution" else "varying"]
-        if wishes.tolerance is None
-        else wishes.tolerance,
+        tolerance=tolerance,
         decisions=decisions,
         seconds=time.perf_counter() - began,
     )
@@ -143,19 +145,23 @@ def _one_channel(calibration: Calibration, channel: int) -> Calibration:
     return replace(calibration, psfs=calibration.psfs[:, own : own + 1], background=None)
 
 
+def _contrast(data: Array, valid: Array, deviation: Array) -> float:
+    """Return the largest channel's standard deviation in units of its noise."""
+    spread = [float(d[v].std(dtype=np.float64)) for d, v in zip(data, valid, strict=True)]
+    return max(s / max(float(n), 1e-30) for s, n in zip(spread, deviation, strict=True))
+
+
 def _smooth_light(
-    coarse: list[Scaled], even: list[Scaled], sparse: CoarsePass, prior: VolumePrior, model: ModelName
+    coarse: list[Scaled], sparse: CoarsePass, prior: VolumePrior, model: ModelName
 ) -> SmoothLight:
     """Look for light that a smooth background would explain."""
     share = sparse.smooth_share
-    if not prior.startswith("tv"):
-        return SmoothLight(share, coarse_passes(even, "l1", background=False), sparse, telling=True)
-    # A picture that l1 explains has no smooth light; that of a volume is not asked for.
-    hard = is_stray(share) and len(coarse[0].depths.z_um) == 1 and model != "convolution"
-    as_used: ModelName = model if hard else "convolution"
-    iterations = VARYING_ITERATIONS if hard else COARSE_ITERATIONS
+    picture = len(coarse[0].depths.z_um) == 1
+    # A picture that l1 explains has no smooth light; that of a volume total variation does not tell.
+    if not (prior.startswith("tv") and picture and is_stray(share) and model != "convolution"):
+        return SmoothLight(share)
     dark, lit = (
-        coarse_passes(coarse, prior, background=b, model=as_used, iterations=iterations)
+        coarse_passes(coarse, prior, background=b, model=model, iterations=VARYING_ITERATIONS)
         for b in (False, True)
     )
-    return SmoothLight(share, dark, lit, telling=hard)
+    return SmoothLight(share, dark, lit)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from recon.analysis.correlation import autocorrelate
 from recon.auto.reduced import Colours
 from recon.noise import estimate_deviation
+from recon.operators import SpatiallyVarying
 from recon.solvers import StoppingRules
 from recon.volume.channel import ChannelProblem, Scaled, VolumePrior
 from recon.volume.model import Depths, ModelName
@@ -28,9 +29,9 @@ CHANNEL_NOISE = 1.1
 """Misfit, in units of the noise, up to which colour channels are taken to be proportional."""
 CHANNEL_PSF = 0.05
 """The same of their PSFs, relative to them."""
-ACCEPTED = 0.02
+ACCEPTED = 0.005
 """Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
-LIGHT_LOST = 2e-3
+LIGHT_LOST = 2e-4
 """Share of a PSF's light that may lie outside the window it is cut to, along each axis."""
 
 
@@ -111,16 +112,34 @@ def coarse_pass(
     return CoarsePass(misfit, share[None], seconds, smooth_share, outcome.history[-1].objective)
 
 
-def operator_seconds(scaled: Scaled, model: ModelName) -> float:
-    """Processor time of a forward and an adjoint of the coarse copy's camera."""
+@dataclass(frozen=True)
+class CameraCost:
+    """What one forward and adjoint of the coarse copy's camera cost.
+
+    Attributes
+    ----------
+    seconds : float
+        Processor time.
+    fft_pixels : int
+        Pixels transformed: the same at any time, to choose by. 0 for one convolution.
+    """
+
+    seconds: float
+    fft_pixels: int
+
+
+def camera_cost(scaled: Scaled, model: ModelName) -> CameraCost:
+    """Measure a forward and an adjoint of the coarse copy's camera."""
     run = ChannelProblem(
         scaled, 0, model, smooth=False, prior="nonnegative", weights=np.ones((len(scaled.depths.z_um), 3))
     )
     try:
-        run.camera.adjoint(run.camera.forward(np.zeros(run.camera.domain_shape, np.float32)))
+        camera = run.camera
+        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
         began = time.process_time()
-        run.camera.adjoint(run.camera.forward(np.zeros(run.camera.domain_shape, np.float32)))
-        return max(time.process_time() - began, 1e-6)
+        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
+        seconds = max(time.process_time() - began, 1e-6)
+        return CameraCost(seconds, camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0)
     finally:
         run.close()
 

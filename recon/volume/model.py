@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,8 @@ from recon.operators.local_convolution import FieldOfPsfs
 from recon.operators.low_rank import principal_psfs
 from recon.registration import moved
 from recon.types import Calibration
-from recon.volume.field_registration import registered_field, shown
+from recon.volume.field_registration import shown
+from recon.volume.remembered import remembered_field
 
 Array = npt.NDArray[Any]
 ModelName = Literal["auto", "convolution", "local", "lowrank"]
@@ -76,7 +78,7 @@ class Depths:
         """Whether any depth was calibrated at more than one place."""
         return any(len(f.points) > 1 for f in self.fields)
 
-    @property
+    @cached_property
     def field_error(self) -> float:
         """Root mean square difference of the registered PSFs from the central one, relative to it."""
         differences = norms = 0.0
@@ -119,7 +121,7 @@ def sort_by_depth(calibration: Calibration) -> Depths:
     z_um = np.array([float(np.mean(positions[group, 2])) for group in members])
     central, fields, warnings = [], [], []
     for group in members:
-        on_axis, field, trouble = registered_field(calibration, group)
+        on_axis, field, trouble = remembered_field(calibration, group)
         central.append(on_axis)
         fields.append(field)
         warnings += trouble

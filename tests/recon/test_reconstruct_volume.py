@@ -350,19 +350,14 @@ def test_depths_of_a_stage_that_repeats_imperfectly_are_one():
 
 
 def test_empty_planes_are_told():
-    result = reconstruct_volume(measurement(), calibration(), prior="l1", tau=0.1, tolerance=1e-4)
+    settings = {"prior": "l1", "tau": 0.1, "tolerance": 1e-4, "estimate_background": False}
+    result = reconstruct_volume(measurement(), calibration(), **settings)
     (empty,) = result.empty_planes
     assert empty.certified
     assert empty.planes
     assert not result.volume[list(empty.planes)].any()
     whole = reconstruct_volume(
-        measurement(),
-        calibration(),
-        prior="l1",
-        model="convolution",
-        tau=0.1,
-        tolerance=1e-4,
-        drop_empty=False,
+        measurement(), calibration(), model="convolution", drop_empty=False, **settings
     )
     assert not whole.empty_planes[0].planes
     np.testing.assert_allclose(result.volume, whole.volume, atol=0.02 * whole.volume.max())

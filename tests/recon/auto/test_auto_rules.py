@@ -1,0 +1,111 @@
+"""Which camera model and which weight suit a scene, and that choosing registers PSFs once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import recon
+from recon.auto import choose, choose_picture
+from recon.operators.local_convolution import FieldOfPsfs
+from recon.scenes import make_scene, score
+from recon.volume import field_registration, remembered
+from recon.volume.channel import ChannelProblem
+from recon.volume.model import sort_by_depth
+from recon.volume.reconstruct import prepare_volume
+
+
+def decision(choice, name):
+    return next(d for d in choice.decisions if d.name == name)
+
+
+def test_the_quicker_of_two_true_cameras_is_taken():
+    few = make_scene("sparse-picture", size=64, grid=3, seed=7)
+    many = make_scene("sparse-picture", size=64, grid=5, aberration=4.0, seed=7)
+    for scene, model in ((few, "lowrank"), (many, "local")):
+        choice = choose_picture(scene.measurement, scene.calibration, z_um=float(scene.z_um[0]))
+        assert choice.model == model
+        depths = prepare_volume(scene.measurement, scene.calibration, None, None, None)
+        pixels = {
+            m: ChannelProblem(
+                depths, 0, m, smooth=False, prior="nonnegative", weights=np.ones((1, 3))
+            ).camera.fft_pixels
+            for m in ("lowrank", "local")
+        }
+        assert model == min(pixels, key=pixels.__getitem__)
+        assert "transforms" in decision(choice, "model").why
+
+
+def test_a_dim_volume_hides_how_psfs_differ_and_a_bright_one_does_not():
+    dim, bright = (
+        make_scene("dense-volume", size=40, depths=5, grid=3, photons=photons, seed=3)
+        for photons in (200.0, 20_000.0)
+    )
+    assert choose(dim.measurement, dim.calibration, prior="tv").model == "convolution"
+    assert choose(bright.measurement, bright.calibration, prior="tv").model != "convolution"
+    assert choose(dim.measurement, dim.calibration, prior="l1").model != "convolution"
+
+
+@pytest.mark.parametrize(("stray", "taken"), [(0.0, False), (0.6, True)])
+def test_points_have_a_background_where_there_is_stray_light(stray, taken):
+    scene = make_scene("beads", size=40, depths=6, grid=3, background=stray, photons=1000.0, seed=5)
+    choice = choose(scene.measurement, scene.calibration, prior="l1")
+    assert choice.background is taken
+    share = decision(choice, "background").numbers["smooth_share"]
+    assert (share > 0.2) is taken
+
+
+def test_a_true_camera_has_the_lighter_prior():
+    scene = make_scene("beads", size=40, depths=6, grid=3, density=2.0, photons=4000.0, seed=5)
+    settings = {"prior": "l1", "estimate_background": False, "iterations": 60, "tolerance": 0.0}
+    one, true = (
+        recon.reconstruct_volume(scene.measurement, scene.calibration, model=model, **settings)
+        for model in ("convolution", "lowrank")
+    )
+    assert true.tau < 0.7 * one.tau
+    as_heavy = recon.reconstruct_volume(
+        scene.measurement, scene.calibration, model="lowrank", tau=one.tau, **settings
+    )
+    light, heavy = (score(r.volume, scene.truth).psnr_db for r in (true, as_heavy))
+    assert light > heavy + 0.3
+
+
+def test_psfs_are_registered_once(monkeypatch):
+    scene = make_scene("beads", size=40, depths=3, grid=3, seed=5)
+    asked = []
+    register = field_registration.register
+    monkeypatch.setattr(field_registration, "register", lambda *a, **k: asked.append(1) or register(*a, **k))
+    remembered.forget()
+    first = sort_by_depth(scene.calibration)
+    all_of_them = len(asked)
+    assert all_of_them > 0
+    again = sort_by_depth(scene.calibration)
+    assert len(asked) == all_of_them
+    for before, after in zip(first.fields, again.fields, strict=True):
+        np.testing.assert_array_equal(before.psfs, after.psfs)
+        np.testing.assert_array_equal(before.points, after.points)
+    psfs = scene.calibration.psfs.copy()
+    psfs[0, 0, 20, 20] += 1.0
+    changed = sort_by_depth(replace(scene.calibration, psfs=psfs))
+    assert all_of_them < len(asked) < 2 * all_of_them, "its depth alone is registered anew"
+    assert not np.array_equal(changed.fields[0].psfs, first.fields[0].psfs)
+    remembered.forget()
+    before = len(asked)
+    sort_by_depth(scene.calibration)
+    assert len(asked) == before + all_of_them
+
+
+def test_no_more_psfs_are_remembered_than_fit():
+    def field(size):
+        psf = np.zeros((1, size, size), np.float32)
+        return psf, FieldOfPsfs(psf[None], [(0, 0)]), []
+
+    known = remembered.Remembered(3 * 800)
+    for k in range(5):
+        known.put(bytes([k]), field(10))
+    assert [known.get(bytes([k])) is not None for k in range(5)] == [False, False, True, True, True]
+    known.put(b"large", field(40))
+    assert known.get(b"large") is None
+    assert known.get(bytes([4])) is not None
