@@ -177,29 +177,39 @@ def write(rows: list[dict], folder: Path) -> None:
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """Draw difference and time for every scene."""
+    """Draw difference and time of every scene, those of a kind in one line."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 0.27 * len(rows) + 1.4), sharey=True)
-    y = np.arange(len(rows))
+    kinds = list(dict.fromkeys(kind_of(r["scene"]) for r in rows))
+    y = np.array([kinds.index(kind_of(r["scene"])) for r in rows])
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 0.27 * len(kinds) + 1.4), sharey=True)
     gap = np.array([r["auto_db"] - r["best_db"] for r in rows])
     left.axvspan(-WITHIN_DB, 0, color="0.9", label=f"within {WITHIN_DB} dB")
-    left.barh(y, gap, color=np.where(gap >= -WITHIN_DB, "tab:blue", "tab:red"))
-    left.set_yticks(y, [r["scene"] for r in rows], fontsize=8)
-    left.invert_yaxis()
+    left.scatter(gap, y, s=24, c=np.where(gap >= -WITHIN_DB, "tab:blue", "tab:red"))
+    left.set_yticks(range(len(kinds)), kinds, fontsize=8)
+    left.set_ylim(len(kinds) - 0.4, -0.6)
     left.set_xlabel("auto minus best fixed model (dB)")
-    left.legend(fontsize=8)
+    left.legend(fontsize=8, loc="upper left")
     ratio = np.array([r["auto_s"] / r["largest_s"] for r in rows])
-    right.barh(y, ratio, color="tab:green")
+    right.scatter(ratio, y, s=24, color="tab:green")
+    right.set_xlim(0, None)
     right.axvline(0.5, color="k", lw=0.8)
     right.axvline(float(np.median(ratio)), color="k", lw=0.8, ls=":", label=f"median {np.median(ratio):.2f}")
     right.set_xlabel("time of auto over the largest model's")
-    right.legend(fontsize=8)
+    right.legend(fontsize=8, loc="upper right")
+    for panel in (left, right):
+        panel.grid(axis="y", color="0.92")
+        panel.set_axisbelow(True)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
+
+
+def kind_of(name: str) -> str:
+    """Return a scene's name without its number."""
+    return name.rstrip("0123456789 ")
 
 
 def main() -> None:
