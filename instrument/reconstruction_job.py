@@ -304,6 +304,12 @@ def job_with(
     )
 
 
+def require_distance(z_um: float) -> None:
+    """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
+    if not 0 < z_um < np.inf:
+        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
+
+
 def refocused(job: Job, z_um: float) -> Job:
     """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
 
@@ -316,8 +322,7 @@ def refocused(job: Job, z_um: float) -> Job:
     BenchError
         When ``z_um`` is no distance.
     """
-    if not 0 < z_um < np.inf:
-        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
+    require_distance(z_um)
     calibration = job.calibration
     z = calibration.source_positions_um[:, 2]
     if not bool((z > 0).all()):

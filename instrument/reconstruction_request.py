@@ -22,6 +22,7 @@ from instrument.reconstruction_job import (
     job_from_calibration,
     job_from_files,
     refocused,
+    require_distance,
 )
 from instrument.volume_job import volume_job
 from recon.auto import Choice, Wishes, choose, choose_picture
@@ -117,13 +118,14 @@ class Settings:
     precision: Precision | None = None
 
     def require(self, *, z_um: float | None = None) -> None:
-        """Check what can be checked before any file is read; InputError says what is wrong."""
+        """Check what can be checked before any file is read; InputError or BenchError says what is wrong."""
+        if z_um is not None:
+            require_distance(z_um)
         require_options(
             iterations=self.iterations,
             time_s=self.time_s,
             tolerance=self.tolerance,
             tau=self.tau,
-            z_um=z_um,
             noise=None if isinstance(self.noise, str) else self.noise,
         )
 

@@ -26,7 +26,7 @@ from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
 from recon.varying_picture import reconstruct_varying
 from recon.volume.channel import PRIORS
-from recon.volume.field_registration import one_psf
+from recon.volume.field_registration import NOT_ON_AXIS, one_psf
 from recon.volume.model import one_depth, sort_by_depth
 
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -131,6 +131,9 @@ def reconstruct_chosen(
         erasures=erasures,
         wishes=wishes,
     )
+    if _is_plain(choice):
+        # The others say so themselves; that some PSFs were hard to register is of no concern to one.
+        warnings += tuple(w for w in sort_by_depth(depth).warnings if w == NOT_ON_AXIS)
     small = reduce(choice, measurement, depth, noise=noise, background=background, erasures=erasures)
 
     def show(record: IterationRecord, now: Callable[[], npt.NDArray[np.float32]]) -> None:

@@ -173,7 +173,7 @@ def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
 
 
 def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
-    """Return the model to use and the reason in words."""
+    """Return the model to use and the reason in words, without comparing what the models cost."""
     if wanted not in MODELS:
         raise InputError(f"The model {wanted!r} is not known. Choose one of {', '.join(MODELS)}.")
     if wanted in ("local", "lowrank") and not depths.varies:

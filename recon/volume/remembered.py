@@ -21,9 +21,9 @@ from recon.volume.field_registration import registered_field
 Array = npt.NDArray[Any]
 Registered = tuple[Array, FieldOfPsfs, list[str]]
 
-REMEMBERED_BYTES = 64 * 2**20
-"""PSFs that are remembered: 25 of 800 x 800 pixels. Larger ones are registered anew: beside what is done with
-them that takes little."""
+REMEMBERED_BYTES = 128 * 2**20
+"""PSFs that are remembered: 50 of 800 x 800 pixels. Larger calibrations are registered anew: a part of
+one would push out the part that is asked for next."""
 
 
 def remembered_field(calibration: Calibration, group: npt.NDArray[np.intp]) -> Registered:
@@ -31,13 +31,16 @@ def remembered_field(calibration: Calibration, group: npt.NDArray[np.intp]) -> R
 
     The arrays are shared with whoever asked before, and cannot be written to.
     """
-    if len(group) < 2:
+    if len(group) < 2 or calibration.psfs.nbytes > REMEMBERED_BYTES:
         return registered_field(calibration, group)
     key = _content(calibration, group)
     known = _fields.get(key)
     if known is None:
-        known = registered_field(calibration, group)
-        known[1].psfs.flags.writeable = False
+        central, field, warnings = registered_field(calibration, group)
+        central = np.array(central)  # no view of the caller's PSFs: he may change them, and they may be many
+        for kept in (central, field.psfs, field.points):
+            kept.flags.writeable = False
+        known = central, field, warnings
         _fields.put(key, known)
     central, field, warnings = known
     return central, field, list(warnings)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import recon
-from recon.auto import choose, choose_picture
+from recon.auto import Wishes, choose, choose_picture
 from recon.operators.local_convolution import FieldOfPsfs
 from recon.scenes import make_scene, score
 from recon.volume import field_registration, remembered
 from recon.volume.channel import ChannelProblem
+from recon.volume.field_registration import NOT_ON_AXIS
 from recon.volume.model import sort_by_depth
 from recon.volume.reconstruct import prepare_volume
 
@@ -109,3 +110,38 @@ def test_no_more_psfs_are_remembered_than_fit():
     known.put(b"large", field(40))
     assert known.get(b"large") is None
     assert known.get(bytes([4])) is not None
+
+
+def test_what_is_remembered_is_nobody_elses():
+    scene = make_scene("beads", size=40, depths=3, grid=3, seed=5)
+    remembered.forget()
+    own = replace(scene.calibration, psfs=scene.calibration.psfs.copy())
+    first = sort_by_depth(own)
+    expected = first.central.copy()
+    for kept in (first.fields[0].psfs, first.fields[0].points):
+        with pytest.raises(ValueError, match="read-only"):
+            kept[...] = 7
+    own.psfs[...] = 7
+    np.testing.assert_array_equal(sort_by_depth(scene.calibration).central, expected)
+
+
+def test_calibrations_larger_than_the_room_are_not_remembered(monkeypatch):
+    scene = make_scene("beads", size=40, depths=3, grid=3, seed=5)
+    remembered.forget()
+    monkeypatch.setattr(remembered, "REMEMBERED_BYTES", scene.calibration.psfs.nbytes - 1)
+    sort_by_depth(scene.calibration)
+    assert not remembered._fields._known
+
+
+def test_one_psf_put_together_on_the_axis_is_told():
+    scene = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=2)
+    settings = {"z_um": float(scene.z_um[0]), "iterations": 3}
+    result = recon.reconstruct(
+        scene.measurement, scene.calibration, wishes=Wishes(model="convolution"), **settings
+    )
+    assert NOT_ON_AXIS in result.warnings
+    odd = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=3)
+    result = recon.reconstruct(
+        odd.measurement, odd.calibration, wishes=Wishes(model="convolution"), **settings
+    )
+    assert NOT_ON_AXIS not in result.warnings
