@@ -168,8 +168,9 @@ class OwnCalibrationsProblem:
             run_setting(small, Setting("volume", setting.model, prior, background=True), counts=(1,))
 
     def fingerprint(self) -> str:
-        """Digest photographs and calibrations."""
-        digest = hashlib.sha256(f"own calibrations {SCORES}".encode())
+        """Digest photographs, calibrations and the names that results are kept by."""
+        names = [s.name for s in self.settings()]
+        digest = hashlib.sha256(f"own calibrations {SCORES} {names}".encode())
         for c in self.calibrations:
             digest.update(f"{c.label} {c.photographs} {c.whole} {c.problem.fingerprint()}".encode())
         return digest.hexdigest()[:16]
@@ -187,7 +188,7 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
         for chooser in choosers[:1] if own.whole else choosers:
             members = tuple(sorted(int(m) for group in chosen for m in chooser(positions, group)))
             if members not in parts:
-                parts[members] = _words(len(members), len(chosen), len(depths))
+                parts[members] = _words(len(members), _which(chosen, depths, positions))
     return [
         OwnSetting(
             own.label,
@@ -200,9 +201,23 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
     ]
 
 
-def _words(psfs: int, depths: int, of: int) -> str:
-    counted = f"{psfs} PSF" + ("s" if psfs > 1 else "")
-    return counted + (f" at {depths} of {of} depths" if of > 1 else "")
+def _words(psfs: int, where: str) -> str:
+    return f"{psfs} PSF" + ("s" if psfs > 1 else "") + where
+
+
+def _which(
+    chosen: list[npt.NDArray[np.intp]],
+    depths: list[npt.NDArray[np.intp]],
+    positions: npt.NDArray[np.float64],
+) -> str:
+    """Say at which of several depths; of a single one its number too: z may be unknown, or the steps fine."""
+    if len(depths) == 1:
+        return ""
+    if len(chosen) > 1:
+        return f" at {len(chosen)} of {len(depths)} depths"
+    number = next(n for n, group in enumerate(depths, 1) if group is chosen[0])
+    z_mm = float(positions[chosen[0], 2].mean()) / 1e3
+    return f" at depth {number} of {len(depths)}" + (f" (z {z_mm:.4g} mm)" if np.isfinite(z_mm) else "")
 
 
 def _all(_positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
