@@ -249,7 +249,9 @@ def reconstruct(
     failed: list[str] = []
     if judged:
         try:
-            verdict = _verdict(measurement, problem, picture, outcome, rules, method, name)
+            verdict = _verdict(
+                measurement, problem, picture, outcome, rules, method, name, started=initial is not None
+            )
         except Exception as error:  # noqa: BLE001 - the picture is worth more than what is said of it
             failed = [not_judged(error)]
     return Reconstruction(
@@ -282,6 +284,8 @@ def _verdict(
     rules: StoppingRules,
     method: str,
     prior: str,
+    *,
+    started: bool,
 ) -> Verdict:
     if outcome.history:
         residual = outcome.history[-1].data_residual
@@ -297,7 +301,7 @@ def _verdict(
         picture[None],
         problem.psfs[None],
         [residual],
-        unsettled_by(outcome.history, outcome.stop_reason, rules.tolerance),
+        unsettled_by(outcome.history, outcome.stop_reason, rules.tolerance, started=started),
     )
     return verdict_on(evidence, method_name(method, prior))
 

@@ -39,6 +39,12 @@ class IterationRecord:
     change: float = np.nan
     """``||x - x_previous|| / ||x||``; every solver knows it, and one that is not finite ends the run."""
 
+    @property
+    def unrest(self) -> float:
+        """What is compared with the tolerance: the change, or the residuals over ``RESIDUAL_FACTOR``."""
+        residual = float(np.nanmax([self.primal_residual, self.dual_residual, 0.0]))
+        return max(self.change, residual / RESIDUAL_FACTOR)
+
 
 RESIDUAL_FACTOR = 10.0
 """Primal and dual residuals may be so much larger than the tolerance: pictures were seen to settle to 0.1 dB
@@ -95,9 +101,7 @@ class StopCheck:
             return StopReason.NOT_FINITE
         if rules.noise_norm is not None and record.data_residual <= rules.noise_norm:
             return StopReason.NOISE_LEVEL
-        residual = np.nanmax([record.primal_residual, record.dual_residual, 0.0])
-        calm = max(record.change, residual / RESIDUAL_FACTOR) < rules.tolerance
-        self._calm = self._calm + 1 if calm else 0
+        self._calm = self._calm + 1 if record.unrest < rules.tolerance else 0
         if rules.tolerance > 0 and self._calm >= rules.patience:
             return StopReason.CONVERGED
         if rules.time_s is not None and record.seconds >= rules.time_s:

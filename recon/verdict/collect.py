@@ -79,12 +79,16 @@ def not_judged(error: Exception) -> str:
     return f"No verdict: judging the result failed ({why}). The result itself is whole."
 
 
-def unsettled_by(history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float) -> float:
+def unsettled_by(
+    history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float, *, started: bool
+) -> float:
     """Return the last change over ten times the tolerance, where a limit ended the run; else 0.
 
     A run that was ended before it could be seen to settle (:class:`~recon.solvers.stopping.StoppingRules`
     ask for several calm iterations in a row) counts as if everything had changed: many solvers do not move
-    at all in their first iteration.
+    at all in their first iteration. One that was ``started`` from a result had not to begin anew: there the
+    residuals count as they do for those rules, as the change alone would call any start settled. Where they
+    are nil as well, the start was empty, and nothing is known.
     """
     if reason is StopReason.NOT_FINITE:
         return DIVERGED
@@ -92,5 +96,6 @@ def unsettled_by(history: tuple[IterationRecord, ...], reason: StopReason | None
         return 0.0
     change = history[-1].change
     if len(history) < StoppingRules().patience:
-        change = max(change, 1.0)
+        unrest = history[-1].unrest
+        change = unrest if started and unrest > 0 else max(change, 1.0)
     return min(float(change / (10 * tolerance)), DIVERGED) if np.isfinite(change) else DIVERGED

@@ -287,7 +287,9 @@ def reconstruct_volume(
     failed: list[str] = []
     if judged:
         try:
-            verdict = _verdict(measurement, as_measured, volume, outcomes, tolerance, prior)
+            verdict = _verdict(
+                measurement, as_measured, volume, outcomes, tolerance, prior, started=initial is not None
+            )
         except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
             failed = [not_judged(error)]
     return VolumeReconstruction(
@@ -328,6 +330,8 @@ def _verdict(
     outcomes: list[Outcome],
     tolerance: float,
     prior: str,
+    *,
+    started: bool,
 ) -> Verdict:
     evidence = evidence_of(
         measurement,
@@ -337,7 +341,7 @@ def _verdict(
         volume,
         scaled.depths.central,
         [o.history[-1].data_residual for o in outcomes],
-        max(unsettled_by(o.history, o.stop_reason, tolerance) for o in outcomes),
+        max(unsettled_by(o.history, o.stop_reason, tolerance, started=started) for o in outcomes),
         points=True,
     )
     return verdict_on(evidence, method_name("volume", prior))

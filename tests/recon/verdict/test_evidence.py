@@ -76,10 +76,10 @@ def test_a_regular_array_is_ambiguous_and_random_lenslets_are_not() -> None:
 
 def test_only_a_limit_leaves_a_run_unsettled() -> None:
     history = tuple(IterationRecord(k, 1.0, change=0.05) for k in (7, 8, 9))
-    assert unsettled_by(history, StopReason.ITERATIONS, 1e-3) == pytest.approx(5)
-    assert unsettled_by(history, StopReason.CONVERGED, 1e-3) == 0
-    assert unsettled_by((), None, 1e-3) == 0
-    assert unsettled_by(history, StopReason.NOT_FINITE, 1e-3) == DIVERGED
+    assert unsettled_by(history, StopReason.ITERATIONS, 1e-3, started=False) == pytest.approx(5)
+    assert unsettled_by(history, StopReason.CONVERGED, 1e-3, started=False) == 0
+    assert unsettled_by((), None, 1e-3, started=False) == 0
+    assert unsettled_by(history, StopReason.NOT_FINITE, 1e-3, started=False) == DIVERGED
 
 
 @pytest.mark.parametrize("iterations", [1, 2])
@@ -91,6 +91,47 @@ def test_a_run_of_one_iteration_is_named_unfinished(iterations: int) -> None:
     assert result.verdict.region is Region.OUTSIDE
     assert result.verdict.findings[0].stress == "unsettled"
     assert "More iterations" in result.verdict.sentences[1]
+
+
+@pytest.mark.parametrize("method", ["admm", "fista"])
+def test_a_start_from_a_settled_result_is_not_called_unfinished(method: str) -> None:
+    scene = make_scene(SceneSpec("sparse-picture", size=40))
+    settled = reconstruct(scene.measurement, scene.calibration, method=method, iterations=300)
+    warm = reconstruct(scene.measurement, scene.calibration, method=method, iterations=2, initial=settled)
+    assert settled.verdict is not None
+    assert warm.verdict is not None
+    assert settled.verdict.region is Region.INSIDE
+    # ADMM's splits have to meet again, which moves the picture; FISTA stays where it was.
+    assert warm.verdict.region is (Region.NEAR if method == "admm" else Region.INSIDE)
+
+
+def test_a_start_from_what_had_not_settled_does_not_pass_for_settled() -> None:
+    """ADMM's first iteration does not move, whatever it starts from."""
+    scene = make_scene(SceneSpec("sparse-picture", size=40))
+    early = reconstruct(scene.measurement, scene.calibration, iterations=2)
+    warm = reconstruct(scene.measurement, scene.calibration, iterations=1, initial=early)
+    assert warm.history[0].change < 1e-3
+    assert warm.verdict is not None
+    assert warm.verdict.evidence["unsettled"] > 1
+    still = (IterationRecord(1, 1.0, primal_residual=0.0, change=0.0),)
+    assert unsettled_by(still, StopReason.ITERATIONS, 1e-3, started=True) == pytest.approx(100)
+
+
+def test_a_volume_that_was_started_is_judged_by_what_it_still_changed() -> None:
+    scene = make_scene(SceneSpec("beads", size=32, depths=3))
+    settled = reconstruct_volume(scene.measurement, scene.calibration, model="convolution", prior="l1")
+    warm = reconstruct_volume(
+        scene.measurement,
+        scene.calibration,
+        model="convolution",
+        prior="l1",
+        iterations=2,
+        initial=settled,
+    )
+    assert warm.verdict is not None
+    last = warm.histories[0][-1].change
+    assert last < 0.5
+    assert warm.verdict.evidence["unsettled"] == pytest.approx(last / 10 / 1e-3)
 
 
 def test_every_reconstruction_carries_its_evidence() -> None:
