@@ -7,6 +7,7 @@ Which stress limits is asked the same way: were this one number as good as a goo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,11 @@ UNSETTLED = 0.2
 CLIPPED = 0.02
 """Share of the used pixels at full scale from which that is named first."""
 OF_LIGHT = ("detail", "signal", "height")
-"""Stresses that more light relieves."""
+"""Stresses that more light relieves, and hardly anything else."""
+WITHOUT_LIGHT: Mapping[str, str] = {
+    "peaks": "A stronger prior (--tau) would help; a scene of so many points is too dense",
+}
+"""What else helps where more light would relieve as well, by stress."""
 FEWEST = 40
 """Cases that a group needs to be judged by."""
 
@@ -226,7 +231,8 @@ def _clipped_first(findings: tuple[Finding, ...], numbers: Mapping[str, float]) 
     value = numbers["saturated"]
     gain = next((f.gain for f in findings if f.stress == "saturated"), 0.0)
     first = Finding("saturated", value, gain, words.format(value=value), help_)
-    return (first, *(f for f in findings if f.stress not in ("saturated", *OF_LIGHT)))
+    others = (f for f in findings if f.stress not in ("saturated", *OF_LIGHT))
+    return (first, *(replace(f, help=WITHOUT_LIGHT.get(f.stress, f.help)) for f in others))
 
 
 def _unfinished_first(

@@ -73,6 +73,25 @@ def test_who_overexposed_is_not_told_to_give_more_light() -> None:
     assert "More light" in " ".join(judge.verdict_on(evidence(1, 0.03, saturated=1e-3), "admm tv").sentences)
 
 
+def test_who_overexposed_a_volume_is_not_told_to_give_more_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = []
+    for k in range(60):
+        numbers = evidence(20 + 0.1 * k, peaks=40.0 if k % 2 else 3.0, height=20.0, ends=0.4)
+        severity = 2.0 if k % 2 else 0.5
+        entries.append(
+            {"scene": k, "method": "volume tv", "severity": severity, "evidence": numbers.as_json()}
+        )
+    monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries))
+    cases.cases_of.cache_clear()
+    grainy = {"peaks": 40.0, "height": 20.0, "ends": 0.4}
+    clipped = judge.verdict_on(evidence(22, saturated=0.05, **grainy), "volume tv")
+    assert [f.stress for f in clipped.findings] == ["saturated", "peaks"]
+    assert "A stronger prior (--tau) would help" in clipped.sentences[2]
+    assert "light" not in " ".join(clipped.sentences).lower()
+    dim = judge.verdict_on(evidence(22, **grainy), "volume tv")
+    assert "More light or a stronger prior (--tau) would help" in dim.sentences[1]
+
+
 def test_what_no_map_saw_is_not_called_reliable() -> None:
     assert judge.verdict_on(evidence(30, 0.03), "admm nonnegative").region is Region.UNKNOWN
     strange = judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv")
