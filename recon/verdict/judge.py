@@ -135,9 +135,13 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
     count, far = (NEIGHBOURS_OF_VOLUMES, FAR_OF_VOLUMES) if of_volumes else (NEIGHBOURS, FAR)
     share, nearest = failing_share(cases, place, count)
     reliable = share <= reliable_share(method)
-    if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all() or share >= LOST:
+    if numbers["unsettled"] >= UNFINISHED or not np.isfinite(place).all():
         region = Region.OUTSIDE
-    elif nearest > far or numbers["signal"] >= NOISELESS:
+    elif numbers["signal"] >= NOISELESS:  # before similar cases are asked: numbers in its noise mean nothing
+        region = Region.UNKNOWN
+    elif share >= LOST:
+        region = Region.OUTSIDE
+    elif nearest > far:
         region = Region.UNKNOWN
     else:
         settled = numbers["unsettled"] < UNSETTLED

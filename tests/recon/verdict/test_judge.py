@@ -111,6 +111,14 @@ def test_data_without_noise_are_no_photograph() -> None:
     assert len(exact.sentences) == 1
     assert "next to no noise" in exact.sentences[0]
     assert "%" not in exact.sentences[0]
+    # Nor are they called unreliable for what is left unexplained beyond such a noise.
+    misfit = judge.verdict_on(evidence(9e4, 0.8), "admm tv")
+    assert misfit.failing is not None
+    assert misfit.failing > 0.5
+    assert misfit.region is Region.UNKNOWN
+    assert misfit.sentences == exact.sentences
+    # Too few iterations are seen without the noise.
+    assert judge.verdict_on(evidence(9e4, 0.8, unsettled=20), "admm tv").region is Region.OUTSIDE
     # What is unlike all cases is not given those cases' share of failures.
     assert "%" not in judge.verdict_on(evidence(30, 0.03, load=40.0), "admm tv").sentences[0]
 
