@@ -12,6 +12,7 @@ from drivers.frame import FrameMetadata
 from instrument.calibration_file import is_calibration
 from instrument.errors import FileError
 from instrument.store import Run
+from recon.noise import estimate_deviation
 
 _BLOCK = 8
 """Pixels along a side over which light is averaged to tell it from noise."""
@@ -65,14 +66,15 @@ def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
     """Tell whether there is more in a frame than noise.
 
     Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
-    variance of the means of 8 x 8 pixels is compared with what noise leaves of it.
+    variance of the means of 8 x 8 pixels is compared with what noise leaves of it. Noise grows with light: a
+    frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
 
     Parameters
     ----------
     frame : ndarray, (height, width) or (height, width, n_channels)
         Counts less dark.
     deviation : ndarray, (n_channels,)
-        Of the noise, counts.
+        Of the noise, counts; that of another frame of the same camera is enough.
     """
     channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
     height, width = (n // _BLOCK for n in channels.shape[1:])
@@ -80,6 +82,9 @@ def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
         return True  # too few blocks to tell
     cut = channels[:, : height * _BLOCK, : width * _BLOCK].astype(np.float64)
     means = cut.reshape(len(cut), height, _BLOCK, width, _BLOCK).mean(axis=(2, 4))
-    noise = np.maximum(np.asarray(deviation, np.float64).reshape(-1), np.finfo(np.float64).tiny)
-    ratio = means.var(axis=(1, 2)) * _BLOCK**2 / noise**2
-    return bool((ratio > LIT).any())
+    spread = means.var(axis=(1, 2)) * _BLOCK**2
+    given = np.asarray(deviation, np.float64).reshape(-1)
+    if (spread > LIT * given**2).any():
+        return True
+    own = np.array([estimate_deviation(channel) for channel in channels])
+    return bool(((own > 0) & (spread > LIT * own**2)).any())  # 0 is no estimate: most pixels are alike

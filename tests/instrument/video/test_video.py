@@ -392,6 +392,24 @@ def test_light_is_told_from_noise_however_faint(photons: float) -> None:
     assert not has_light(rng.normal(0, deviation[0], SHAPE), deviation)
 
 
+def test_a_dim_frame_after_a_bright_one_has_light() -> None:
+    rng = np.random.default_rng(2)
+    light = cast([(0, 0, 1.0), (5, -8, 0.7)])
+    light /= light.max()
+
+    def photographed(photons: float) -> np.ndarray:
+        return rng.poisson(photons * light) + rng.normal(0, 2, SHAPE)
+
+    # The noise of a first frame with 500 times the light.
+    deviation = np.array([np.sqrt(10_000 * light.mean() + 4)])
+    assert has_light(photographed(20), deviation)
+    assert not has_light(photographed(0), deviation)
+    two = np.stack([photographed(0), photographed(20)], axis=2)
+    assert has_light(two, deviation.repeat(2))
+    told = [has_light(np.round(photographed(0)), deviation) for _ in range(50)]
+    assert sum(told) <= 2
+
+
 @pytest.mark.parametrize("over_time", ["tv", "lowrank"])
 def test_with_a_prior_over_time(recording: Path, video: Path, tmp_path: Path, over_time: str) -> None:
     solved(request(recording, tmp_path, over_time=over_time, film=False))
