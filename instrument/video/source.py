@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,14 +20,19 @@ _BLOCK = 8
 LIT = 2.0
 """Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
 
+STILL = {"um": 0.5, "mrad": 0.02}
+"""How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
+
+A mask 25 mm wide that turns by 0.02 mrad moves by 0.25 um at its edges: less than any pixel.
+"""
+
 _SAME: dict[str, Callable[[FrameMetadata], object]] = {
-    "stage position": lambda m: tuple(sorted((axis, round(at, 1)) for axis, at in m.stage_position.items())),
     "light": lambda m: m.led_pattern,
     "pattern on the SLM": lambda m: m.slm_image_hash,
     "exposure": lambda m: m.exposure_ms,
     "gain": lambda m: m.gain,
 }
-"""What all frames of a planned run must share to be a video of one scene."""
+"""What all frames of a planned run must share to be a video of one scene, besides the stage's position."""
 
 
 def require_video(run: Run) -> None:
@@ -52,7 +57,8 @@ def require_video(run: Run) -> None:
     if not planned:
         return
     frames = [record.metadata for record in run.records.values()]
-    differing = [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
+    differing = [] if _stands([frame.stage_position for frame in frames]) else ["stage position"]
+    differing += [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
     if differing:
         raise FileError(
             run.path,
@@ -60,6 +66,19 @@ def require_video(run: Run) -> None:
             "Record a video with 'diffuserbench record'. Single frames: 'diffuserbench export' writes them, "
             "'reconstruct --image' takes each.",
         )
+
+
+def _stands(positions: Sequence[Mapping[str, float]]) -> bool:
+    """Tell whether all positions have the same axes, each at one place as far as readings tell."""
+    axes = set(positions[0])
+    if any(set(position) != axes for position in positions):
+        return False
+    for axis in axes:
+        readings = [position[axis] for position in positions]
+        # An axis of another unit has no tolerance.
+        if not np.ptp(readings) <= STILL.get(axis.rsplit("_", 1)[-1], 0.0):
+            return False
+    return True
 
 
 def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:

@@ -31,11 +31,12 @@ def write_recording(
     led: str | Mapping[int, str] = "off",
     plan: Plan | None = None,
     saturated: float = 0.0,
+    stage: Mapping[int, Mapping[str, float]] | None = None,
 ) -> Path:
     """Write frames, uint16, by their number; numbers left out are gaps. Returns the run's folder.
 
     With a plan they are the frames of its steps, and those left out are missing. ``led`` is the light of all,
-    or of each.
+    or of each; ``stage`` the position of each.
     """
     with RunWriter.create(parent, label="recording", bench=BENCH, plan=plan) as writer:
         expected = 0
@@ -58,6 +59,7 @@ def write_recording(
                 binning=1,
                 led_pattern=led if isinstance(led, str) else led[index],
                 saturated_fraction=saturated,
+                stage_position={} if stage is None else stage[index],
             )
             writer.write([FrameToStore(index, image.astype(np.uint16), metadata)])
         return writer.finish(FinishReason.COMPLETED).path

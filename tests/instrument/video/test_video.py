@@ -22,6 +22,7 @@ from instrument.cli import main
 from instrument.errors import BenchError, FileError
 from instrument.plan import Part, Plan
 from instrument.reconstruction_request import Settings
+from instrument.store import Run
 from instrument.video import block as block_module
 from instrument.video.block import BlockReport
 from instrument.video.crew import cluster, on_cluster
@@ -34,7 +35,7 @@ from instrument.video.reconstruction import (
     prepare_video,
     solve_video,
 )
-from instrument.video.source import has_light
+from instrument.video.source import has_light, require_video
 from recon import reconstruct
 from recon.metrics import psnr
 from tests.mocks.recordings import write_recording
@@ -359,6 +360,31 @@ def test_the_run_of_a_plan_is_no_video_unless_its_frames_are_alike(recording: Pa
     (alike / "calibration" / "calibration.json").write_text("{}")
     with pytest.raises(FileError, match=r"holds a calibration.*were the two swapped"):
         prepare_video(request(recording, tmp_path / "other", run=alike, out=tmp_path / "w.ome.zarr"))
+
+
+@pytest.mark.parametrize(
+    ("positions", "stands"),
+    [
+        ([{"x_um": 5.049}, {"x_um": 5.051}, {"x_um": 5.3}], True),
+        ([{"x_um": 5.0}, {"x_um": 5.4}, {"x_um": 5.8}], False),  # each near the next: it drifts
+        ([{"x_um": -0.04, "roll_mrad": 0.049}, {"x_um": 0.04, "roll_mrad": 0.051}], True),
+        ([{"x_um": 0.0, "roll_mrad": 0.01}, {"x_um": 0.0, "roll_mrad": 0.04}], False),
+        ([{"x_um": 0.0}, {"x_um": 0.0, "z_um": 0.0}], False),
+        ([{"x_um": float("nan")}, {"x_um": 0.0}], False),
+        ([{"x_um": 0.0}, {"x_um": float("nan")}], False),
+    ],
+)
+def test_a_stage_stands_as_far_as_its_readings_tell(
+    tmp_path: Path, positions: list[dict[str, float]], stands: bool
+) -> None:
+    plan = Plan(label="lapse", parts=(Part(label="a", repeats=len(positions), interval_s=1.0),))
+    frames = {t: np.ones(SHAPE, np.uint16) for t in range(len(positions))}
+    run = Run(write_recording(tmp_path, frames, plan=plan, stage=dict(enumerate(positions))))
+    if stands:
+        require_video(run)
+        return
+    with pytest.raises(FileError, match="its frames differ in stage position"):
+        require_video(run)
 
 
 def test_frames_without_light_are_told(
