@@ -15,6 +15,7 @@ from instrument.cli import chart as module
 from instrument.reconstruction_job import Job
 from recon import Calibration, NoiseModel
 from recon.chart import reconstruction as recon_chart
+from recon.chart.scored import Point
 
 
 @pytest.fixture
@@ -352,6 +353,21 @@ def own(tmp_path):
     return tmp_path
 
 
+GROUPS = ("as an extended scene (tv)", "as a sparse scene (l1)")
+
+
+@pytest.mark.parametrize(
+    ("names", "said"), [("ab", "even with it, as far as"), ("a", "no other setting is even")]
+)
+def test_whether_a_setting_is_even_with_the_best_is_said(capsys, names, said):
+    even = [Point(n, 40, 1.0, held_out=1.0, held_out_parts=(1.0,) * 4, images=3.0) for n in names]
+    module._tell_even(GROUPS[0], even, on_the_way=False)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"Held out    best {GROUPS[0]}: a")
+    assert second.strip().startswith(said)
+    assert ("scatter: 1; the one with the fewest photographs: a" in second) == (len(names) > 1)
+
+
 def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
     import instrument.chart.job as job
     import recon.chart.own_calibrations as module
@@ -362,8 +378,18 @@ def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
     out = tmp_path / "chart"
     result = run("--calibrations", *folders, "--image", own / "photo.tif", "--out", out)
     assert result.exit_code == 0, result.output
-    assert "even with it" in result.output
     record = json.loads((out / "chart.json").read_text())
+    _, *told = result.output.split("Held out    best ")  # one for each group
+    assert len(told) == 2
+    for words in told:
+        group = next(g for g in GROUPS if words.startswith(g))
+        even = {p["setting"] for p in record["even_with_best"] if p["group"] == group}
+        line = words.splitlines()[1].strip()
+        if len(even) > 1:
+            assert line.startswith("even with it, as far as")
+            assert f"scatter: {len(even) - 1}; the one with the fewest photographs" in line
+        else:
+            assert line == "no other setting is even with it"
     assert record["kind"] == "calibration"
     names = {(p["setting"], p["images"]) for p in record["points"]}
     assert names == {("one, 1 PSF", 1), ("fine, 1 PSF", 1), ("fine, 9 PSFs", 9), ("fine, 25 PSFs", 25)}
