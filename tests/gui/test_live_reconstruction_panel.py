@@ -103,18 +103,30 @@ def test_refining_holds_its_picture_until_the_preview_is_wanted_again(
 def test_refining_tells_how_long_it_takes_at_most(
     qtbot: QtBot, panel: LiveReconstructionPanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_reconstruction, "_PROGRESS_S", 0.0)
+    monkeypatch.setattr(live_reconstruction, "_PROGRESS_S", -1.0)  # however coarse the clock
     qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
     told: list[str] = []
+    heard = threading.Event()
+    real = live_reconstruction.full_picture
+
+    def not_over_before_it_is_heard(*args: Any, callback: Any, **options: Any) -> Any:
+        def watch(*record: Any) -> None:
+            callback(*record)
+            heard.wait(WAIT_MS / 1000)
+
+        return real(*args, callback=watch, **options)
 
     def listen(so_far: Any) -> None:
         panel._refined_so_far(so_far)
         told.append(panel.status.text())
+        heard.set()
 
+    monkeypatch.setattr(live_reconstruction, "full_picture", not_over_before_it_is_heard)
     qtbot.mouseClick(panel.refine_button, Qt.MouseButton.LeftButton)
     assert panel._refining is not None
     panel._refining.progressed.connect(listen)
     qtbot.waitUntil(lambda: bool(told) or panel._refining is None, timeout=WAIT_MS)
+    assert told, panel.status.text()
     assert re.fullmatch(r"Refining: iteration \d+ of at most 200, at most [\d.]+ (s|min|h) left", told[0])
     if panel._refining is not None:
         panel.refine()
