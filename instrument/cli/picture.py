@@ -58,7 +58,10 @@ def tell_choice(choice: Choice) -> None:
     """Print what was chosen and why, and what one step up and down would cost."""
     for line in choice.lines():
         typer.echo(line)
-    typer.echo(f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it")
+    typer.echo(
+        f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it, --tolerance and "
+        "--iterations the end. Times and errors of a step are rough estimates"
+    )
 
 
 def _solve(job: Job, request: PictureRequest, keeper: CheckpointFolder | None) -> Reconstruction:

@@ -30,6 +30,11 @@ def binning_of(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
         f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, and "
         f"{SAMPLES:g} (binned) pixels over that width are enough"
     )
+    if sharpest < SAMPLES:
+        why = (
+            f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, less than "
+            f"the {SAMPLES:g} that would be enough: there is nothing to bin"
+        )
     if not whole and not asked and fitting > 1:
         why = f"erased pixels are not averaged with others; else {why}"
     up = None if binning == 1 else Option(str(binning - 1), (binning / (binning - 1)) ** 2, 0.0)

@@ -42,9 +42,13 @@ def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple
         kept = np.isin(np.arange(n), planes)
     lost = _share(passed.light, ~kept)
     channel = " of any colour" if len(passed.light) > 1 else ""
+    rest = n - int(kept.sum())
     why = (
-        f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light{channel} into "
-        f"{n - int(kept.sum())} ({LEFT_OUT:.0%} may be left out, and neighbours of those that are not stay)"
+        f"of {n} calibrated depths a coarse pass puts {lost:.1%} of the light{channel} into the {rest} left "
+        f"out ({LEFT_OUT:.0%} may be left out, and neighbours of those that are not stay)"
+        if rest
+        else f"a coarse pass finds more than {LEFT_OUT:.0%} of the light{channel} in whatever could be left "
+        "out, or in its neighbours"
     )
     loss = left_out_db(lost)
     numbers = {"planes": float(len(planes)), "of": float(n), "light_left_out": lost}

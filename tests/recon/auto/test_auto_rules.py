@@ -145,3 +145,16 @@ def test_one_psf_put_together_on_the_axis_is_told():
         odd.measurement, odd.calibration, wishes=Wishes(model="convolution"), **settings
     )
     assert NOT_ON_AXIS not in result.warnings
+
+
+def test_a_picture_is_judged_as_pictures_are_whatever_solves_it():
+    scene = make_scene("sparse-picture", size=48, grid=3, seed=7)
+    settings = {"z_um": float(scene.z_um[0]), "iterations": 10}
+    for model in ("lowrank", "convolution"):
+        result = recon.reconstruct(scene.measurement, scene.calibration, model=model, **settings)
+        assert result.verdict is not None
+        assert result.verdict.method == "admm tv"
+    volume = make_scene("beads", size=40, depths=3, grid=3, seed=7)
+    result = recon.reconstruct_volume(volume.measurement, volume.calibration, iterations=5)
+    assert result.verdict is not None
+    assert result.verdict.method == "volume tv"
