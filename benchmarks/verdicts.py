@@ -223,6 +223,17 @@ def said(entries: list[dict]) -> list[str]:
     return [words, "", *lines]
 
 
+def ranges(numbers: set[int]) -> list[tuple[int, int]]:
+    """Return numbers that follow one another as the first and how many."""
+    found: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if found and number == sum(found[-1]):
+            found[-1] = (found[-1][0], found[-1][1] + 1)
+        else:
+            found.append((number, 1))
+    return found
+
+
 def main() -> None:
     """Run, judge, tabulate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -245,8 +256,12 @@ def main() -> None:
     report = [
         "# How often verdicts are wrong",
         "",
-        f"    python benchmarks/verdicts.py --first {UNSEEN_FROM} --count {len(numbers)} "
-        "--out docs/benchmarks/verdicts.md",
+        *(
+            f"    python benchmarks/verdicts.py --first {first} --count {count} --keep verdicts.jsonl"
+            + ("" if first in chosen else " --fixed-only")
+            for first, count in ranges(numbers)
+        ),
+        "    python benchmarks/verdicts.py --count 0 --keep verdicts.jsonl --out docs/benchmarks/verdicts.md",
         "",
         f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}. Simulated scenes of five families that are in",
         "no stability map: other seeds, random and regular lenslets and smooth diffusers, several stresses",
