@@ -57,7 +57,7 @@ def chart_figure(data: ChartData) -> Figure:
             front = _draw(axes, own, cost, score, colours)
             heading = f"{group}: {score.words.split(' (')[0]}" if group else ""
             axes.set_title(heading, fontsize=9, loc="left")
-            blocks.append(_named(front, f"Front, {'left' if place == 0 else 'middle'}"))
+            blocks.append(_named(front, f"Front, {'left' if place == 0 else 'right'}"))
         text.text(0.0, 1.0, "\n\n".join(blocks), fontsize=8.5, va="top", transform=text.transAxes)
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=5, frameon=False)

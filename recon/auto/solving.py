@@ -15,7 +15,7 @@ STRAY_SHARE = 0.2
 in a picture: sparse ones without any had up to 0.15 there, dense ones, which l1 does not explain, 0.75."""
 POINTS_SHARE = 0.11
 """The same from which on points have a background estimated. Where there was stray light of 0.3 to 1.2 times
-the scene's one gained 1.6 to 12 dB, with few points and with many; without any it changed -3 to 0.4 dB."""
+the scene's one gained 1.6 to 12 dB, with few points and with many; without any it changed -3 to 0.9 dB."""
 OBJECTIVE_FALL = 0.15
 """By how much of itself misfit and prior together must fall in a picture with total variation.
 
