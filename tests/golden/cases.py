@@ -64,6 +64,7 @@ dense = partial(inputs.photograph, dense=True)
 axial, beads = cache(inputs.axial), cache(inputs.beads)
 one_depth = partial(axial, 1)
 field, field_3d = cache(inputs.over_field), partial(cache(inputs.over_field), 2, (32, 40))
+lit = cache(inputs.patterns)
 flat_beads = partial(beads, 1, stretch=0.8)
 deep_beads = partial(beads, 2, shape=(32, 40), stretch=0.8)
 NOISE = adapter.noise_model(inputs.READ_NOISE, 1.0)
@@ -150,8 +151,8 @@ _add(
 _add(
     "picture-patterned",
     adapter.patterned,
-    lambda: inputs.patterns()[0],
-    lambda: inputs.patterns()[1],
+    lambda: lit()[0],
+    lambda: lit()[1],
     psf,
     noise=NOISE,
     iterations=25,
@@ -159,8 +160,8 @@ _add(
 _add(
     "picture-patterned-l1",
     adapter.patterned,
-    lambda: inputs.patterns()[0],
-    lambda: inputs.patterns()[1],
+    lambda: lit()[0],
+    lambda: lit()[1],
     psf,
     noise=NOISE,
     iterations=25,
@@ -277,7 +278,7 @@ _add(
     beads,
     axial,
     stop_at_noise=True,
-    **SPARSE | {"noise": 20.0, "iterations": 60},
+    **SPARSE | {"noise": 45.0, "iterations": 60},
 )
 _add(
     "volume-started",
@@ -312,7 +313,7 @@ _add("volume-auto-tv", adapter.volume, hazy, axial, prior="tv", **CHOSEN)
 _add("volume-auto-varying", adapter.volume, deep_beads, field_3d, prior="l1", **CHOSEN | {"iterations": 12})
 
 # Streams -------------------------------------------------------------------------------------------------
-film = partial(inputs.frames, 6)
+film = partial(cache(inputs.frames), 6)
 flat_psf = inputs.psf
 _add("video", adapter.video, film, flat_psf, cold=10, warm=3, noise=NOISE)
 _add(
@@ -328,9 +329,23 @@ _add(
 )
 _add("video-joint-tv", adapter.joint, film, flat_psf, "tv", iterations=20)
 _add("video-joint-lowrank", adapter.joint, film, flat_psf, "lowrank", weight=2.0, iterations=20)
-_add("live", adapter.live, partial(inputs.frames, 3, step=4.0), flat_psf, refinements=3, noise=NOISE)
-_add("live-moving", adapter.live, partial(inputs.frames, 5, step=0.7), flat_psf, refinements=1, noise=NOISE)
-_add("live-still", adapter.live, partial(inputs.frames, 4, step=0.0), flat_psf, refinements=2, background=1.0)
+_add("live", adapter.live, partial(cache(inputs.frames), 3, step=4.0), flat_psf, refinements=3, noise=NOISE)
+_add(
+    "live-moving",
+    adapter.live,
+    partial(cache(inputs.frames), 5, step=0.7),
+    flat_psf,
+    refinements=1,
+    noise=NOISE,
+)
+_add(
+    "live-still",
+    adapter.live,
+    partial(cache(inputs.frames), 4, step=0.0),
+    flat_psf,
+    refinements=2,
+    background=1.0,
+)
 
 # Holograms -----------------------------------------------------------------------------------------------
 SLM = (32, 40)
