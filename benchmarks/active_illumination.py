@@ -2,7 +2,7 @@
 
     python benchmarks/active_illumination.py [--side 64] [--out FILE.png]
 
-A dense scene (recon/scenes) of points at continuous places, cast lenslet by lenslet: no grid, no
+A dense scene (recon/evaluation) of points at continuous places, cast lenslet by lenslet: no grid, no
 convolution. Patterns are soft spots of light on a lattice that add up to even light; the reconstruction
 knows each only to 5 % in brightness. Every frame has the same exposure, so that n patterns give the scene
 as much light in all as one even frame does, and read noise is paid n times. The even frame n times over,
@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from recon import fft as project_fft
-from recon.metrics import psnr
-from recon.patterned import reconstruct_patterned
-from recon.scenes.content import dense_picture
-from recon.scenes.lenslets import build_camera
+from recon.base import fft as project_fft
+from recon.base.metrics import psnr
+from recon.evaluation.content import dense_picture
+from recon.evaluation.lenslets import build_camera
+from recon.reconstruction.patterned import reconstruct_patterned
 
 COUNTS = (1, 4, 9, 16, 36)
 PHOTONS = (300.0, 10000.0)

@@ -2,7 +2,7 @@
 
     python benchmarks/activity.py [--frames 240] [--out FOLDER]
 
-Light is cast lenslet by lenslet from points at continuous places (recon/scenes/lenslets.py): no grid, no
+Light is cast lenslet by lenslet from points at continuous places (recon/evaluation/lenslets.py): no grid, no
 convolution. Neurons: clouds of points with a resting light of 0.5 to 1.5 and calcium transients (dF/F up to
 1, decay half a second at 10 frames/s), on tissue that shines as much as all of them together and does not
 change; all bleach by a third, photon and read noise. The video is reconstructed with warm starts and
@@ -27,11 +27,11 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from recon import fft as project_fft
-from recon.activity import aligned, baseline, change, fading, find_regions, motion
-from recon.scenes.lenslets import LensletCamera, build_camera
-from recon.video import VideoSolver, video_camera
-from recon.video.solver import BLOCK
+from recon.base import fft as project_fft
+from recon.evaluation.lenslets import LensletCamera, build_camera
+from recon.streams.baseline import aligned, baseline, change, fading, motion
+from recon.streams.regions import find_regions
+from recon.streams.video import BLOCK, VideoSolver, video_camera
 
 SHAPE = (128, 160)
 READ_NOISE = 2.0

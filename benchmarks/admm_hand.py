@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from recon.operators import PadCropConvolution
-from recon.preparation import prepare
+from recon.base.threads import get_threads, set_threads
+from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
+from recon.reconstruction.preparation import prepare
 from recon.solvers import Admm, LiteralAdmm, Solver
-from recon.threads import get_threads, set_threads
 
 ROOT = Path(os.environ.get("DIFFUSERBENCH_DATA", Path(__file__).parents[1] / "../shared/data"))
 DATA = ROOT / "diffusercam_hand"

@@ -39,11 +39,11 @@ from typing import Any
 import numpy as np
 from admm_hand import DATA, inputs, processor
 
-from recon.operators import PadCropConvolution
-from recon.preparation import prepare
+from recon.base.threads import get_threads, set_threads
+from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
+from recon.reconstruction.preparation import prepare
 from recon.solvers import Admm, SensorAdmm, Solver
-from recon.threads import get_threads, set_threads
 
 REQUIREMENT = "lensless==1.0.8"
 BLOCK = 3

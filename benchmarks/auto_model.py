@@ -3,7 +3,7 @@
     python benchmarks/auto_model.py [--tuning] [--seed-offset N] [--only NAME] [--keep FILE [--finished]]
                                     [--out FOLDER]
 
-Each scene is rendered lenslet by lenslet (``recon.scenes``) and reconstructed with the convolution,
+Each scene is rendered lenslet by lenslet (``recon.evaluation.scene``) and reconstructed with the convolution,
 low-rank and local models, each without and with a background, all depths, all pixels; and once with ``auto``.
 Errors are against the truth (PSNR after the best factor; volumes through a blur of one voxel), times are
 processor seconds of one thread, those of choosing included. The largest model is the local one with a
@@ -34,10 +34,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from auto_scenes import FAMILY_PRIOR, JUDGED, TUNING
 
 import recon
-from recon.auto import Choice
-from recon.scenes import SceneSpec, TestScene, make_scene, score
-from recon.threads import set_threads
-from recon.volume import remembered
+from recon.base.threads import set_threads
+from recon.camera import registration_cache as remembered
+from recon.evaluation.scene import SceneSpec, TestScene, make_scene
+from recon.evaluation.scene_score import score
+from recon.reconstruction.choice import Choice
 
 FIXED = tuple(f"{m}{b}" for m in ("convolution", "lowrank", "local") for b in ("", " + background"))
 LARGEST = "local + background"

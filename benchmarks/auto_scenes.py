@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from recon.scenes import SceneSpec, spec_of
-from recon.scenes.scene import Family
+from recon.evaluation.scene import Family, SceneSpec, spec_of
 
 P, S, B, D, M = "dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"
 FAMILY_PRIOR = {P: "tv", S: "tv", B: "l1", D: "tv", M: "tv"}

@@ -25,13 +25,13 @@ from scipy.optimize import minimize
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.scene_choice import LUMINANCE, sample_picture
 from drivers.simulated.world import SimulatedWorld
+from recon.base.threads import set_threads
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.point_psfs import support_of
+from recon.camera.registration import displacement, shifted
 from recon.optics.scenes import bead_volume, picture
-from recon.registration import displacement, shifted
-from recon.threads import set_threads
+from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Calibration, Geometry
-from recon.volume.reconstruct import reconstruct_volume
 
 GREEN = (0.0, 1.0, 0.0)
 Z_UM = 2500.0

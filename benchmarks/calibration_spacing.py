@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from recon import metrics
+from recon.base import metrics
 from recon.optics.fall_off import gaussian_fall_off
+from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Calibration, Geometry
-from recon.volume.reconstruct import reconstruct_volume
 
 Image = npt.NDArray[np.float32]
 

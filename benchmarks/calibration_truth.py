@@ -14,13 +14,13 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from calibration_routines.angular import AngularSweep, farthest_um, measure_angular_response
-from calibration_routines.dpc import DpcSetup, measure_diffuser
+from calibration_routines.optics.angular import AngularSweep, farthest_um, measure_angular_response
+from calibration_routines.optics.dpc import DpcSetup, measure_diffuser
 from drivers.simulated.led_microscope import LedMicroscopeWorld
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench import open_bench
-from instrument.config_file import led_microscope_text, parse_config
-from recon.dpc import level, slopes_deg
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import led_microscope_text, parse_config
+from recon.analysis.dpc import level, slopes_deg
 
 PCO = """
 [camera]

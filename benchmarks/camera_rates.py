@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.aravis.camera import AravisCamera
 from drivers.camera import Camera, Roi
-from drivers.pixels import Packing, PixelFormat, unpack
+from drivers.common.pixels import Packing, PixelFormat, unpack
 from drivers.v4l2.camera import V4l2Camera
 
 _REPOSITORY = Path(__file__).parents[1]

@@ -28,14 +28,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from instrument.acquire import prepare
-from instrument.bench import Bench, open_bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan
-from instrument.resume import prepare_resume
-from instrument.store import FrameToStore, Run, RunCondition, RunWriter
-from instrument.store.durable import read_lines
-from instrument.verification import verify
+from instrument.runs.acquire import prepare
+from instrument.runs.durable import read_lines
+from instrument.runs.layout import RunCondition
+from instrument.runs.resume import prepare_resume
+from instrument.runs.run import Run
+from instrument.runs.verification import verify
+from instrument.runs.writer import FrameToStore, RunWriter
 
 BENCH = """
 [bench]

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lenslet_scene import Camera, beads, expose, tilted_bars
 
 from recon import Calibration, reconstruct_volume
-from recon.threads import set_threads
+from recon.base.threads import set_threads
 
 SCENES = (
     ("few beads", 64, 8, "l1", 10, 3000.0),

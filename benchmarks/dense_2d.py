@@ -133,8 +133,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("dense-2d"))
     args = parser.parse_args()
 
-    from recon.metrics import psnr
-    from recon.operators import PadCropConvolution
+    from recon.base.metrics import psnr
+    from recon.camera.convolution import PadCropConvolution
     from recon.priors import NonNegativity, TotalVariation
     from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules
 

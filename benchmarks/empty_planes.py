@@ -21,10 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lenslet_scene import Camera, expose
 
-from recon.operators import Convolution3D
+from recon.base.threads import set_threads
+from recon.camera.convolution3d import Convolution3D
 from recon.solvers import StoppingRules
-from recon.threads import set_threads
-from recon.volume import DouglasRachford, LeanTotalVariation
+from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.tv_admm_volume import LeanTotalVariation
 
 
 def layers(camera: Camera, count: int, seed: int = 1) -> np.ndarray:

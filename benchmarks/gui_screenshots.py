@@ -31,10 +31,10 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import apply_theme
+from instrument.bench.config_file import parse_config
 from instrument.cli import main as command
-from instrument.config_file import parse_config
-from instrument.images import write_image
-from instrument.sample_images import load_sample
+from instrument.files.images import write_image
+from instrument.files.sample_images import load_sample
 
 SIZE = "1600x980"
 WAIT_S = 900.0
@@ -135,7 +135,7 @@ def _prepare_camera(folder: Path) -> None:
 
 def _prepare_display(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    text = (Path(instrument.__file__).parent / "display_bench.toml").read_text()
+    text = (Path(instrument.__file__).parent / "bench" / "display_bench.toml").read_text()
     for key, value in SMALL_DISPLAY.items():
         text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
         if count != 1:
@@ -278,7 +278,7 @@ def _first_run(window: MainWindow) -> None:
 def _reconstructions(window: MainWindow, out: Path) -> None:
     """Reconstruct a picture and a volume with the form, and look at them."""
     from gui.panels.reconstructions import ReconstructionsPanel
-    from gui.views.reconstruct_form import CALIBRATION, VOLUME
+    from gui.widgets.reconstruct_form import CALIBRATION, VOLUME
 
     panel = window.panel("reconstructions")
     assert isinstance(panel, ReconstructionsPanel)

@@ -41,10 +41,10 @@ from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
-from instrument.acquire import prepare
-from instrument.calibration_file import save_calibration
-from instrument.config_file import parse_config
+from instrument.bench.config_file import parse_config
+from instrument.files.calibration_file import save_calibration
 from instrument.plan.file import load_plan
+from instrument.runs.acquire import prepare
 from recon.types import Calibration
 
 BENCH = """

@@ -25,9 +25,9 @@ from PySide6.QtTest import QTest
 from gui.app import application
 from gui.jobs import JobRunner
 from gui.theme import apply_theme
-from gui.views.volume_view import VolumeView
-from instrument.result_export import export_result
-from instrument.stored_result import open_result
+from gui.widgets.volume_view import VolumeView
+from instrument.reconstruction.result_export import export_result
+from instrument.reconstruction.stored_result import open_result
 
 TICK_MS = 5
 WAIT_S = 300.0

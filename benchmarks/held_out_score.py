@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from scipy.stats import spearmanr
 
-from recon.chart.even import SETTLED_ITERATIONS, even_with_best
-from recon.chart.reconstruction import ChartProblem, run_setting, settings_for
-from recon.chart.scored import Point
-from recon.scenes import make_scene
-from recon.threads import set_threads
+from recon.base.threads import set_threads
+from recon.evaluation.chart_reconstruction import ChartProblem, run_setting, settings_for
+from recon.evaluation.even import SETTLED_ITERATIONS, even_with_best
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scored import Point
 
 SCENES = ("sparse-picture", "dense-picture", "beads")
 COUNTS = (3, 10, 30, 90)

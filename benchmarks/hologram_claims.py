@@ -17,7 +17,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from instrument.sample_images import load_sample
+from instrument.files.sample_images import load_sample
+from recon.base.threads import set_threads
 from recon.holography import (
     Budget,
     DcTerm,
@@ -28,7 +29,6 @@ from recon.holography import (
     judge,
     random_mask,
 )
-from recon.threads import set_threads
 
 PICTURES = ("portrait", "relief", "leaves")
 DC = DcTerm(0.1, 0.6)

@@ -20,9 +20,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from instrument.sample_images import load_sample
+from instrument.files.sample_images import load_sample
+from recon.base.threads import set_threads
 from recon.holography import Budget, Display, HologramModel, Target, compute_hologram, random_mask
-from recon.threads import set_threads
 
 Curve = list[tuple[int, float, float]]
 

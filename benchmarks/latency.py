@@ -18,11 +18,11 @@ import time
 import numpy as np
 
 from drivers.frame import Frame
-from instrument.acquire import prepare
-from instrument.bench import Bench, open_bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, StagePoints
-from instrument.runner import RunStatus
+from instrument.runs.acquire import prepare
+from instrument.runs.runner import RunStatus
 
 BENCH = """
 [bench]

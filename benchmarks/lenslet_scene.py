@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from recon.scenes.lenslets import stamp
+from recon.evaluation.lenslets import stamp
 
 
 @njit(nogil=True)

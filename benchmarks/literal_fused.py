@@ -1,8 +1,8 @@
 """The dissertation's ADMM for volumes (Kuo 2020, Eq. 4.5, A.3), written as well as its splitting allows.
 
-The same updates as :class:`recon.volume.LiteralAdmm`, in four three-dimensional FFTs into preallocated arrays
-and two compiled sweeps, with split variable and multiplier kept as one state: what a fair comparison has to
-beat. l1 takes the identity for Psi (one split less).
+The same updates as :class:`recon.solvers.literal_volume.LiteralAdmm`, in four three-dimensional FFTs into
+preallocated arrays and two compiled sweeps, with split variable and multiplier kept as one state: what a
+fair comparison has to beat. l1 takes the identity for Psi (one split less).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit
 from rocket_fft import c2c, c2r, r2c
 
-from recon import fft
-from recon.operators._plane_kernels import FAST
-from recon.threads import get_threads, in_blocks
+from recon.base import fft
+from recon.base.threads import get_threads, in_blocks
+from recon.camera._plane_kernels import FAST
 
 AXES = np.array([0, 1, 2])
 

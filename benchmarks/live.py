@@ -27,14 +27,14 @@ import numpy as np
 from dense_2d import FINE, binned, caustic, dense_scene
 from scipy import fft
 
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceTimeoutError
 from drivers.frame import FrameMetadata
-from drivers.stream import FrameStream
-from instrument.live import LiveView
-from recon import fft as project_fft
+from instrument.live.live import LiveView
 from recon import reconstruct
-from recon.live import LiveReconstructor
-from recon.metrics import psnr
+from recon.base import fft as project_fft
+from recon.base.metrics import psnr
+from recon.streams.live import LiveReconstructor
 
 PHOTONS = 1e4
 FULL = 3000

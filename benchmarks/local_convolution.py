@@ -21,10 +21,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from recon.operators import FieldOfPsfs, LinearOperator, PadCropConvolution, local_convolution, low_rank
-from recon.operators.interpolation import interpolation_weights
-from recon.operators.low_rank import principal_psfs
-from recon.threads import set_threads
+from recon.base.threads import set_threads
+from recon.camera.base import LinearOperator
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.interpolation import interpolation_weights
+from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.camera.low_rank import low_rank, principal_psfs
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lenslet_scene import expose
 
 from recon import Calibration, NoiseModel
+from recon.base.threads import set_threads
+from recon.evaluation.lenslets import stamp
 from recon.priors import NonNegativity, TotalVariation
-from recon.scenes.lenslets import stamp
+from recon.reconstruction.channel import ChannelProblem
+from recon.reconstruction.volume import prepare_volume
 from recon.solvers import Fista, Solver, StoppingRules
-from recon.threads import set_threads
-from recon.volume.channel import ChannelProblem
-from recon.volume.reconstruct import prepare_volume
 
 READ_NOISE = 2.0
 

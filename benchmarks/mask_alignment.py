@@ -21,15 +21,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration_routines.display_io import DisplayBench
-from calibration_routines.hologram_capture import capture_hologram
-from calibration_routines.mask_alignment import AlignmentFailedError, MaskAlignment
+from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.hologram_capture import capture_hologram
+from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
 from drivers.simulated.display_world import DisplayWorld
-from instrument.bench import Bench
-from instrument.config_file import display_text, parse_config
-from instrument.display_setup import bench_display
-from instrument.hologram_job import prepare_target
-from instrument.sample_images import load_sample
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import display_text, parse_config
+from instrument.bench.display_setup import bench_display
+from instrument.display.hologram_job import prepare_target
+from instrument.files.sample_images import load_sample
 from recon.holography import Budget, DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera
 from recon.holography.pose import Pose, nodes_of

@@ -2,8 +2,8 @@
 
     python benchmarks/over_time.py [--frames 16] [--out FILE.png]
 
-Light is cast lenslet by lenslet from points at continuous places (recon/scenes/lenslets.py). For each speed
-and each number of photons in the brightest pixel: squared error of the pictures against the beads' true
+Light is cast lenslet by lenslet from points at continuous places (recon/evaluation/lenslets.py). For each
+speed and each number of photons in the brightest pixel: squared error of the pictures against the beads' true
 light (blurred by one pixel, brightness fitted), relative to frames solved alone by the same solver with as
 many iterations.
 """
@@ -20,10 +20,10 @@ import numpy as np
 from activity import SHAPE, expose, points
 from scipy import ndimage
 
-from recon import fft as project_fft
-from recon.scenes.lenslets import build_camera
-from recon.video import video_camera
-from recon.video.joint import OVER_TIME, solve_together
+from recon.base import fft as project_fft
+from recon.evaluation.lenslets import build_camera
+from recon.streams.joint import OVER_TIME, solve_together
+from recon.streams.video import video_camera
 
 SPEEDS_PX = (0.0, 0.1, 0.3, 1.0, 3.0)
 PHOTONS = (30.0, 300.0)

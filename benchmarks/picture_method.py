@@ -30,9 +30,9 @@ from benchmarks.admm_hand import DATA, inputs
 from benchmarks.against_lensless import resized
 from benchmarks.dense_2d import binned, caustic, photograph
 from recon import Reconstruction, reconstruct
-from recon.metrics import psnr
-from recon.preparation import prepare
+from recon.base.metrics import psnr
 from recon.priors import TotalVariation
+from recon.reconstruction.preparation import prepare
 
 METHODS = ("admm", "admm-sensor")
 FINE = 3

@@ -24,10 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.lenslet_scene import Camera, expose
 from recon import reconstruct
-from recon.operators.base import Array
-from recon.scenes.scene import make_scene
-from recon.scenes.score import score
-from recon.threads import set_threads
+from recon.base.threads import set_threads
+from recon.camera.base import Array
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scene_score import score
 
 LOOK_AT = 16
 """Iterations of ``admm-sensor`` after which the edges are measured."""

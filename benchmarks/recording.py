@@ -24,9 +24,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from instrument.bench import open_bench
-from instrument.config_file import parse_config
-from instrument.recording import record
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
+from instrument.runs.recording import record
 
 SIZES = {"0.3 MP": (480, 640), "1.3 MP": (1024, 1280), "5 MP": (2048, 2560)}
 BENCH = """

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines import PointSweep, expose_sweep
-from calibration_routines.background import block_mean
+from calibration_routines.psf.background import block_mean
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench import open_bench
-from instrument.config_file import parse_config
-from recon.registration import expected_shift, register
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
+from recon.camera.registration import expected_shift, register
 
 BENCH = """
 [camera]

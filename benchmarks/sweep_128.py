@@ -20,11 +20,11 @@ from typing import Any
 from calibration_routines import AxialSweep, calibrate_sweep, expose_sweep, sweep_plan
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.world import SimulatedWorld
-from instrument.acquire import abilities_of
-from instrument.bench import open_bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import estimate
-from instrument.runner import RunStatus
+from instrument.runs.acquire import abilities_of
+from instrument.runs.runner import RunStatus
 
 BENCH = """
 [camera]

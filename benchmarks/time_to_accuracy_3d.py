@@ -29,11 +29,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lenslet_scene import Camera, beads, expose, tilted_bars
 from literal_fused import FusedLiteralAdmm
 
-from recon.operators import Convolution3D
+from recon.base.threads import set_threads
+from recon.camera.convolution3d import Convolution3D
 from recon.priors import HaarTotalVariation, NonNegativity
 from recon.solvers import Fista
-from recon.threads import set_threads
-from recon.volume import LeanTotalVariation, LiteralAdmm
+from recon.solvers.literal_volume import LiteralAdmm
+from recon.solvers.tv_admm_volume import LeanTotalVariation
 
 
 @dataclass

@@ -20,7 +20,7 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon import Calibration, VolumeReconstruction, reconstruct_volume
-from recon.threads import set_threads
+from recon.base.threads import set_threads
 
 ROOT = Path(os.environ.get("DIFFUSERBENCH_DATA", Path(__file__).parents[1] / "../shared/data"))
 

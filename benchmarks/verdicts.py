@@ -6,7 +6,7 @@
 
 Scenes of all five families, with seeds, diffusers (random and regular lenslets, smooth) and combinations of
 stresses that no stability map has: each scene draws its light, read noise and density, and every other
-stress with a chance of one in five. Failure is that of ``recon.stability.failure``, from the truth; the
+stress with a chance of one in five. Failure is that of ``recon.verdict.failure``, from the truth; the
 verdict sees the data alone. What is kept is evidence and severity, so that verdicts can be made again.
 
 170 of scenes 100 to 503, scenes 700 to 899 and the volumes of 1200 to 1229 come with the program, as cases
@@ -28,12 +28,12 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta
 
-from recon.scenes import FAMILIES, SceneSpec, spec_of
-from recon.stability.failure import worst
-from recon.stability.scene_trial import Options, run_scene
-from recon.threads import set_threads
+from recon.base.threads import set_threads
+from recon.evaluation.scene import FAMILIES, SceneSpec, spec_of
+from recon.evaluation.scene_trial import Options, run_scene
 from recon.verdict.cases import cases_of, group_of, is_whole, mixed_scenes, weights_of
 from recon.verdict.evidence import Evidence
+from recon.verdict.failure import worst
 from recon.verdict.judge import verdict_on
 from recon.verdict.verdict import Region
 

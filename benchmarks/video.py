@@ -35,13 +35,12 @@ from scipy import fft
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from instrument.reconstruction_request import Settings
-from instrument.video.crew import cluster, in_process, on_cluster
-from instrument.video.reconstruction import VideoRequest, prepare_video
-from recon import fft as project_fft
-from recon.metrics import psnr
-from recon.video import VideoSolver, video_camera
-from recon.video.solver import COLD_ITERATIONS
+from instrument.reconstruction.request import Settings
+from instrument.reconstruction.video import VideoRequest, prepare_video
+from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from recon.base import fft as project_fft
+from recon.base.metrics import psnr
+from recon.streams.video import COLD_ITERATIONS, VideoSolver, video_camera
 from tests.mocks.recordings import write_recording
 
 PHOTONS = 1e4

@@ -19,10 +19,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lenslet_scene import Camera, beads, expose
 
-from recon.operators import Convolution3D
+from recon.base.threads import set_threads
+from recon.camera.convolution3d import Convolution3D
 from recon.solvers import StoppingRules
-from recon.threads import set_threads
-from recon.volume import DouglasRachford
+from recon.solvers.douglas_rachford import DouglasRachford
 
 
 def peak_gib() -> float:

@@ -5,8 +5,8 @@
 
 Each method runs in a process of its own (its peak memory is the process's), in rounds, one after the other,
 so that a busy machine is unjust to none. The best of the rounds' medians counts. ``naive`` is the
-dissertation's algorithm as it stands in NumPy (:class:`recon.volume.LiteralAdmm`), ``fused`` the same written
-well (``benchmarks/literal_fused.py``), both with three-dimensional FFTs.
+dissertation's algorithm as it stands in NumPy (:class:`recon.solvers.literal_volume.LiteralAdmm`), ``fused``
+the same written well (``benchmarks/literal_fused.py``), both with three-dimensional FFTs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def problem(sensor: int, depths: int):
     """Return an operator with random microlens-like PSFs that grow with nearness, and a measurement."""
     import numpy as np
 
-    from recon.operators import Convolution3D
+    from recon.camera.convolution3d import Convolution3D
 
     rng = np.random.default_rng(0)
     lenses = rng.uniform(-0.36, 0.36, (400, 2)) * sensor
@@ -43,7 +43,9 @@ def problem(sensor: int, depths: int):
 
 def solver(method: str, operator, data):
     """Return a solver by its name in METHODS."""
-    from recon.volume import DouglasRachford, LeanTotalVariation, LiteralAdmm
+    from recon.solvers.douglas_rachford import DouglasRachford
+    from recon.solvers.literal_volume import LiteralAdmm
+    from recon.solvers.tv_admm_volume import LeanTotalVariation
 
     if method == "lean TV":
         return LeanTotalVariation(operator, data, 10.0)
@@ -60,7 +62,7 @@ def measure(method: str, sensor: int, depths: int, iterations: int, threads: int
     """Run one method in this process."""
     import os
 
-    from recon.threads import set_threads
+    from recon.base.threads import set_threads
 
     set_threads(threads)
     sys.path.insert(0, str(Path(__file__).resolve().parent))

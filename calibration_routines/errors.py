@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from instrument.errors import BenchError
-from instrument.store import Run
+from instrument.files.errors import BenchError
+from instrument.runs.run import Run
 
 
 class CalibrationError(BenchError):

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from calibration_routines.axial_exposure import SweepExposures
-from calibration_routines.spot_camera import SpotLook
-from calibration_routines.sweep_watch import SweepEvent
-from instrument.acquire import abilities_of
-from instrument.bench import Bench
+from calibration_routines.display.spot_camera import SpotLook
+from calibration_routines.psf.axial_exposure import SweepExposures
+from calibration_routines.psf.sweep_watch import SweepEvent
+from instrument.bench.bench import Bench
 from instrument.plan import Plan, PlanEstimate, Step, estimate
-from instrument.run_control import RunControl
-from instrument.runner import RunStatus
+from instrument.runs.acquire import abilities_of
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import RunStatus
 
 
 @dataclass(frozen=True, slots=True)

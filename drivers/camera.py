@@ -9,10 +9,10 @@ from typing import ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
+from drivers.common.stream import FrameStream
 from drivers.device import Device
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameMetadata
-from drivers.stream import FrameStream
 
 TriggerMode = Literal["free_run", "software", "hardware"]
 

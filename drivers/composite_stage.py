@@ -13,11 +13,11 @@ from typing import Any, ClassVar, Self, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from drivers.common.stage_axes import check_target
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
-from drivers.registry import driver_names, load_driver
+from drivers.registry.registry import driver_names, load_driver
 from drivers.stage import Stage, StageAxis
-from drivers.stage_axes import check_target
 
 _Answer = TypeVar("_Answer")
 _NAME = "composite"
@@ -49,7 +49,8 @@ class StagePart(BaseModel):
     def _by_its_driver(cls, table: Any, check: Callable[[Any], Self]) -> Self:
         part = check(table)
         part._stage = _stage_driver(part.driver)
-        # As instrument.config_file does: strict JSON, so that arrays may be tuples and text is no number.
+        # As instrument.bench.config_file does: strict JSON, so that arrays may be tuples and text is no
+        # number.
         part._options = part._stage.Options.model_validate_json(json.dumps(part.model_extra), strict=True)
         return part
 

@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from drivers.discovery import FoundDevice
+from drivers.registry.discovery import FoundDevice
 
 Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
 

@@ -15,8 +15,8 @@ from gui.main_window import MainWindow, theme_of
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.message import TextWindow
-from instrument.config import BenchConfig
-from instrument.errors import BenchError, in_words
+from instrument.bench.config import BenchConfig
+from instrument.files.errors import BenchError, in_words
 
 _SIGNAL_CHECK_MS = 200
 """Python sees signals only while it runs: an idle event loop has to be woken for them."""

@@ -13,29 +13,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display_io import DisplayBench, bring_mask
-from calibration_routines.hologram_photograph import (
-    Photographed,
-    photograph_hologram,
-    write_capture,
-)
+from calibration_routines.display.display_io import DisplayBench, bring_mask
+from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
 from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
 from gui.python_lines import expression
-from instrument.alignment_file import load_alignment
-from instrument.atomic import check_writable
-from instrument.bench import Bench
-from instrument.config import BenchConfig
-from instrument.display_setup import bench_display
-from instrument.hologram_file import HologramFiles
-from instrument.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
-from instrument.images import read_image
-from instrument.result_list import free_name
-from instrument.run_control import EndedEarlyError, RunControl
-from instrument.safety import StepsFailedError
-from instrument.slm_correction import load_slm_correction
+from instrument.bench.bench import Bench
+from instrument.bench.config import BenchConfig
+from instrument.bench.display_setup import bench_display
+from instrument.bench.safety import StepsFailedError
+from instrument.display.hologram_file import HologramFiles
+from instrument.display.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
+from instrument.files.alignment_file import load_alignment
+from instrument.files.atomic import check_writable
+from instrument.files.images import read_image
+from instrument.files.slm_correction import load_slm_correction
+from instrument.reconstruction.result_list import free_name
+from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.holography import Display, HologramRecord, Target
 
 _INTERVAL_S = 0.25
@@ -245,11 +241,11 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
     if weights is not None:
         request = f"replace({request}, loss_kind='spatial', weights={weights})"
     imports = [
-        "from instrument.config_file import load_config",
-        "from instrument.display_setup import bench_display, slm_size",
-        "from instrument.hologram_file import HologramFiles",
-        "from instrument.hologram_job import HologramRequest, prepare_target, run_request",
-        "from instrument.images import read_image",
+        "from instrument.bench.config_file import load_config",
+        "from instrument.bench.display_setup import bench_display, slm_size",
+        "from instrument.display.hologram_file import HologramFiles",
+        "from instrument.display.hologram_job import HologramRequest, prepare_target, run_request",
+        "from instrument.files.images import read_image",
         "from recon.holography import Budget, foveal_weights, painted_weights",
     ]
     lines = [
@@ -258,7 +254,7 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
         f"display = request.display_of(bench_display(config, slm_size(config), expansion={order.expansion}))",
     ]
     if order.alignment is not None:
-        imports.append("from instrument.alignment_file import load_alignment")
+        imports.append("from instrument.files.alignment_file import load_alignment")
         lines.append(f"display = load_alignment({expression(order.alignment)}).of(display)")
     lines += [
         f"planes = {expression([(order.picture, order.z_mm), *order.further])}",

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from PySide6.QtCore import QObject, Qt, Signal
 
 from drivers.errors import StoppedError
-from instrument.errors import BenchError, in_words
+from instrument.files.errors import BenchError, in_words
 
 _log = logging.getLogger(__name__)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
-from drivers.stream import FrameStream
-from instrument.errors import BenchError, in_words
-from instrument.live import LiveResult, LiveStatus, LiveView
-from instrument.live_camera import LiveCamera
+from instrument.files.errors import BenchError, in_words
+from instrument.live.live import LiveResult, LiveStatus, LiveView
+from instrument.live.live_camera import LiveCamera
 from recon.errors import InputError
-from recon.live import LiveReconstructor
+from recon.streams.live import LiveReconstructor
 
 
 class LiveFollower:

@@ -30,9 +30,9 @@ from gui.procedure_run import Ended, ProcedureRun, Situation
 from gui.session import BenchSession
 from gui.widgets.form_view import FormView
 from gui.widgets.run_bar import RunBar
-from instrument.bench import Bench
-from instrument.errors import BenchError, SettingsError
-from instrument.words import count, duration, size
+from instrument.bench.bench import Bench
+from instrument.files.errors import BenchError, SettingsError
+from instrument.files.formatting import count, duration, size
 
 _CHECK_MS = 250
 """Rest after a key before what was typed is checked."""

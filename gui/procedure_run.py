@@ -10,17 +10,17 @@ from pathlib import Path
 
 from PySide6.QtCore import QObject, QTimer, Signal
 
-from calibration_routines.axial_exposure import SweepExposures
+from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.errors import RunEndedError
 from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
-from calibration_routines.spot_camera import SpotLook
-from calibration_routines.sweep_watch import SweepEvent
-from calibration_routines.sweep_words import event_lines, exposure_lines
+from calibration_routines.psf.axial_exposure import SweepExposures
+from calibration_routines.psf.sweep_watch import SweepEvent
+from calibration_routines.psf.sweep_words import event_lines, exposure_lines
 from gui.jobs import Job, JobContext
 from gui.session import BenchSession
-from instrument.photograph import Snapshot
-from instrument.run_control import EndedEarlyError, RunControl
-from instrument.runner import RunState, RunStatus
+from instrument.bench.photograph import Snapshot
+from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.runner import RunState, RunStatus
 
 _LOOK_MS = 100
 

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from gui.jobs import JobCancelledError, JobContext
 from gui.python_lines import expression
-from instrument.kept_request import checkpoint_for, settle_checkpoint
-from instrument.reconstruction_file import Outputs, write_reconstruction
-from instrument.reconstruction_job import Job as Prepared
-from instrument.reconstruction_request import PictureRequest, VolumeRequest
-from instrument.volume_file import write_volume
+from instrument.reconstruction.job import Job as Prepared
+from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from instrument.reconstruction.volume_file import write_volume
 from recon.solvers.stopping import IterationRecord
 
 _INTERVAL_S = 0.5
@@ -121,25 +121,25 @@ def lines_of(work: ReconstructionWork) -> str:
     """Return the Python that does a reconstruction."""
     request, settings = work.request, work.request.settings
     volume = isinstance(request, VolumeRequest)
-    imports = {f"from instrument.reconstruction_request import {type(request).__name__}, Settings"}
+    imports = {f"from instrument.reconstruction.request import {type(request).__name__}, Settings"}
     if volume:
-        imports.add("from instrument.volume_file import write_volume")
-        imports.add("from instrument.reconstruction_file import Outputs")
+        imports.add("from instrument.reconstruction.volume_file import write_volume")
+        imports.add("from instrument.reconstruction.result_file import Outputs")
     else:
-        imports.add("from instrument.reconstruction_file import Outputs, write_reconstruction")
+        imports.add("from instrument.reconstruction.result_file import Outputs, write_reconstruction")
     if settings.crop is not None:
-        imports.add("from instrument.preparation import Crop")
+        imports.add("from instrument.reconstruction.preparation import Crop")
     if type(settings.noise).__name__ == "NoiseModel":
-        imports.add("from recon.noise import NoiseModel")
+        imports.add("from recon.base.noise import NoiseModel")
     if settings.wishes is not None:
-        imports.add("from recon.auto import Wishes")
+        imports.add("from recon.reconstruction.overrides import Wishes")
     named = f"Outputs.named({expression(work.outputs.image)}{', volume=True' if volume else ''})"
     lines = [f"request = {expression(request)}", "job = request.prepare()"]
     settled: list[str] = []
     if work.kept_in is None:
         lines.append("result = request.solve(job)")
     else:
-        imports.add("from instrument.kept_request import checkpoint_for, settle_checkpoint")
+        imports.add("from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint")
         reasons = "result.stop_reasons" if volume else "[result.stop_reason]"
         lines += [
             f"keeper = checkpoint_for({expression(work.kept_in)}, job, request)",

@@ -23,10 +23,10 @@ from gui.device_state import DeviceState, is_gone
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
 from gui.log_bridge import LogBridge
 from gui.operator_request import OperatorRequest
-from instrument.bench import Bench
-from instrument.config import BenchConfig, Kind
-from instrument.live_camera import LiveCamera
-from instrument.snapshot import Light, switch_light
+from instrument.bench.bench import Bench
+from instrument.bench.config import BenchConfig, Kind
+from instrument.live.live_camera import LiveCamera
+from instrument.runs.snapshot import Light, switch_light
 
 Level = Literal["debug", "info", "warning", "error"]
 

@@ -1,12 +1,12 @@
 """Numbers only: optics, operators, priors, solvers, analysis. Knows no device, no file format, no window."""
 
+from recon.base.noise import NoiseModel
 from recon.errors import InputError
-from recon.noise import NoiseModel
-from recon.picture import reconstruct
-from recon.result import ImageGrid, Reconstruction
+from recon.reconstruction.picture import reconstruct
+from recon.reconstruction.result import ImageGrid, Reconstruction
+from recon.reconstruction.volume import reconstruct_volume
+from recon.reconstruction.volume_result import VolumeGrid, VolumeReconstruction
 from recon.types import Calibration, Geometry
-from recon.volume.reconstruct import reconstruct_volume
-from recon.volume.result import VolumeGrid, VolumeReconstruction
 
 __all__ = [
     "Calibration",

@@ -18,15 +18,16 @@ import numpy as np
 import pytest
 
 from calibration_routines import SweepCalibration, SweepExposures
-from calibration_routines.comparison import compare, scene_field
-from calibration_routines.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo_settings import DemoSettings, read_picture
+from calibration_routines.demo.demo import Advance, DemoResult, run_demo
+from calibration_routines.demo.demo_settings import DemoSettings, read_picture
+from calibration_routines.optics.comparison import compare, scene_field
 from drivers.errors import DeviceError
-from instrument.bench import Bench
-from instrument.calibration_file import load_calibration
+from instrument.bench.bench import Bench
 from instrument.cli import main
-from instrument.errors import FileError
-from instrument.store import Run, RunCondition
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import FileError
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
 
 SMALL = DemoSettings(
     preset="tiny",
@@ -193,7 +194,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 
 PROGRAM = """
 import sys
-from calibration_routines import demo_settings
+from calibration_routines.demo import demo_settings
 from instrument.cli import main
 small = demo_settings.DemoSettings(
     preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from instrument.config_file import parse_config
+from instrument.bench.config_file import parse_config
 
 PAGES = sorted((Path(__file__).parents[1] / "docs" / "how-to" / "devices").glob("*.md"))
 CAMERA = '[camera]\ndriver = "simulated"\n'

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers import listing, registry
 from drivers.errors import DeviceError
-from drivers.registry import GROUP, KINDS, driver_names, load_driver, registration_mistakes
-from instrument.config_file import load_config
-from instrument.errors import ConfigError
+from drivers.registry import listing, registry
+from drivers.registry.registry import GROUP, KINDS, driver_names, load_driver, registration_mistakes
+from instrument.bench.config_file import load_config
+from instrument.files.errors import ConfigError
 
 Register = Callable[..., None]
 

@@ -17,9 +17,9 @@ from drivers.apt.protocol import (
     decode,
     short,
 )
+from drivers.common.framing import Matcher, Verdict
+from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.framing import Matcher, Verdict
-from drivers.serial_transport import SerialTransport
 
 _log = logging.getLogger(__name__)
 _BAUD_RATE = 115_200

@@ -14,8 +14,8 @@ from drivers.apt.actuators import (
     ActuatorName,
     ControllerName,
 )
+from drivers.common.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
 from drivers.device import DriverOptions
-from drivers.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
 
 
 class AptAxis(AxisOptions):

@@ -10,11 +10,11 @@ from drivers.apt.actuators import CONTROLLERS, SETTLING_COUNTS
 from drivers.apt.drives import Drive, InertiaChannel, InertiaUnit, Motor
 from drivers.apt.link import Link
 from drivers.apt.options import AptAxis, AptOptions
-from drivers.buses import lasting_name, serial_ports
+from drivers.common.polled_stage import PolledStage, StageState
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
-from drivers.polled_stage import PolledStage, StageState
+from drivers.registry.buses import lasting_name, serial_ports
+from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 _log = logging.getLogger(__name__)

@@ -12,12 +12,12 @@ import numpy as np
 
 from drivers.aravis.image_settings import AravisImageSettings
 from drivers.aravis.library import library_error, load
-from drivers.buffered_camera import RawFrame
+from drivers.common.buffered_camera import RawFrame
+from drivers.common.drops import FrameNumberCounter
+from drivers.common.pixels import Bytes, Pixels, unpack
 from drivers.device import DriverOptions, SharedPart
-from drivers.discovery import FoundDevice
-from drivers.drops import FrameNumberCounter
 from drivers.errors import DeviceError
-from drivers.pixels import Bytes, Pixels, unpack
+from drivers.registry.discovery import FoundDevice
 
 _SLICE_S = 0.05
 """A wait in the library cannot be ended from outside: it is cut into pieces of this length."""

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from drivers.aravis.features import FRAME_TRIGGERS
 from drivers.aravis.settings import AravisSettings
 from drivers.camera import Roi, TriggerMode
+from drivers.common.pixels import PixelFormat, genicam_format, prepare
 from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
-from drivers.pixels import PixelFormat, genicam_format, prepare
 
 
 class AravisImageSettings(AravisSettings):

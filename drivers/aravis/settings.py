@@ -18,11 +18,11 @@ from drivers.aravis.features import (
     Features,
 )
 from drivers.aravis.library import enable_fake, library_error, load
-from drivers.buffered_camera import BufferedCamera
-from drivers.claim import DeviceBusyError
+from drivers.common.buffered_camera import BufferedCamera
+from drivers.common.gain import GainScale, GainUnit
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart
 from drivers.errors import DeviceError, DeviceLostError, LimitError
-from drivers.gain import GainScale, GainUnit
+from drivers.registry.claim import DeviceBusyError
 
 _MISSING = "Is it on, connected, and in this computer's subnet? arv-tool-0.8 lists what Aravis finds."
 _FAKES = {("Aravis", "Fake"), ("vitavision.dev", "VivaCam Fake")}

@@ -6,11 +6,11 @@ import threading
 import time
 from typing import Any
 
-from drivers.buses import hid_devices
-from drivers.discovery import FoundDevice
 from drivers.dlpc900.commands import Command, error_words
 from drivers.dlpc900.packets import REPORT_BYTES, Reply, parse_reply, reports
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError
+from drivers.registry.buses import hid_devices
+from drivers.registry.discovery import FoundDevice
 
 USB_ID = "0451:c900"
 _ANSWER_S = 2.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
+from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.grbl.protocol import (
     ALARMS,
@@ -20,7 +21,6 @@ from drivers.grbl.protocol import (
     parse_report,
     report_matcher,
 )
-from drivers.serial_transport import SerialTransport
 
 _log = logging.getLogger(__name__)
 _RESET_S = 2.0

@@ -9,7 +9,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from drivers.framing import Matcher, Verdict
+from drivers.common.framing import Matcher, Verdict
 
 STATUS = b"?"
 JOG_CANCEL = b"\x85"

@@ -8,9 +8,8 @@ import re
 import time
 from collections.abc import Mapping
 
-from drivers.buses import lasting_name
+from drivers.common.polled_stage import PolledStage, StageState
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
 from drivers.grbl.options import GrblAxis, GrblOptions
@@ -26,7 +25,8 @@ from drivers.grbl.protocol import (
     parse_settings,
 )
 from drivers.grbl.settings import REPORTED_STEP, ControllerSettings
-from drivers.polled_stage import PolledStage, StageState
+from drivers.registry.buses import lasting_name
+from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 _log = logging.getLogger(__name__)

@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from drivers.buses import lasting_name
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.illuminate.geometry import Geometry, read_geometry
 from drivers.illuminate.link import Link
 from drivers.illuminate.sequencer import Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
+from drivers.registry.buses import lasting_name
+from drivers.registry.discovery import FoundDevice
 
 _log = logging.getLogger(__name__)
 _OVERTAKE_S = 0.2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError
 from drivers.illuminate.dialect import OLDEST, Dialect, dialect_of
 from drivers.illuminate.protocol import (
@@ -12,7 +13,6 @@ from drivers.illuminate.protocol import (
     reply_matcher,
     version_matcher,
 )
-from drivers.serial_transport import SerialTransport
 
 BAUD_RATE = 115_200
 _POWER_CODES = (3,)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.framing import Matcher, Verdict
+from drivers.common.framing import Matcher, Verdict
 
 TERMINATOR = b"-==-"
 _REFUSAL = re.compile(rb"ERROR ?\[(\d+)\]: *(.*)")

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
+from drivers.registry.discovery import FoundDevice
 from drivers.second_display.options import SecondDisplayOptions
 from drivers.second_display.outputs import Output
 from drivers.slm import Slm

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from drivers.common.stage_axes import AXIS_NAMES
 from drivers.device import DriverOptions, SharedPart
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.display_world import DisplayWorld
 from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
-from drivers.stage_axes import AXIS_NAMES
 
 
 class DisplayStageOptions(StageOptions):

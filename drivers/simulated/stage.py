@@ -9,13 +9,13 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivers.common.stage_axes import AXIS_NAMES, check_target
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import Stage, StageAxis
-from drivers.stage_axes import AXIS_NAMES, check_target
 
 POLL_S = 0.002
 REFERENCE_S = 1.0

@@ -7,13 +7,13 @@ from collections import deque
 
 import numpy as np
 
-from drivers.buffered_camera import RawFrame
-from drivers.buses import video_devices
+from drivers.common.buffered_camera import RawFrame
+from drivers.common.drops import FrameNumberCounter
+from drivers.common.pixels import Bytes, Pixels
 from drivers.device import DriverOptions, SharedPart
-from drivers.discovery import FoundDevice
-from drivers.drops import FrameNumberCounter
 from drivers.errors import DeviceError
-from drivers.pixels import Bytes, Pixels
+from drivers.registry.buses import video_devices
+from drivers.registry.discovery import FoundDevice
 from drivers.v4l2 import api
 from drivers.v4l2.device import FilledBuffer, VideoDevice
 from drivers.v4l2.formats import decode

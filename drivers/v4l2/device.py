@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.claim import DeviceBusyError
+from drivers.common.pixels import Bytes
 from drivers.errors import DeviceError, DeviceLostError, DeviceNotOpenError
-from drivers.pixels import Bytes
+from drivers.registry.claim import DeviceBusyError
 from drivers.v4l2 import api
 
 _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.pixels import Bytes, Packing, PixelFormat, Pixels, unpack
+from drivers.common.pixels import Bytes, Packing, PixelFormat, Pixels, unpack
 from drivers.v4l2.api import fourcc
 
 Coding = Literal["plain", "YUYV luma", "YUYV colour", "MJPG luma", "MJPG colour"]

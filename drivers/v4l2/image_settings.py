@@ -7,9 +7,9 @@ import math
 from collections.abc import Mapping
 
 from drivers.camera import Roi, TriggerMode
+from drivers.common.pixels import prepare
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceLostError, LimitError
-from drivers.pixels import prepare
 from drivers.v4l2.formats import V4l2Format
 from drivers.v4l2.geometry import (
     crop,

@@ -7,10 +7,10 @@ from typing import ClassVar, cast
 
 from pydantic import Field, PositiveInt
 
-from drivers.buffered_camera import BufferedCamera
+from drivers.common.buffered_camera import BufferedCamera
+from drivers.common.gain import GainScale, GainUnit
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
 from drivers.errors import DeviceError, LimitError
-from drivers.gain import GainScale, GainUnit
 from drivers.v4l2 import api
 from drivers.v4l2.controls import Control, Controls
 from drivers.v4l2.device import VideoDevice

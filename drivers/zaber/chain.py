@@ -6,9 +6,9 @@ import itertools
 import logging
 import threading
 
+from drivers.common.framing import Verdict
+from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.framing import Verdict
-from drivers.serial_transport import SerialTransport
 from drivers.zaber.protocol import FAULTS, REJECTIONS, Message, command, flag_words, parse
 
 _log = logging.getLogger(__name__)

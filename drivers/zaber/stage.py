@@ -9,13 +9,13 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.buses import lasting_name, serial_ports
+from drivers.common.polled_stage import PolledStage, StageState
+from drivers.common.stage_axes import MRAD_PER_DEG, AxisMap, AxisName, AxisOptions
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
-from drivers.polled_stage import PolledStage, StageState
+from drivers.registry.buses import lasting_name, serial_ports
+from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
-from drivers.stage_axes import MRAD_PER_DEG, AxisMap, AxisName, AxisOptions
 from drivers.zaber.chain import Chain
 from drivers.zaber.protocol import FAULTS, NO_REFERENCE, SPEED_FACTOR, flag_words
 

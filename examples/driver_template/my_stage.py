@@ -16,12 +16,12 @@ from collections.abc import Mapping
 
 from pydantic import Field
 
+from drivers.common.framing import reply_line
+from drivers.common.polled_stage import PolledStage, StageState
+from drivers.common.serial_transport import SerialTransport
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.framing import reply_line
-from drivers.polled_stage import PolledStage, StageState
-from drivers.serial_transport import SerialTransport
+from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 WHO = (b"V\n", reply_line(rb"MYSTAGE [\d.]+ \S+"))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from calibration_routines.alignment_session import AlignmentSettings
-from calibration_routines.display_procedures import AlignmentProcedure
+from calibration_routines.display.alignment_session import AlignmentSettings
+from calibration_routines.display.display_procedures import AlignmentProcedure
 from gui.forms.field import Field, Form, field_of
-from instrument.errors import SettingsError
+from instrument.files.errors import SettingsError
 
 _SECTIONS = AlignmentSettings().division
 

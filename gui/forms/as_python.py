@@ -23,7 +23,7 @@ def script(procedure: Procedure, bench: Path | None) -> str:
     bench : Path, optional
         Its bench.toml; None: the built-in simulated bench.
     """
-    imports: set[tuple[str, str]] = {("instrument.bench", "open_bench")}
+    imports: set[tuple[str, str]] = {("instrument.bench.bench", "open_bench")}
     plain: set[str] = set()
     made = expression(procedure, imports, plain)
     lines = [f"import {name}" for name in sorted(plain)]

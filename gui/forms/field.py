@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, Literal
 
 from calibration_routines.procedure import Procedure
-from instrument.bench import Bench
+from instrument.bench.bench import Bench
 
 Kind = Literal["number", "whole", "switch", "choice", "file", "text"]
 MM = 1e3

@@ -8,26 +8,26 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from calibration_routines.beads import BeadSlides
-from calibration_routines.display_procedures import SlmProcedure
-from calibration_routines.dpc import BANDS, DpcSetup
-from calibration_routines.optics_procedures import (
+from calibration_routines.display.display_procedures import SlmProcedure
+from calibration_routines.optics.beads import BeadSlides
+from calibration_routines.optics.dpc import BANDS, DpcSetup
+from calibration_routines.optics.optics_procedures import (
     AngularProcedure,
     BeadProcedure,
     DpcProcedure,
     PhotographProcedure,
 )
-from calibration_routines.plan_procedures import PlanProcedure
-from calibration_routines.sweep_procedure import SweepProcedure
-from calibration_routines.sweep_request import (
+from calibration_routines.psf.plan_procedures import PlanProcedure
+from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.psf.sweep_request import (
     AxialRequest,
     LateralRequest,
     VolumeRequest,
     reachable_depths_um,
 )
 from gui.forms.field import MM, Field, Form, field_of
-from instrument.bench import Bench
-from instrument.errors import SettingsError
+from instrument.bench.bench import Bench
+from instrument.files.errors import SettingsError
 from instrument.plan import Plan
 from recon.blind import BlindSettings
 

@@ -19,9 +19,9 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from calibration_routines.mask_alignment import AlignmentReport
+from calibration_routines.display.mask_alignment import AlignmentReport
+from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.procedure import Outcome
-from calibration_routines.spot_camera import SpotLook
 from gui.forms.alignment import ALIGNMENT
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession

@@ -12,7 +12,7 @@ from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.widgets.message import TextWindow
 from gui.widgets.number_edit import NumberEdit
-from instrument.camera_settings import CameraState, read_camera
+from instrument.bench.camera_settings import CameraState, read_camera
 
 _READ_BACK_MS = 3000
 

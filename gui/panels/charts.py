@@ -11,14 +11,14 @@ from gui.jobs import Job
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
-from gui.views.chart_view import ChartView
-from gui.views.stability_view import StabilityView
+from gui.widgets.chart_view import ChartView
 from gui.widgets.question import choose_path
-from instrument.chart.reader import read_chart
-from instrument.chart.words import subject_of
-from instrument.errors import FileError
-from instrument.stability_file import read_stability
-from recon.stability.shipped import shipped_file
+from gui.widgets.stability_view import StabilityView
+from instrument.evaluation.chart_reader import read_chart
+from instrument.evaluation.chart_words import subject_of
+from instrument.files.errors import FileError
+from instrument.files.stability_file import read_stability
+from recon.verdict.shipped import shipped_file
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
 
@@ -106,7 +106,7 @@ class ChartsPanel(Panel):
             lines = [
                 "from pathlib import Path",
                 "",
-                "from instrument.chart.reader import read_chart",
+                "from instrument.evaluation.chart_reader import read_chart",
                 "",
                 f"points = read_chart({expression(self.chart_path)})['points']",
                 f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "
@@ -119,9 +119,9 @@ class ChartsPanel(Panel):
             [
                 "from pathlib import Path",
                 "",
-                "from instrument.figures import save_figure",
-                "from instrument.stability_figure import map_figure",
-                "from instrument.stability_file import read_stability",
+                "from instrument.files.figures import save_figure",
+                "from instrument.evaluation.stability_figure import map_figure",
+                "from instrument.files.stability_file import read_stability",
                 "",
                 f"maps = read_stability({expression(self.maps_path)})['maps']",
                 f"save_figure(map_figure(maps[{name!r}]), Path({f'{name}.png'!r}))",

@@ -36,9 +36,9 @@ from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.theme import colours
-from gui.views.entry import Entry, PathEntry, existing_path, narrow, number
-from gui.views.facts import FactsView
-from gui.views.hologram_words import (
+from gui.widgets.entry import Entry, PathEntry, existing_path, narrow, number
+from gui.widgets.facts import FactsView
+from gui.widgets.hologram_words import (
     brush_radius,
     depth_mm,
     expansion,
@@ -47,15 +47,15 @@ from gui.views.hologram_words import (
     pattern_png,
     share,
 )
-from gui.views.view_grid import ViewGrid
-from gui.views.weights_view import WEIGHTS_SHAPE, WeightsView
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from instrument.display_setup import depth_limit_mm
-from instrument.errors import BenchError
-from instrument.hologram_job import HologramRequest, HologramResult, field_picture
-from instrument.images import read_image
-from instrument.result_list import free_name
+from gui.widgets.view_grid import ViewGrid
+from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsView
+from instrument.bench.display_setup import depth_limit_mm
+from instrument.display.hologram_job import HologramRequest, HologramResult, field_picture
+from instrument.files.errors import BenchError
+from instrument.files.images import read_image
+from instrument.reconstruction.result_list import free_name
 from recon.errors import InputError
 from recon.holography import Budget, Scores
 from recon.holography.display import require_defocus

@@ -138,7 +138,7 @@ class LedPanel(Panel):
         pattern = self._drawn or LedPattern("off")
         return (
             "from drivers.led_array import LedPattern\n"
-            "from instrument.bench import open_bench\n\n"
+            "from instrument.bench.bench import open_bench\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    bench.led_array.set_pattern({pattern!r})\n"
             '    input("Enter ends, and turns the light off. ")\n'

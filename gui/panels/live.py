@@ -31,9 +31,16 @@ from gui.widgets.histogram import HistogramPlot
 from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import curve_pen, plot_widget
-from instrument.frame_view import histogram, line_profile, percentiles, sensor_roi
-from instrument.live_camera import LiveCameraStatus
-from instrument.snapshot import Light, check_target, led_pattern, light_of, photograph_name, write_snapshot
+from instrument.live.frame_view import histogram, line_profile, percentiles, sensor_roi
+from instrument.live.live_camera import LiveCameraStatus
+from instrument.runs.snapshot import (
+    Light,
+    check_target,
+    led_pattern,
+    light_of,
+    photograph_name,
+    write_snapshot,
+)
 
 _LOOK_MS = 8
 """Between two looks whether there is another frame: a look costs next to nothing."""
@@ -234,8 +241,8 @@ class LivePanel(Panel):
             "",
             "from drivers.camera import Roi",
             "from drivers.led_array import LedPattern",
-            "from instrument.bench import open_bench",
-            "from instrument.snapshot import Light, photograph_name, switch_light, write_snapshot",
+            "from instrument.bench.bench import open_bench",
+            "from instrument.runs.snapshot import Light, photograph_name, switch_light, write_snapshot",
             "",
             f"with open_bench({str(path) if path else None!r}) as bench:",
         ]

@@ -29,14 +29,14 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.question import choose_path
-from instrument.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.full_picture import MOST_ITERATIONS, full_picture
-from instrument.live import LiveResult
-from instrument.reconstruction_job import find_calibration
-from instrument.snapshot import Light, light_of
-from instrument.words import duration
-from recon.live import LiveReconstructor
-from recon.result import Reconstruction
+from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
+from instrument.files.formatting import duration
+from instrument.live.full_picture import MOST_ITERATIONS, full_picture
+from instrument.live.live import LiveResult
+from instrument.reconstruction.job import find_calibration
+from instrument.runs.snapshot import Light, light_of
+from recon.reconstruction.result import Reconstruction
+from recon.streams.live import LiveReconstructor
 from recon.types import Calibration
 
 _LOOK_MS = 50
@@ -143,7 +143,7 @@ class LiveReconstructionPanel(Panel):
         path = self.session.config.path
         calibration = "calibration" if self.loaded is None else str(self.loaded.path)
         return (
-            "from instrument.bench import open_bench\n\n"
+            "from instrument.bench.bench import open_bench\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    settings = dict(z_um={self.z_um!r}, budget_ms={self.budget.value!r})\n"
             f"    with bench.live({calibration!r}, **settings) as live:\n"

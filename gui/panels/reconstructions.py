@@ -29,23 +29,23 @@ from gui.panel import Panel
 from gui.python_lines import expression
 from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
-from gui.views.convergence import ConvergenceView
-from gui.views.facts import FactsView
-from gui.views.picture_view import PictureView
-from gui.views.reconstruct_form import CALIBRATION, PSF, ReconstructForm
-from gui.views.volume_view import VolumeView
 from gui.widgets.colour_maps import as_shown
+from gui.widgets.convergence import ConvergenceView
+from gui.widgets.facts import FactsView
+from gui.widgets.picture_view import PictureView
 from gui.widgets.question import Question, choose_path
-from instrument.calibration_file import calibrated_depths_um, newest_calibration
-from instrument.errors import BenchError, FileError
-from instrument.images import write_image
-from instrument.plane_steps import uneven_steps
-from instrument.reconstruction_job import find_calibration
-from instrument.reconstruction_request import VolumeRequest
-from instrument.result_export import export_result
-from instrument.result_list import find_results, free_name
-from instrument.stored_result import StoredResult, open_result
-from recon.auto import Choice
+from gui.widgets.reconstruct_form import CALIBRATION, PSF, ReconstructForm
+from gui.widgets.volume_view import VolumeView
+from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import write_image
+from instrument.files.plane_steps import uneven_steps
+from instrument.reconstruction.job import find_calibration
+from instrument.reconstruction.request import VolumeRequest
+from instrument.reconstruction.result_export import export_result
+from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.stored_result import StoredResult, open_result
+from recon.reconstruction.choice import Choice
 
 Views = dict[Path, npt.NDArray[np.uint8]]
 """Files of an export with the colours that they show, (height, width, 3)."""
@@ -464,7 +464,7 @@ class ReconstructionsPanel(Panel):
         lines = [
             "from pathlib import Path",
             "",
-            "from instrument.stored_result import open_result",
+            "from instrument.reconstruction.stored_result import open_result",
             "",
             f"result = open_result({expression(path)})",
             "print(result.facts(), result.warnings)",

@@ -27,10 +27,10 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
-from calibration_routines.sweep import FOLDER
-from calibration_routines.sweep_record import is_sweep
+from calibration_routines.psf.plan_procedures import ResumeProcedure, lacks_result
+from calibration_routines.psf.sweep import FOLDER
+from calibration_routines.psf.sweep_record import is_sweep
 from gui.forms.as_python import script
 from gui.jobs import BusyError, Job, JobContext
 from gui.newest_only import NewestOnly
@@ -40,8 +40,9 @@ from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.run_bar import RunBar
-from instrument.store import Run, RunCondition
-from instrument.store.catalogue import RunSummary, run_paths, summary
+from instrument.runs.catalogue import RunSummary, run_paths, summary
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _LEVELS = (0.1, 99.9)
@@ -174,13 +175,13 @@ class RunsPanel(Panel):
         """Return lines that read the run, or go on with it where it did not end."""
         if self.opened is None:
             return (
-                "from pathlib import Path\n\nfrom instrument.store.catalogue import run_paths, summary\n\n"
+                "from pathlib import Path\n\nfrom instrument.runs.catalogue import run_paths, summary\n\n"
                 f"for path in run_paths(Path({str(self.session.runs_folder)!r})):\n    print(summary(path))\n"
             )
         if self._can_resume:
             return script(ResumeProcedure(self.opened.path), self.session.config.path)
         return (
-            "from instrument.store import Run\n\n"
+            "from instrument.runs.run import Run\n\n"
             f"run = Run.open({str(self.opened.path)!r})\n"
             "print(run)\n"
             "for index in sorted(run.records):\n"

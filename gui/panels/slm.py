@@ -25,9 +25,9 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.message import elided
 from gui.widgets.plot import curve_pen, plot_widget, restyle
 from gui.widgets.question import choose_path
-from instrument.errors import BenchError
-from instrument.slm_correction import SlmCorrection, load_slm_correction, show_levels
-from instrument.slm_image import read_slm_image
+from instrument.files.errors import BenchError
+from instrument.files.slm_correction import SlmCorrection, load_slm_correction, show_levels
+from instrument.files.slm_image import read_slm_image
 
 _LOOK_MS = 500
 _IMAGES = "Phase pictures (*.png *.tif *.tiff *.bmp *.npy)"
@@ -101,9 +101,9 @@ class SlmPanel(Panel):
         table = self.table_file.text() if self.use_table.isChecked() else ""
         return (
             "from pathlib import Path\n\n"
-            "from instrument.bench import open_bench\n"
-            "from instrument.slm_correction import load_slm_correction, show_levels\n"
-            "from instrument.slm_image import read_slm_image\n\n"
+            "from instrument.bench.bench import open_bench\n"
+            "from instrument.files.slm_correction import load_slm_correction, show_levels\n"
+            "from instrument.files.slm_image import read_slm_image\n\n"
             f"correction = {f'load_slm_correction(Path({table!r}))' if table else None}\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    levels, _ = read_slm_image({self.file.text() or 'phase.png'!r})\n"

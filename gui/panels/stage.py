@@ -151,7 +151,7 @@ class StagePanel(Panel):
         path = self.session.config.path
         here = {name: row.target.value for name, row in self.rows.items()}
         return (
-            "from instrument.bench import open_bench\n\n"
+            "from instrument.bench.bench import open_bench\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             "    if not bench.stage.is_homed:\n"
             "        bench.stage.home()\n"

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxL
 
 from calibration_routines import Photograph, SweepCalibration
 from calibration_routines.procedure import Outcome, Outlook
-from calibration_routines.sweep_watch import PointTaken
+from calibration_routines.psf.sweep_watch import PointTaken
 from gui.forms.routines import ROUTINES
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
@@ -24,10 +24,10 @@ from gui.widgets.message import elided
 from gui.widgets.path_plot import PathPlot
 from gui.widgets.picture import Picture
 from gui.widgets.psf_table import PsfTable
-from instrument.errors import BenchError, FileError
-from instrument.photograph import Snapshot
+from instrument.bench.photograph import Snapshot
+from instrument.files.errors import BenchError, FileError
+from instrument.files.formatting import count
 from instrument.plan.file import load_plan, plan_toml
-from instrument.words import count
 
 Image = npt.NDArray[Any]
 _LEVELS = (0.1, 99.9)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.frame_view import SATURATED
+from instrument.live.frame_view import SATURATED
 
 _SIGNAL = SATURATED - 1
 _SATURATED_RGB = {"grey": (255, 40, 40), "red": (255, 120, 90)}

@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QGraphicsItem, QVBoxLayout, QWidget
 
 from gui.theme import colours
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from instrument.frame_view import grouped
+from instrument.live.frame_view import grouped
 
 BINS = 256
 _SHADE = 18
@@ -59,7 +59,7 @@ class HistogramPlot(QWidget):
         layout.addWidget(self.plot)
 
     def show_counts(self, counts: npt.NDArray[np.float32], full_scale: int, low: float, high: float) -> None:
-        """Show a histogram of all counts (``instrument.frame_view.histogram``) and the levels in use."""
+        """Show a histogram of all counts (``instrument.live.frame_view.histogram``) and the levels in use."""
         bins = grouped(counts, full_scale, BINS)
         step = (full_scale + 1) / BINS
         self.curve.setData(np.arange(BINS) * step, np.maximum(bins, 0.5))

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from gui.theme import colours
 from gui.widgets.arrow_keys import ArrowKeys
 from gui.widgets.colour_maps import grey_indices, indices_of, spares_hues, table
-from instrument.frame_view import SATURATED, fill_indices, index_table
+from instrument.live.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 

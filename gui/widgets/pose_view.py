@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from calibration_routines.mask_alignment import AlignmentReport
+from calibration_routines.display.mask_alignment import AlignmentReport
 from gui.theme import colours
 from gui.widgets.plot import plot_widget, restyle
 from recon.holography.pose import NAMES

@@ -11,8 +11,8 @@ from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QColor
 from PySide6.QtWidgets import QHeaderView, QSplitter, QTableWidget, QTableWidgetItem, QVBoxLayout, QWidget
 
-from calibration_routines.psf_quality import MIN_SNR, PsfQuality
-from calibration_routines.sweep_watch import PointTaken
+from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
+from calibration_routines.psf.sweep_watch import PointTaken
 from gui.theme import colours
 from gui.widgets.plot import plot_widget, restyle
 

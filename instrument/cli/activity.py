@@ -8,15 +8,15 @@ from typing import Annotated
 
 import typer
 
-from instrument.activity import ActivitySettings, find_activity, write_activity
 from instrument.cli.app import command_app, examples, saying_what_is_left
 from instrument.cli.reconstruct_options import BinningOption, CalibrationOption, DistanceOption, PsfOption
-from instrument.errors import BenchError, FileError
-from instrument.reconstruction_request import Settings
-from instrument.reconstruction_words import parse_binning
-from instrument.store.layout import STATE
-from instrument.video.output import VideoPictures
-from instrument.volume_zarr import is_zarr_name
+from instrument.files.errors import BenchError, FileError
+from instrument.files.volume_zarr import is_zarr_name
+from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
+from instrument.reconstruction.request import Settings
+from instrument.reconstruction.video_output import VideoPictures
+from instrument.reconstruction.words import parse_binning
+from instrument.runs.layout import STATE
 
 app = command_app()
 
@@ -132,7 +132,7 @@ def _video(
     if not (path / STATE).exists():
         raise FileError(path, "is neither a reconstructed video (.ome.zarr) nor a run.")
     from instrument.cli.video import reconstruct_to_video
-    from instrument.video.reconstruction import VideoRequest
+    from instrument.reconstruction.video import VideoRequest
 
     out.mkdir(parents=True, exist_ok=True)
     request = VideoRequest(

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from calibration_routines.display_procedures import AlignmentProcedure, refuse_existing
-from calibration_routines.mask_alignment import AlignmentSettings
+from calibration_routines.display.display_procedures import AlignmentProcedure, refuse_existing
+from calibration_routines.display.mask_alignment import AlignmentSettings
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.sweeping import Told
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 app = command_app("Align the holographic display.")
 

@@ -9,7 +9,7 @@ import typer
 
 from instrument.cli.app import command_app, examples, saying_what_is_left
 from instrument.cli.progress import one_task
-from instrument.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError
 from recon.types import Calibration
 
 app = command_app()
@@ -95,12 +95,12 @@ def analyze(
     """
     import json
 
-    from calibration_routines.angular_response import load_response
-    from instrument.analysis_figure import draw_analysis, facts
-    from instrument.atomic import whole_file, write_text
-    from instrument.calibration_file import load_calibration
-    from instrument.figures import save_figure
-    from instrument.reconstruction_job import find_calibration
+    from calibration_routines.optics.angular_response import load_response
+    from instrument.evaluation.analysis_figure import draw_analysis, facts
+    from instrument.files.atomic import whole_file, write_text
+    from instrument.files.calibration_file import load_calibration
+    from instrument.files.figures import save_figure
+    from instrument.reconstruction.job import find_calibration
     from recon.analysis import AnalysisSettings, Noise, analyse
 
     if out.suffix.lower() not in _PAGES:

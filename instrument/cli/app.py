@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from instrument.bench import Bench
-    from instrument.config import BenchConfig
+    from instrument.bench.bench import Bench
+    from instrument.bench.config import BenchConfig
 
 BenchOption = Annotated[
     Path | None,
@@ -45,7 +45,7 @@ def examples(*lines: str) -> str:
 
 def load_and_say(bench: Path | None) -> BenchConfig:
     """Read the bench configuration; say on stderr when it is the built-in one."""
-    from instrument.config_file import DEFAULT_NAME, load_config
+    from instrument.bench.config_file import DEFAULT_NAME, load_config
 
     config = load_config(bench)
     if config.path is None:
@@ -61,7 +61,7 @@ def open_and_say(bench: Path | None, *, as_is: bool = False) -> Bench:
 
     With ``as_is`` nobody is asked: what the operator would have to do is said, and taken for done.
     """
-    from instrument.bench import open_bench
+    from instrument.bench.bench import open_bench
 
     opened = open_bench(load_and_say(bench), ask=_taken_for_done if as_is else operator())
     typer.echo(f"Bench: {opened.label}", err=True)
@@ -88,7 +88,7 @@ def _taken_for_done(request: str) -> None:
 @contextmanager
 def naming_as_is() -> Iterator[None]:
     """Let the error of a bench that needs an operator, where none is, name the option that does without."""
-    from instrument.errors import OperatorNeededError
+    from instrument.files.errors import OperatorNeededError
 
     try:
         yield

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calibration_routines.sweep_request import AxialRequest, LateralRequest, VolumeRequest
+from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
 from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.numbers import finite, positive
 from instrument.cli.sweeping import say_and_take
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 app = command_app("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
 

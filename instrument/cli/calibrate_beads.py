@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from calibration_routines.beads import (
+from calibration_routines.optics.beads import (
     BIN_FIRST,
     MANY_PX,
     BeadCalibration,
@@ -22,13 +22,13 @@ from calibration_routines.beads import (
     needed_geometry,
     window_for,
 )
-from calibration_routines.optics_procedures import BeadProcedure, bead_lines
-from instrument.calibration_file import save_calibration
+from calibration_routines.optics.optics_procedures import BeadProcedure, bead_lines
 from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.progress import progress_bar
 from instrument.cli.sweeping import Told
-from instrument.errors import BenchError, FileError
-from instrument.images import read_image
+from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_image
 from recon.blind import BlindSettings
 from recon.types import Geometry
 

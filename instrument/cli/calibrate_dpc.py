@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines.dpc import DpcSetup
-from calibration_routines.optics_procedures import DpcProcedure
+from calibration_routines.optics.dpc import DpcSetup
+from calibration_routines.optics.optics_procedures import DpcProcedure
 from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.sweeping import Told, print_lines
 

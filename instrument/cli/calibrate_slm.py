@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibration_routines.display_procedures import SlmProcedure, refuse_existing
+from calibration_routines.display.display_procedures import SlmProcedure, refuse_existing
 from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.sweeping import Told
 

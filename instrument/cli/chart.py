@@ -17,15 +17,15 @@ from instrument.cli.reconstruct_options import (
     DarkOption,
     PsfOption,
 )
-from instrument.errors import BenchError
-from instrument.reconstruction_words import parse_binning, parse_dark
+from instrument.files.errors import BenchError
+from instrument.reconstruction.words import parse_binning, parse_dark
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from instrument.chart.data import ChartData
-    from instrument.reconstruction_job import Job
-    from recon.chart.scored import Named, Point, Problem
+    from instrument.evaluation.chart_data import ChartData
+    from instrument.reconstruction.job import Job
+    from recon.evaluation.scored import Named, Point, Problem
 
 app = command_app()
 
@@ -188,8 +188,8 @@ def chart(
             "--bench": (bench is not None, ("--hologram",)),
         },
     )
-    from instrument.chart.figure import write_charts
-    from instrument.chart.problems import (
+    from instrument.evaluation.chart_figure import write_charts
+    from instrument.evaluation.chart_problems import (
         problem_of_calibrations,
         problem_of_job,
         problem_of_pictures,
@@ -287,9 +287,9 @@ def _job(
         raise BenchError("Your own chart needs --image FILE, and either --calibration FOLDER or --psf FILE.")
     if psf is not None and volume:
         raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
-    from instrument.preparation import Crop
-    from instrument.reconstruction_job import job_from_calibration, job_from_files
-    from instrument.volume_job import volume_job
+    from instrument.reconstruction.job import job_from_calibration, job_from_files
+    from instrument.reconstruction.preparation import Crop
+    from instrument.reconstruction.volume_job import volume_job
 
     window = None if crop is None else Crop.parse(crop)
     level, factor = parse_dark(dark), parse_binning(binning)
@@ -301,8 +301,8 @@ def _job(
 
 
 def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:
-    from instrument.chart.bench_photographs import OutOfTimeError, photographs
-    from recon.chart.calibration import CalibrationProblem
+    from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
+    from recon.evaluation.chart_calibration import CalibrationProblem
 
     out.mkdir(parents=True, exist_ok=True)
     path = out / "photographs.npz"
@@ -329,7 +329,7 @@ def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[
 
 
 def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
-    from instrument.chart.job import make_chart
+    from instrument.evaluation.chart_job import make_chart
 
     with saying_what_is_left(record), progress_bar() as bar:
         task = bar.add_task("settings", total=None, note="")
@@ -344,7 +344,7 @@ def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float
 
 def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
     """Say what the held-out pixels cannot tell from the best setting."""
-    from recon.chart.even import SETTLED_ITERATIONS
+    from recon.evaluation.even import SETTLED_ITERATIONS
 
     best, others = even[0], sorted({p.setting for p in even[1:]} - {even[0].setting})
     when = f"after {SETTLED_ITERATIONS} iterations or more" if on_the_way else group
@@ -361,7 +361,7 @@ def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
 
 
 def _told(point: Point) -> str:
-    from instrument.chart.words import in_words
+    from instrument.evaluation.chart_words import in_words
 
     # Pixel by pixel, as settings were compared; points are drawn by blocks, which every binning has.
     error = (sum(point.held_out_parts) / len(point.held_out_parts)) ** 0.5

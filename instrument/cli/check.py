@@ -16,9 +16,9 @@ from drivers.errors import DeviceError
 from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
-from instrument.bench import Bench
+from instrument.bench.bench import Bench
+from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import BenchOption, command_app, examples, load_and_say
-from instrument.safety import StepsFailedError
 
 app = command_app()
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples
-from instrument.errors import FileError
+from instrument.files.errors import FileError
 
 app = command_app()
 
@@ -38,10 +38,10 @@ def compare(
     from rich.console import Console
     from rich.table import Table
 
-    from instrument.atomic import write_text
-    from instrument.calibration_file import load_calibration
-    from instrument.plain_json import plain
-    from instrument.reconstruction_job import find_calibration
+    from instrument.files.atomic import write_text
+    from instrument.files.calibration_file import load_calibration
+    from instrument.files.plain_json import plain
+    from instrument.reconstruction.job import find_calibration
     from recon.analysis.compare import compare as compare_calibrations
 
     if out is not None and out.exists() and not force:

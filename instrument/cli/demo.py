@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
-from calibration_routines.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo_settings import DemoSettings
-from calibration_routines.sweep_words import exposure_lines, quality_lines
-from instrument.bench import Bench
+from calibration_routines.demo.demo import Advance, DemoResult, run_demo
+from calibration_routines.demo.demo_settings import DemoSettings
+from calibration_routines.psf.sweep_words import exposure_lines, quality_lines
+from instrument.bench.bench import Bench
 from instrument.cli.app import command_app, examples
 from instrument.cli.progress import one_task
 from instrument.cli.sweeping import describe_plan, print_lines

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from drivers.discovery import BUSES, FoundDevice
-from drivers.listing import Listing, list_devices
+from drivers.registry.discovery import BUSES, FoundDevice
+from drivers.registry.listing import Listing, list_devices
 from instrument.cli.app import command_app, examples
 
 app = command_app()

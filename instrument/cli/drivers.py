@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from drivers.registry import KINDS, driver_names, registration_mistakes
+from drivers.registry.registry import KINDS, driver_names, registration_mistakes
 from instrument.cli.app import command_app, examples
 
 app = command_app()

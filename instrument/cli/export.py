@@ -9,13 +9,13 @@ import typer
 
 from instrument.cli.app import command_app, examples
 from instrument.cli.progress import one_task, progress_bar
-from instrument.errors import BenchError
-from instrument.export import export as export_run
-from instrument.plane_steps import uneven_steps
-from instrument.result_export import export_result
-from instrument.store import Run
-from instrument.stored_result import open_result
-from instrument.volume_zarr import is_zarr_name
+from instrument.files.errors import BenchError
+from instrument.files.plane_steps import uneven_steps
+from instrument.files.volume_zarr import is_zarr_name
+from instrument.reconstruction.result_export import export_result
+from instrument.reconstruction.stored_result import open_result
+from instrument.runs.export import export as export_run
+from instrument.runs.run import Run
 
 app = command_app()
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples, load_and_say
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 app = command_app()
 

@@ -10,14 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from instrument.alignment_file import load_alignment
+from instrument.bench.display_setup import bench_display, slm_size
 from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
 from instrument.cli.hologram_output import tell
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
-from instrument.display_setup import bench_display, slm_size
-from instrument.errors import BenchError
-from instrument.hologram_file import HologramFiles
-from instrument.hologram_job import (
+from instrument.display.hologram_file import HologramFiles
+from instrument.display.hologram_job import (
     HologramRequest,
     HologramResult,
     foveal,
@@ -25,7 +23,9 @@ from instrument.hologram_job import (
     read_weights,
     run_request,
 )
-from instrument.images import Pixels, read_image, read_stack
+from instrument.files.alignment_file import load_alignment
+from instrument.files.errors import BenchError
+from instrument.files.images import Pixels, read_image, read_stack
 from recon.holography import Budget, Display, HologramRecord, HologramStop, Target
 from recon.holography.optimise import Method
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from instrument.hologram_job import HologramRequest, HologramResult
+from instrument.display.hologram_job import HologramRequest, HologramResult
 
 
 def tell(label: str, result: HologramResult, request: HologramRequest) -> None:

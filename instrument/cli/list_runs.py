@@ -9,10 +9,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from instrument.bench.config_file import load_config
 from instrument.cli.app import BenchOption, command_app, examples
-from instrument.config_file import load_config
-from instrument.errors import FileError
-from instrument.store.catalogue import run_paths, summary
+from instrument.files.errors import FileError
+from instrument.runs.catalogue import run_paths, summary
 
 app = command_app()
 

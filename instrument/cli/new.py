@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.atomic import write_text
+from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
 from instrument.cli.app import command_app, examples
-from instrument.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
-from instrument.errors import BenchError, FileError
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, FileError
 
 app = command_app()
 

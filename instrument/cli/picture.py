@@ -6,16 +6,16 @@ from pathlib import Path
 
 import typer
 
-from instrument.checkpoint import CheckpointFolder
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
-from instrument.kept_request import checkpoint_for, settle_checkpoint
-from instrument.reconstruction_file import Outputs, write_reconstruction
-from instrument.reconstruction_job import Job
-from instrument.reconstruction_request import PICTURE_ITERATIONS, PictureRequest
-from recon.auto import Choice
-from recon.result import Reconstruction
+from instrument.files.checkpoint import CheckpointFolder
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.request import PICTURE_ITERATIONS, PictureRequest
+from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from recon.reconstruction.choice import Choice
+from recon.reconstruction.result import Reconstruction
 from recon.solvers.stopping import IterationRecord, StopReason
 
 
@@ -79,7 +79,9 @@ def _solve(job: Job, request: PictureRequest, keeper: CheckpointFolder | None) -
 def _write(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) -> None:
     write_reconstruction(outputs, result, job, rotate_deg=rotate_deg)
     if outputs.figure is not None:
-        from instrument.reconstruction_figure import write_figure  # matplotlib, only where it is wanted
+        from instrument.reconstruction.result_figure import (
+            write_figure,  # matplotlib, only where it is wanted
+        )
 
         write_figure(outputs.figure, result, job, rotate_deg=rotate_deg)
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")

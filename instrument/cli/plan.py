@@ -9,15 +9,15 @@ from typing import Annotated
 
 import typer
 
-from instrument.acquire import abilities_of
-from instrument.atomic import write_text
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
-from instrument.errors import BenchError, FileError
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.files.formatting import duration, size
 from instrument.plan import BenchAbilities, Plan, check, estimate
 from instrument.plan.drawing import draw_path
 from instrument.plan.file import load_plan, save_plan
 from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
-from instrument.words import duration, size
+from instrument.runs.acquire import abilities_of
 
 app = command_app("Look at a plan before anything moves, or write one to start from.")
 

@@ -54,9 +54,9 @@ from instrument.cli.reconstruct_options import (
     WorkersOption,
     parse_settings,
 )
-from instrument.errors import BenchError
-from instrument.reconstruction_file import Outputs
-from instrument.reconstruction_request import PictureRequest, VolumeRequest, known_device
+from instrument.files.errors import BenchError
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, known_device
+from instrument.reconstruction.result_file import Outputs
 
 app = command_app()
 
@@ -203,7 +203,7 @@ def reconstruct(
                 "diffuserbench reconstruct RUN --patterned SHEET --calibration FOLDER"
             )
         from instrument.cli.patterned import reconstruct_to_patterned
-        from instrument.patterned import PatternedRequest
+        from instrument.reconstruction.patterned import PatternedRequest
 
         reconstruct_to_patterned(
             PatternedRequest(
@@ -253,8 +253,8 @@ def reconstruct(
         if given := [option for option, is_given in no_videos.items() if is_given]:
             raise BenchError(f"With --video these do not apply: {', '.join(given)}. Leave them out.")
         from instrument.cli.video import reconstruct_to_video
-        from instrument.video.reconstruction import VideoRequest
-        from recon.video.joint import OVER_TIME
+        from instrument.reconstruction.video import VideoRequest
+        from recon.streams.joint import OVER_TIME
 
         chosen = next((name for name in OVER_TIME if name == over_time), None)
         if over_time is not None and chosen is None:

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.mosaic import mosaic_named
-from instrument.preparation import Crop
-from instrument.reconstruction_request import PICTURE_ITERATIONS, Settings, known_model
-from instrument.reconstruction_words import (
+from instrument.reconstruction.mosaic import mosaic_named
+from instrument.reconstruction.preparation import Crop
+from instrument.reconstruction.request import PICTURE_ITERATIONS, Settings, known_model
+from instrument.reconstruction.words import (
     parse_binning,
     parse_dark,
     parse_erasures,

@@ -10,10 +10,10 @@ import typer
 from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
-from instrument.recorder import RecordingStatus
-from instrument.recording import prepare_recording
-from instrument.store import Run
-from instrument.words import duration, size
+from instrument.files.formatting import duration, size
+from instrument.runs.recorder import RecordingStatus
+from instrument.runs.recording import prepare_recording
+from instrument.runs.run import Run
 
 app = command_app()
 

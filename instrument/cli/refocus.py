@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 app = command_app()
 
@@ -40,10 +40,10 @@ def refocus(
 
     import numpy as np
 
-    from instrument.calibration_file import load_calibration, save_calibration
-    from instrument.reconstruction_job import find_calibration
-    from recon.refocus import central_places
-    from recon.refocus import refocus as refocused
+    from instrument.files.calibration_file import load_calibration, save_calibration
+    from instrument.reconstruction.job import find_calibration
+    from recon.camera.refocus import central_places
+    from recon.camera.refocus import refocus as refocused
 
     if not all(0 < z < float("inf") for z in z_mm):
         raise BenchError("--z-mm: depths are above 0 mm, from the diffuser.")

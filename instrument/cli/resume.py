@@ -9,17 +9,18 @@ import typer
 from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
-from calibration_routines.plan_procedures import finish_simple
-from calibration_routines.sweep import FOLDER
-from calibration_routines.sweep_words import event_lines
-from instrument.bench import Bench
+from calibration_routines.psf.plan_procedures import finish_simple
+from calibration_routines.psf.sweep import FOLDER
+from calibration_routines.psf.sweep_words import event_lines
+from instrument.bench.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import one_task, progress_bar
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.cli.sweeping import describe_result, print_lines
-from instrument.resume import prepare_resume
-from instrument.store import FinishReason, Run, RunCondition, RunWriter
-from instrument.store.layout import BENCH_TOML
+from instrument.runs.layout import BENCH_TOML, FinishReason, RunCondition
+from instrument.runs.resume import prepare_resume
+from instrument.runs.run import Run
+from instrument.runs.writer import RunWriter
 
 app = command_app()
 

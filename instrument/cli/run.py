@@ -14,7 +14,7 @@ import typer
 
 from drivers.errors import DeviceError, LimitError
 from instrument.cli.commands import Command
-from instrument.errors import BenchError, in_words
+from instrument.files.errors import BenchError, in_words
 
 DEBUG_VARIABLE = "DIFFUSERBENCH_DEBUG"
 INTERRUPTED = 130

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from instrument.acquire import abilities_of, prepare
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.plan import check
 from instrument.plan.file import load_plan
+from instrument.runs.acquire import abilities_of, prepare
 
 app = command_app()
 

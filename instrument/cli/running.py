@@ -6,15 +6,16 @@ import time
 
 import typer
 
-from instrument.acquire import free_bytes
-from instrument.bench import Bench
+from instrument.bench.bench import Bench
+from instrument.bench.safety import StepsFailedError
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
+from instrument.files.formatting import duration, size
 from instrument.plan import Plan
-from instrument.runner import Runner, RunState, RunStatus
-from instrument.safety import StepsFailedError
-from instrument.store import Run, RunCondition
-from instrument.words import duration, size
+from instrument.runs.acquire import free_bytes
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
+from instrument.runs.runner import Runner, RunState, RunStatus
 
 
 def home_if_needed(bench: Bench, plan: Plan) -> None:

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import command_app, examples
-from instrument.run_picture import contact_sheet
-from instrument.store import Run
-from instrument.words import size
+from instrument.files.formatting import size
+from instrument.runs.run import Run
+from instrument.runs.run_picture import contact_sheet
 
 app = command_app()
 

@@ -9,22 +9,22 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from calibration_routines.display_io import DisplayBench, bring_mask
-from calibration_routines.hologram_photograph import (
+from calibration_routines.display.display_io import DisplayBench, bring_mask
+from calibration_routines.display.hologram_photograph import (
     display_of_pattern,
     envelope_of_pattern,
     photograph_hologram,
     write_capture,
     write_refined,
 )
-from instrument.alignment_file import Alignment, load_alignment
-from instrument.bench import Bench
+from instrument.bench.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
-from instrument.errors import BenchError, FileError
-from instrument.hologram_job import prepare_target
-from instrument.images import read_image
-from instrument.slm_correction import load_slm_correction
-from instrument.slm_image import levels_phase, read_slm_image
+from instrument.display.hologram_job import prepare_target
+from instrument.files.alignment_file import Alignment, load_alignment
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_image
+from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import levels_phase, read_slm_image
 
 app = command_app()
 

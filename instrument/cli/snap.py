@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from instrument.bench import Bench
+from instrument.bench.bench import Bench
+from instrument.bench.photograph import Snapshot
 from instrument.cli.app import (
     BenchOption,
     command_app,
@@ -18,8 +19,7 @@ from instrument.cli.app import (
     saying_what_is_left,
 )
 from instrument.cli.progress import progress_bar
-from instrument.photograph import Snapshot
-from instrument.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
+from instrument.runs.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
 
 app = command_app()
 

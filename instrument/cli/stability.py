@@ -11,7 +11,7 @@ import typer
 
 from instrument.cli.app import command_app, examples, saying_what_is_left
 from instrument.cli.progress import progress_bar
-from instrument.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError
 
 app = command_app()
 
@@ -63,8 +63,8 @@ def stability(
     For each map a PNG, and stability.json with all of them. Ctrl-C keeps what is done; the same command goes
     on from there. What counts as failure, and what each map says, is in docs/stability.md.
     """
-    from recon.stability.catalogue import MAPS, map_named
-    from recon.stability.run import cells_of, run_map
+    from recon.evaluation.catalogue import MAPS, map_named
+    from recon.evaluation.stability_run import cells_of, run_map
 
     chosen = [map_named(name) for name in names] if names else list(MAPS.values())
     if list_maps:
@@ -83,7 +83,7 @@ def stability(
         known = sorted({m for s in (map_named(n) for n in wanted) for m in s.methods})
         raise BenchError(f"No map has the method {', '.join(method or [])}. Methods: {'; '.join(known)}.")
     _make(out)
-    from instrument.stability_file import RESULT, CellLog, map_record, write_stability
+    from instrument.files.stability_file import RESULT, CellLog, map_record, write_stability
 
     log = CellLog(out)
     jobs = {s.name: cells_of(s, size.value, wanted[s.name]) for s in chosen}
@@ -115,17 +115,17 @@ def _make(folder: Path) -> None:
 
 
 def _draw(record: dict[str, object], picture: Path) -> None:
-    from instrument.atomic import whole_file
-    from instrument.figures import save_figure
-    from instrument.stability_figure import map_figure
+    from instrument.evaluation.stability_figure import map_figure
+    from instrument.files.atomic import whole_file
+    from instrument.files.figures import save_figure
 
     with whole_file(picture) as temporary:
         save_figure(map_figure(record), temporary)
 
 
 def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
-    from instrument.stability_file import RESULT, read_stability
-    from recon.stability.shipped import shipped_file
+    from instrument.files.stability_file import RESULT, read_stability
+    from recon.verdict.shipped import shipped_file
 
     maps = read_stability(shipped_file() if shipped else out / RESULT)["maps"]
     if missing := [n for n in names or () if n not in maps]:

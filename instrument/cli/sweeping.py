@@ -20,16 +20,16 @@ from calibration_routines import (
     sweep_plan,
 )
 from calibration_routines.procedure import Listener
-from calibration_routines.sweep_plan import DARK, depths_um, reference_point
-from calibration_routines.sweep_procedure import take_sweep
-from calibration_routines.sweep_request import SweepRequest
-from calibration_routines.sweep_words import event_lines, event_note, exposure_lines, quality_lines
-from instrument.acquire import abilities_of
-from instrument.bench import Bench
+from calibration_routines.psf.sweep_plan import DARK, depths_um, reference_point
+from calibration_routines.psf.sweep_procedure import take_sweep
+from calibration_routines.psf.sweep_request import SweepRequest
+from calibration_routines.psf.sweep_words import event_lines, event_note, exposure_lines, quality_lines
+from instrument.bench.bench import Bench
 from instrument.cli.progress import progress_bar
+from instrument.files.formatting import count
 from instrument.plan import Plan, estimate
-from instrument.runner import RunStatus
-from instrument.words import count
+from instrument.runs.acquire import abilities_of
+from instrument.runs.runner import RunStatus
 
 _MUCH_BYTES = 10e9  # of a sweep, above which the plan says how to need less
 

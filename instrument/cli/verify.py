@@ -11,8 +11,8 @@ from rich.progress import Progress
 
 from instrument.cli.app import command_app, examples
 from instrument.cli.progress import progress_bar
-from instrument.store import Run
-from instrument.verification import verify as verify_run
+from instrument.runs.run import Run
+from instrument.runs.verification import verify as verify_run
 
 app = command_app()
 

@@ -7,16 +7,16 @@ import time
 import typer
 
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
-from instrument.video.block import BlockReport
-from instrument.video.crew import require_crew
-from instrument.video.reconstruction import (
+from instrument.files.formatting import duration
+from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
     finish_video,
     prepare_video,
     solve_video,
 )
-from instrument.words import duration
+from instrument.reconstruction.video_block import BlockReport
+from instrument.reconstruction.video_workers import require_crew
 
 
 def reconstruct_to_video(

@@ -10,11 +10,11 @@ from instrument.cli.app import saying_what_is_left
 from instrument.cli.picture import tell_choice
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
-from instrument.kept_request import checkpoint_for, settle_checkpoint
-from instrument.plane_steps import uneven_steps
-from instrument.reconstruction_file import Outputs
-from instrument.reconstruction_request import VOLUME_ITERATIONS, VolumeRequest
-from instrument.volume_file import write_volume
+from instrument.files.plane_steps import uneven_steps
+from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.request import VOLUME_ITERATIONS, VolumeRequest
+from instrument.reconstruction.result_file import Outputs
+from instrument.reconstruction.volume_file import write_volume
 from recon.solvers.stopping import IterationRecord, StopReason
 
 

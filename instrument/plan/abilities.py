@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.stage import StageAxis
-from instrument.errors import FileError
+from instrument.files.errors import FileError
 from instrument.plan.errors import PlanError
 from instrument.plan.model import Plan, Step
 from instrument.plan.positions import SourcePosition

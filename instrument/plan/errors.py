@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 
 class PlanError(BenchError):

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from instrument.atomic import write_text
-from instrument.errors import FileError
+from instrument.files.atomic import write_text
+from instrument.files.errors import FileError
 from instrument.plan.errors import PlanError
 from instrument.plan.model import Plan
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 from instrument.plan.model import OFF, Light, Part, Plan
 
 DARK, PATTERN = "dark", "pattern"
@@ -24,7 +24,8 @@ def illumination_plan(
     """Return a plan that photographs the scene lit by each group of LEDs in turn.
 
     The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
-    :func:`recon.patterned.reconstruct_patterned` takes; :mod:`instrument.patterned` reads them from runs.
+    :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
+    :mod:`instrument.reconstruction.patterned` reads them from runs.
 
     Parameters
     ----------

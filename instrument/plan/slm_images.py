@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from instrument.errors import FileError
+from instrument.files.errors import FileError
 
 
 def read_slm_image(path: Path) -> npt.NDArray[np.uint8]:

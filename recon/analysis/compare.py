@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate, cut_to_light, similarity
+from recon.camera.refocus import central_psfs, refocus
+from recon.camera.registration import register
 from recon.errors import InputError
-from recon.refocus import central_psfs, refocus
-from recon.registration import register
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
+from recon.base import fft
+from recon.camera.refocus import rescaled
 from recon.errors import InputError
-from recon.refocus import rescaled
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]

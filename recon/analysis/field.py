@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate
+from recon.camera.camera_model import members_of_depths
+from recon.camera.registration import register
 from recon.errors import InputError
-from recon.registration import register
 from recon.types import Calibration
-from recon.volume.model import members_of_depths
 
 Array = npt.NDArray[Any]
 

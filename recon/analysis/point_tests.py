@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
 from recon.analysis.points import Noise, PointImage, Trial, smallest_resolved, try_points
 from recon.analysis.window import WindowProblem
-from recon.refocus import refocus
+from recon.base import fft
+from recon.camera.refocus import refocus
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]

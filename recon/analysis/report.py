@@ -36,11 +36,11 @@ from recon.analysis.sampling import (
     lateral_spacing_um,
     voxel_grid,
 )
+from recon.camera.camera_model import choose_model, sort_by_depth
+from recon.camera.refocus import central_psfs, refocus
 from recon.errors import InputError
 from recon.optics.fall_off import FallOff
-from recon.refocus import central_psfs, refocus
 from recon.types import Calibration
-from recon.volume.model import choose_model, sort_by_depth
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]

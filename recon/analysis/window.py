@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
+from recon.base import fft
 from recon.errors import InputError
 
 Array = npt.NDArray[Any]

@@ -18,11 +18,11 @@ from recon.blind.point_step import Points
 from recon.blind.polish import points_on_grid, polish
 from recon.blind.psf_step import BeadMixer, solve_psfs
 from recon.blind.start import first_psf, offset_of
+from recon.camera.interpolation import interpolation_weights
+from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
+from recon.camera.registration import shifted
 from recon.errors import InputError
-from recon.operators.interpolation import interpolation_weights
-from recon.operators.local_convolution import FieldOfPsfs, field_of, local_convolution
 from recon.priors import L1, NonNegativity
-from recon.registration import shifted
 from recon.solvers import Fista, StoppingRules
 
 Array = npt.NDArray[Any]

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.blind.point_step import Points
+from recon.camera.registration import LOCAL_MEAN_PX
 from recon.errors import InputError
-from recon.registration import LOCAL_MEAN_PX
 
 Floats = npt.NDArray[np.float32]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
+from recon.base import fft
 from recon.blind.field_functions import FieldFunctions
 from recon.blind.point_step import Points
-from recon.operators.local_convolution import field_of
+from recon.camera.local_convolution import field_of
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

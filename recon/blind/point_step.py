@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
+from recon.base import fft
 from recon.blind.field_functions import FieldFunctions
 
 Array = npt.NDArray[np.float32]

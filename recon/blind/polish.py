@@ -143,7 +143,7 @@ def _better_points(
 
 def _centred(psfs: Floats, beads: Sequence[Points]) -> tuple[Floats, tuple[Points, ...]]:
     """Give the mean PSF unit light, centred on the centre pixel; the beads go the other way."""
-    from recon.registration import shifted
+    from recon.camera.registration import shifted
 
     rows, columns = offset_of(np.maximum(psfs[0], 0)[None])
     light = float(psfs[0].sum(dtype=np.float64))

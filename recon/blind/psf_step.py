@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
-from recon.operators.base import Array
-from recon.operators.local_convolution import field_of
+from recon.base import fft
+from recon.camera.base import Array
+from recon.camera.local_convolution import field_of
 
 Floats = npt.NDArray[np.float32]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import displacement, shifted
+from recon.camera.registration import displacement, shifted
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

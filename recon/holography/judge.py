@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.metrics import psnr, ssim
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.target import Target
-from recon.metrics import psnr, ssim
 
 Array = npt.NDArray[Any]
 

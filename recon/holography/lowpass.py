@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.fft import fast_length
 from recon.errors import InputError
-from recon.fft import fast_length
 
 Grid = Literal["alias_free", "dissertation"]
 

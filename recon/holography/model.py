@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.fft import irfft, rfft
+from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
-from recon.fft import irfft, rfft
 from recon.holography.display import Display
 from recon.holography.lowpass import Grid, make_band
 from recon.holography.target import Loss, Target
-from recon.threads import get_threads, in_blocks
 
 ComplexArray = npt.NDArray[Any]
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
+from recon.base.metrics import psnr
 from recon.holography.display import Display
 from recon.holography.judge import low_pass
 from recon.holography.lowpass import make_band
@@ -20,7 +21,6 @@ from recon.holography.model import HologramModel
 from recon.holography.optimise import Budget, compute_hologram
 from recon.holography.pose import Pose
 from recon.holography.target import Target
-from recon.metrics import psnr
 
 Array = npt.NDArray[Any]
 

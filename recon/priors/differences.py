@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.operators.base import Array, LinearOperator
+from recon.camera.base import Array, LinearOperator
 
 
 class Differences(LinearOperator):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.operators.base import Array
+from recon.camera.base import Array
 from recon.priors.base import Prior
 from recon.priors.differences import Differences
 from recon.priors.simple import Separable, Zero

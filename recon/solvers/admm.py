@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from recon.operators.base import Array, LinearOperator
-from recon.operators.convolution import PadCropConvolution
+from recon.camera.base import Array, LinearOperator
+from recon.camera.convolution import PadCropConvolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import Solver
@@ -51,7 +51,7 @@ class Penalties:
 
 
 class Admm(Solver):
-    """ADMM for a (masked) :class:`~recon.operators.PadCropConvolution`.
+    """ADMM for a (masked) :class:`~recon.camera.convolution.PadCropConvolution`.
 
     Parameters
     ----------

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon import fft
-from recon.operators.base import Array
+from recon.base import fft
+from recon.camera.base import Array
 
 EXACT_MODES = 18
 """Lowest cosine modes per axis that are inverted together: their matrix has 324 rows."""

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from recon import fft
-from recon.operators.base import Array
-from recon.operators.convolution import PadCropConvolution
+from recon.base import fft
+from recon.base.threads import over_rows
+from recon.camera.base import Array
+from recon.camera.convolution import PadCropConvolution
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
-from recon.threads import over_rows
 
 
 class DataSplit:

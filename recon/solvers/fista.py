@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from recon.operators.base import Array, LinearOperator
+from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior
 from recon.solvers.base import Solver
 from recon.solvers.stopping import IterationRecord

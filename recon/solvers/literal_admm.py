@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.operators.base import Array, LinearOperator
+from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior
 from recon.priors.differences import Differences
 from recon.solvers.base import Solver

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from recon.base.threads import in_blocks
+from recon.camera.base import Array
 from recon.errors import StructureError
-from recon.operators.base import Array
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
 from recon.priors.sums import sum_of
 from recon.priors.total_variation import TotalVariation
-from recon.threads import in_blocks
 
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""

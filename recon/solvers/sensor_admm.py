@@ -27,10 +27,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from recon import fft
-from recon.operators.base import Array, LinearOperator
-from recon.operators.convolution import PadCropConvolution
-from recon.operators.erasures import Erasures
+from recon.base import fft
+from recon.base.threads import over_rows
+from recon.camera.base import Array, LinearOperator
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.erasures import Erasures
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import Solver
@@ -38,7 +39,6 @@ from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_
 from recon.solvers.prior_splits import PriorSplits
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.structure import as_cropped_convolution
-from recon.threads import over_rows
 
 BALANCING = (3, 6, 12, 24, 48, 96, 192)
 """Iterations before which the penalties are balanced; fixed after the last, so that convergence is sure."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recon.camera.base import Array, Composition, LinearOperator
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.erasures import Erasures
 from recon.errors import StructureError
-from recon.operators.base import Array, Composition, LinearOperator
-from recon.operators.convolution import PadCropConvolution
-from recon.operators.erasures import Erasures
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 
-from recon import fft
+from recon.base import fft
+from recon.camera.base import Array, LinearOperator
 from recon.errors import StructureError
-from recon.operators.base import Array, LinearOperator
 from recon.solvers.base import Outcome
 from recon.solvers.stopping import StopReason
 from recon.solvers.structure import CroppedConvolution, as_cropped_convolution

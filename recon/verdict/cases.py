@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.stability.shipped import shipped_maps
+from recon.verdict.shipped import shipped_maps
 
 Floats = npt.NDArray[np.float64]
 

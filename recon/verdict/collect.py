@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.checks import as_channels, saturated_share
+from recon.base.checks import as_channels, saturated_share
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
 from recon.verdict.evidence import Evidence, averaged, measure
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon import fft
+from recon.base import fft
 from recon.verdict.content import lit_and_edges, points_of
 
 Array = npt.NDArray[Any]

@@ -8,14 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.angular import AngularSweep, check_angular, farthest_um, measure_angular_response
-from calibration_routines.angular_response import AngularResponse, Curve, load_response
+from calibration_routines.optics.angular import (
+    AngularSweep,
+    check_angular,
+    farthest_um,
+    measure_angular_response,
+)
+from calibration_routines.optics.angular_response import AngularResponse, Curve, load_response
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench import Bench, open_bench
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
 from instrument.cli import main
-from instrument.config_file import parse_config
-from instrument.errors import BenchError, FileError
-from instrument.runner import RunStatus
+from instrument.files.errors import BenchError, FileError
+from instrument.runs.runner import RunStatus
 from recon.optics.fall_off import gaussian_fall_off
 
 TINY = """

@@ -19,13 +19,13 @@ from calibration_routines import (
     sweep_plan,
 )
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench import Bench, open_bench
-from instrument.calibration_file import load_calibration
-from instrument.config_file import parse_config
-from instrument.errors import BenchError
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import BenchError
 from instrument.plan import PlanError
-from instrument.runner import RunStatus
-from instrument.store import RunCondition
+from instrument.runs.layout import RunCondition
+from instrument.runs.runner import RunStatus
 from recon.types import Geometry
 
 TINY = """

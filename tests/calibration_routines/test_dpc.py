@@ -10,14 +10,22 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.dpc import DpcSetup, dpc_optics, measure_diffuser
+from calibration_routines.optics.dpc import DpcSetup, dpc_optics, measure_diffuser
 from drivers.simulated.led_microscope import LedMicroscopeWorld
-from instrument.bench import Bench, open_bench
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import led_microscope_text, parse_config
 from instrument.cli import main
-from instrument.config_file import led_microscope_text, parse_config
-from instrument.errors import BenchError
-from instrument.runner import RunStatus
-from recon.dpc import SIDES, DpcOptics, deflections_deg, level, phase_from_halves, slopes_deg, transfer
+from instrument.files.errors import BenchError
+from instrument.runs.runner import RunStatus
+from recon.analysis.dpc import (
+    SIDES,
+    DpcOptics,
+    deflections_deg,
+    level,
+    phase_from_halves,
+    slopes_deg,
+    transfer,
+)
 from recon.errors import InputError
 from recon.optics.led_microscope import led_image
 

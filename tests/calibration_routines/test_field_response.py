@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calibration_routines import CalibrationError
-from calibration_routines.field_response import fit_field_response, measure_field_response
-from instrument.bench import open_bench
-from instrument.config_file import parse_config
+from calibration_routines.psf.field_response import fit_field_response, measure_field_response
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import PlanError
 
 PLACES = [(0.0, 0.0, 1e5), (3e4, 0.0, 1e5), (-3e4, 0.0, 1e5), (0.0, 2e4, 1e5), (0.0, -2e4, 1e5)]

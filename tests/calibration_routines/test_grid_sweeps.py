@@ -26,23 +26,23 @@ from calibration_routines import (
     photograph,
     watch_resumed,
 )
-from calibration_routines.drift import judge_drift
-from calibration_routines.feature_size import feature_size_px, optical_binning
-from calibration_routines.stage_fit import fit_stage
-from calibration_routines.sweep_record import read_retakes
+from calibration_routines.display.stage_fit import fit_stage
+from calibration_routines.psf.drift import judge_drift
+from calibration_routines.psf.feature_size import feature_size_px, optical_binning
+from calibration_routines.psf.sweep_record import read_retakes
 from drivers.simulated.world import SimulatedWorld
-from instrument.bench import Bench, open_bench
-from instrument.calibration_file import load_calibration
-from instrument.config_file import parse_config
-from instrument.errors import BenchError
-from instrument.resume import prepare_resume
-from instrument.runner import Runner, RunStatus
-from instrument.store import FinishReason, RunCondition
-from recon import metrics
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import BenchError
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.resume import prepare_resume
+from instrument.runs.runner import Runner, RunStatus
+from recon.base import metrics
+from recon.camera.camera_model import ModelName
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
+from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Geometry
-from recon.volume.model import ModelName
-from recon.volume.reconstruct import reconstruct_volume
 
 TINY = """
 [camera]

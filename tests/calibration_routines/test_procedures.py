@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 
 from calibration_routines import CalibrationError
-from calibration_routines.axial_exposure import SweepExposures
 from calibration_routines.errors import RunEndedError
-from calibration_routines.optics_procedures import AngularProcedure
-from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
+from calibration_routines.optics.optics_procedures import AngularProcedure
 from calibration_routines.procedure import Listener, Outcome
-from calibration_routines.sweep_procedure import SweepProcedure
-from calibration_routines.sweep_request import AxialRequest, LateralRequest, VolumeRequest
-from instrument.bench import Bench, open_bench
-from instrument.config_file import parse_config
-from instrument.errors import SettingsError
+from calibration_routines.psf.axial_exposure import SweepExposures
+from calibration_routines.psf.plan_procedures import PlanProcedure, ResumeProcedure
+from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.files.errors import SettingsError
 from instrument.plan import Part, Plan, PlanError
-from instrument.run_control import EndedEarlyError, RunControl
-from instrument.runner import RunState, RunStatus
-from instrument.store import FinishReason, Run, RunCondition
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.run import Run
+from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.runner import RunState, RunStatus
 
 TINY = """
 [camera]

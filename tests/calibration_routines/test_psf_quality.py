@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.psf_quality import judge_sweep, measure_psf, temporal_noise
+from calibration_routines.psf.psf_quality import judge_sweep, measure_psf, temporal_noise
 
 D_UM = 8_900.0
 SHAPE = (256, 320)

@@ -14,8 +14,8 @@ import pytest
 
 from drivers.aravis.camera import AravisCamera
 from drivers.camera import Roi
-from drivers.claim import DeviceBusyError
 from drivers.errors import DeviceError, DeviceLostError, LimitError
+from drivers.registry.claim import DeviceBusyError
 from drivers.testing.camera import CameraContract
 from tests.mocks.gige_cameras import (
     ADDRESS,

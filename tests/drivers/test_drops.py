@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.drops import FrameNumberCounter, TimestampCounter
+from drivers.common.drops import FrameNumberCounter, TimestampCounter
 
 
 def test_frame_numbers_count_exactly() -> None:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.common.framing import LineFramer, Verdict
 from drivers.errors import DeviceError
-from drivers.framing import LineFramer, Verdict
 from drivers.grbl.protocol import (
     Report,
     is_banner,

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.common.framing import LineFramer, Verdict
 from drivers.errors import DeviceError
-from drivers.framing import LineFramer, Verdict
 from drivers.illuminate.dialect import Firmware1, Firmware2, dialect_of
 from drivers.illuminate.geometry import read_geometry
 from drivers.illuminate.link import Link

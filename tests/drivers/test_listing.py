@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from serial.tools import list_ports
 
-from drivers import buses, listing
-from drivers.claim import Claim
 from drivers.device import Device, port_claim
-from drivers.discovery import FoundDevice
 from drivers.dlpc900.link import HidLink
 from drivers.errors import DeviceError
-from drivers.listing import Listing, list_devices
+from drivers.registry import buses, listing
+from drivers.registry.claim import Claim
+from drivers.registry.discovery import FoundDevice
+from drivers.registry.listing import Listing, list_devices
 from instrument.cli.devices import _words
 
 

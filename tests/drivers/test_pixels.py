@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from drivers.pixels import Packing, PixelFormat, genicam_format, unpack
+from drivers.common.pixels import Packing, PixelFormat, genicam_format, unpack
 
 
 def _bits(value: int, n: int) -> list[int]:

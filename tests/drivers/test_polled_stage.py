@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 import pytest
 
+from drivers.common.polled_stage import PolledStage, StageState
 from drivers.device import DeviceIdentity, DriverOptions
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.polled_stage import PolledStage, StageState
 from drivers.stage import StageAxis
 from drivers.testing.stage import StageContract
 

@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import pytest
 from serial.tools import list_ports
 
-from drivers import buses, listing
 from drivers.apt.stage import AptStage
 from drivers.grbl.stage import GrblStage
 from drivers.illuminate.led_array import IlluminateLedArray
-from drivers.listing import list_devices
+from drivers.registry import buses, listing
+from drivers.registry.listing import list_devices
 from drivers.zaber.stage import ZaberStage
-from instrument.config_file import load_config
-from instrument.errors import ConfigError
+from instrument.bench.config_file import load_config
+from instrument.files.errors import ConfigError
 from tests.mocks.grbl_controller import GrblController
 from tests.mocks.illuminate_emulator import IlluminateEmulator
 from tests.mocks.pty_device import PtyDevice

@@ -156,7 +156,8 @@ def test_without_qt_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPat
 
 def test_the_driver_can_be_configured_without_qt() -> None:
     code = (
-        "import sys; from drivers.registry import load_driver; load_driver('slm', 'second_display'); "
+        "import sys; from drivers.registry.registry import load_driver; "
+        "load_driver('slm', 'second_display'); "
         "print([name for name in sys.modules if name.startswith('PySide6')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)

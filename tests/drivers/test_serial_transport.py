@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.claim import Claim
+from drivers.common.framing import LineFramer, Verdict, reply_line, reply_until
+from drivers.common.serial_transport import SerialTransport
 from drivers.device import port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
-from drivers.framing import LineFramer, Verdict, reply_line, reply_until
-from drivers.serial_transport import SerialTransport
+from drivers.registry.claim import Claim
 from tests.mocks.pty_device import Answer, PtyDevice
 
 PONG = reply_line(rb"PONG")
@@ -152,7 +152,9 @@ def test_messages_of_no_command_are_handed_on(device: PtyDevice) -> None:
 def test_a_device_that_never_stops_talking_is_an_error_not_a_hang(
     device: PtyDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.serial_transport._QUIET_S", 1.0)  # no pause of a busy machine is that long
+    monkeypatch.setattr(
+        "drivers.common.serial_transport._QUIET_S", 1.0
+    )  # no pause of a busy machine is that long
     port = SerialTransport(str(device.link), "stage (test)", probe=PROBE, timeout_s=0.2)
     port.open()
     babbling = threading.Event()
@@ -247,7 +249,7 @@ def test_a_cable_pulled_while_a_reply_is_awaited_ends_the_wait(
 
 HOLDER = """
 import sys
-from drivers.claim import Claim
+from drivers.registry.claim import Claim
 claim = Claim(sys.argv[1], "stage")
 print("held", flush=True)
 sys.stdin.read()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from drivers.common.stage_axes import AXIS_NAMES
 from drivers.device import Device
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.camera_settings import CameraOptions
@@ -12,7 +13,6 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, SimulatedStage, StageOptions
 from drivers.simulated.world import SimulatedWorld
-from drivers.stage_axes import AXIS_NAMES
 from drivers.testing.camera import CameraContract
 from drivers.testing.led_array import LedArrayContract
 from drivers.testing.slm import SlmContract

@@ -10,8 +10,8 @@ from drivers.simulated.slm import SlmOptions
 from drivers.testing.camera import CameraContract
 from drivers.testing.slm import SlmContract
 from drivers.testing.stage import StageContract
-from instrument.bench import Bench
-from instrument.config_file import display_text, parse_config
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import display_text, parse_config
 
 
 class TestDisplayCamera(CameraContract):

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
+from drivers.common.stage_axes import AXIS_NAMES, AxisMap, AxisName, AxisOptions, check_target
 from drivers.errors import LimitError
 from drivers.stage import StageAxis
-from drivers.stage_axes import AXIS_NAMES, AxisMap, AxisName, AxisOptions, check_target
 
 X = StageAxis("x_um", -10.0, 10.0, 1.0, 0.1)
 YAW = StageAxis("yaw_mrad", 0.0, 5.0, 1.0, 0.01)

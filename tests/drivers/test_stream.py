@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from drivers.common.ring import BufferPool
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame
-from drivers.ring import BufferPool
-from drivers.stream import FrameStream
 from tests.mocks.free_running import FreeRunningCamera
 
 
@@ -133,7 +133,7 @@ def test_a_closed_stream_holds_no_buffers_whoever_keeps_it_or_its_error(
             super().__init__(n_buffers, shape, dtype)
             buffers.extend(weakref.ref(memory) for memory in self._memory)
 
-    monkeypatch.setattr("drivers.stream.BufferPool", Watched)
+    monkeypatch.setattr("drivers.common.stream.BufferPool", Watched)
     camera = FreeRunningCamera()
     camera.fail_at = 12
     stream = FrameStream(camera, 32)

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.camera import Roi
-from drivers.claim import DeviceBusyError
 from drivers.errors import (
     DeviceError,
     DeviceLostError,
@@ -23,6 +22,7 @@ from drivers.errors import (
     LimitError,
     StoppedError,
 )
+from drivers.registry.claim import DeviceBusyError
 from drivers.testing.camera import CameraContract
 from drivers.v4l2 import api
 from drivers.v4l2.camera import V4l2Camera

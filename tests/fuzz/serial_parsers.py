@@ -20,10 +20,10 @@ with atheris.instrument_imports(
         "drivers.grbl.protocol",
         "drivers.illuminate.protocol",
         "drivers.zaber.protocol",
-        "drivers.framing",
+        "drivers.common.framing",
     ]
 ):
-    from drivers.framing import LineFramer, Verdict
+    from drivers.common.framing import LineFramer, Verdict
     from drivers.grbl import protocol as grbl
     from drivers.illuminate import protocol as illuminate
     from drivers.zaber import protocol as zaber

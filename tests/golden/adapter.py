@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 import recon
-from recon import threads
+from recon.base import threads
 from recon.holography import (
     Budget,
     DcTerm,
@@ -34,7 +34,7 @@ from recon.holography import (
     judge,
     random_mask,
 )
-from recon.patterned import reconstruct_patterned
+from recon.reconstruction.patterned import reconstruct_patterned
 
 Result = dict[str, Any]
 Calibration = Mapping[str, Any]
@@ -65,7 +65,7 @@ def noise_model(read_noise: float, counts_per_electron: float) -> Any:
 
 def wishes(**wanted: str) -> Any:
     """Return choices that are not left to the program, from words."""
-    from recon.auto import Wishes
+    from recon.reconstruction.overrides import Wishes
 
     return Wishes.parse(wanted)
 
@@ -101,10 +101,10 @@ def numpy_as_device() -> Iterator[None]:
     twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
     with ExitStack() as patched:
         for name, value in (
-            ("recon.gpu.array_namespace", lambda _device: np),
-            ("recon.volume.channel.array_namespace", lambda _device: twin),
-            ("recon.gpu.total_variation.require_memory", lambda *_: None),
-            ("recon.gpu.douglas_rachford.require_memory", lambda *_: None),
+            ("recon.base.namespace.array_namespace", lambda _device: np),
+            ("recon.reconstruction.channel.array_namespace", lambda _device: twin),
+            ("recon.solvers.gpu_total_variation.require_memory", lambda *_: None),
+            ("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None),
         ):
             patched.enter_context(mock.patch(name, value))
         yield
@@ -130,7 +130,7 @@ def resumed(
     kind: str, measurement: npt.NDArray[Any], calibration: Any, *, after: int, iterations: int, **options: Any
 ) -> Result:
     """Keep a reconstruction in a folder after some iterations, and go on with it."""
-    from instrument.checkpoint import CheckpointFolder
+    from instrument.files.checkpoint import CheckpointFolder
 
     run = {"picture": picture, "volume": volume}[kind]
     with TemporaryDirectory() as folder:
@@ -165,7 +165,7 @@ def patterned(
 
 def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: int, **options: Any) -> Result:
     """Reconstruct frames one after the other, each from where the one before ended; begin anew half way."""
-    from recon.video import VideoSolver, video_camera
+    from recon.streams.video import VideoSolver, video_camera
 
     camera = video_camera(frames[0], psf, **options)
     solver = VideoSolver(camera, cold_iterations=cold, warm_iterations=warm)
@@ -179,8 +179,8 @@ def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: i
 
 def joint(frames: npt.NDArray[Any], psf: npt.NDArray[Any], over_time: Any, **options: Any) -> Result:
     """Reconstruct frames together, with a prior over time."""
-    from recon.video import video_camera
-    from recon.video.joint import solve_together
+    from recon.streams.joint import solve_together
+    from recon.streams.video import video_camera
 
     return {"image": solve_together(video_camera(frames[0], psf), frames, over_time, **options)}
 
@@ -192,7 +192,7 @@ def live(
 
     Iterations are counted, not timed: the budget leaves room for one iteration a frame at most.
     """
-    from recon.live import LiveReconstructor
+    from recon.streams.live import LiveReconstructor
 
     reconstructor = LiveReconstructor(psf, budget_ms=1e-3, coarsest=1, **options)
     pictures, said, done = [], [], []
@@ -300,8 +300,8 @@ def hologram(
 
 def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> Result:
     """Score settings of a reconstruction at counts of iterations; times are left out."""
-    from recon.chart.reconstruction import ChartProblem, Setting, run_setting, settings_for
-    from recon.scenes import make_scene
+    from recon.evaluation.chart_reconstruction import ChartProblem, Setting, run_setting, settings_for
+    from recon.evaluation.scene import make_scene
 
     scene = make_scene(family, size=size)
     problem = ChartProblem(
@@ -321,8 +321,8 @@ def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts:
 
 def stability_map(name: str, methods: Sequence[str]) -> Result:
     """Make a map of where methods fail; times are left out."""
-    from recon.stability.catalogue import map_named
-    from recon.stability.run import run_map
+    from recon.evaluation.catalogue import map_named
+    from recon.evaluation.stability_run import run_map
 
     cells = [c.as_json() for c in run_map(map_named(name), "quick", methods=list(methods))]
     cells.sort(key=lambda c: (c["method"], c["ix"], c["iy"]))

@@ -78,7 +78,8 @@ def main() -> None:
     slower: list[str] = []
     with other_checkout(asked.against) as other:
         print(
-            f"processor time here, of {asked.against}, ratio: medians of {asked.rounds} turns; *: above {LIMIT}"
+            f"processor time here, of {asked.against}, ratio: "
+            f"medians of {asked.rounds} turns; *: above {LIMIT}"
         )
         if asked.cases is None or asked.cases:
             slower += compare_cases(other, asked.cases, asked.rounds, asked.seconds)

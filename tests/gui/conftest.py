@@ -24,7 +24,7 @@ else:
     from gui.main_window import MainWindow
     from gui.session import BenchSession
     from gui.theme import apply_theme
-from instrument.config_file import parse_config
+from instrument.bench.config_file import parse_config
 
 WAIT_MS = 60_000
 """Against a hang, not a slow machine: for what takes a fraction of a second where nothing else runs."""

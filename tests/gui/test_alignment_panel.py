@@ -10,13 +10,13 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from calibration_routines.mask_alignment import AlignmentReport
+from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.procedure import Outcome
 from gui.main_window import MainWindow
 from gui.panels.alignment import AlignmentPanel
 from gui.procedure_run import Situation
 from gui.widgets.run_bar import RunBar
-from instrument.config_file import display_text
+from instrument.bench.config_file import display_text
 from recon.holography.pose import NODES, Pose
 
 LEFT = Qt.MouseButton.LeftButton

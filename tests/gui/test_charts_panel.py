@@ -12,12 +12,12 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from gui.panels.charts import ChartsPanel
-from gui.views.chart_view import describe
-from instrument.chart.reader import read_chart
-from instrument.errors import FileError
-from instrument.images import read_image
-from instrument.stability_file import read_stability
-from recon.stability.shipped import shipped_file
+from gui.widgets.chart_view import describe
+from instrument.evaluation.chart_reader import read_chart
+from instrument.files.errors import FileError
+from instrument.files.images import read_image
+from instrument.files.stability_file import read_stability
+from recon.verdict.shipped import shipped_file
 
 WAIT_MS = 60_000
 

@@ -17,10 +17,10 @@ from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
 from gui.widgets.question import Question
-from instrument.bench import Bench
-from instrument.config_file import parse_config
-from instrument.slm_correction import SlmCorrection, load_slm_correction
-from instrument.slm_image import write_slm_image
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.files.slm_correction import SlmCorrection, load_slm_correction
+from instrument.files.slm_image import write_slm_image
 
 WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
@@ -242,7 +242,7 @@ def run_copied(panel: Panel, text: str, monkeypatch: pytest.MonkeyPatch, look: C
             super().close()
 
     monkeypatch.setattr(
-        "instrument.bench.open_bench", lambda _: Looked(parse_config(text, Path("bench.toml"))).open()
+        "instrument.bench.bench.open_bench", lambda _: Looked(parse_config(text, Path("bench.toml"))).open()
     )
     asked: list[str] = []
     monkeypatch.setattr("builtins.input", asked.append)

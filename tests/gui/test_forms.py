@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from calibration_routines.display_procedures import AlignmentProcedure
-from calibration_routines.optics_procedures import BeadProcedure
-from calibration_routines.plan_procedures import PlanProcedure
+from calibration_routines.display.display_procedures import AlignmentProcedure
+from calibration_routines.optics.optics_procedures import BeadProcedure
 from calibration_routines.procedure import Outcome, Outlook
-from calibration_routines.sweep_procedure import SweepProcedure
-from calibration_routines.sweep_request import AxialRequest
+from calibration_routines.psf.plan_procedures import PlanProcedure
+from calibration_routines.psf.sweep_procedure import SweepProcedure
+from calibration_routines.psf.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT
 from gui.forms.as_python import script
 from gui.forms.routines import (
@@ -27,9 +27,9 @@ from gui.forms.routines import (
     SLM,
     VOLUME,
 )
-from instrument.bench import Bench
-from instrument.config_file import display_text, led_microscope_text
-from instrument.errors import BenchError, SettingsError
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import display_text, led_microscope_text
+from instrument.files.errors import BenchError, SettingsError
 
 Z = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3}
 

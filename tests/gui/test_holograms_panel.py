@@ -19,11 +19,11 @@ import instrument
 from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
-from gui.views.view_grid import best_columns
-from instrument.config_file import parse_config
-from instrument.display_setup import bench_display, depth_limit_mm
-from instrument.images import read_image, write_image
-from instrument.slm_image import levels_phase, read_slm_image
+from gui.widgets.view_grid import best_columns
+from instrument.bench.config_file import parse_config
+from instrument.bench.display_setup import bench_display, depth_limit_mm
+from instrument.files.images import read_image, write_image
+from instrument.files.slm_image import levels_phase, read_slm_image
 from recon.errors import InputError
 
 WAIT_MS = 60_000
@@ -31,7 +31,7 @@ WAIT_MS = 60_000
 
 def aligned() -> str:
     """Return the display bench that ships, small, its mask where it belongs."""
-    text = (Path(instrument.__file__).parent / "display_bench.toml").read_text()
+    text = (Path(instrument.__file__).parent / "bench" / "display_bench.toml").read_text()
     changes = {
         "shape": "[200, 280]",
         "expansion": "4",

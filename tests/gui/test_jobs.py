@@ -11,7 +11,7 @@ from pytestqt.qtbot import QtBot
 
 from drivers.errors import LimitError
 from gui.jobs import BusyError, JobContext, JobRunner, JobState
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 
 WAIT_MS = 60_000
 

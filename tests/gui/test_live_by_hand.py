@@ -17,9 +17,9 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels import record_bar
 from gui.panels.live import LivePanel
-from instrument.acquire import free_bytes
-from instrument.errors import FileError
-from instrument.store import Run
+from instrument.files.errors import FileError
+from instrument.runs.acquire import free_bytes
+from instrument.runs.run import Run
 
 WAIT_MS = 60_000
 CTRL = Qt.KeyboardModifier.ControlModifier

@@ -14,9 +14,9 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from gui.widgets.image_view import ImageView
-from instrument.images import read_image
-from instrument.snapshot import Light
-from instrument.store import Run
+from instrument.files.images import read_image
+from instrument.runs.run import Run
+from instrument.runs.snapshot import Light
 
 WAIT_MS = 60_000
 

@@ -17,7 +17,7 @@ import gui.panels.live_reconstruction as live_reconstruction
 from gui.main_window import MainWindow
 from gui.panels.live_reconstruction import LiveReconstructionPanel
 from gui.session import BenchSession
-from instrument.calibration_file import load_calibration, save_calibration
+from instrument.files.calibration_file import load_calibration, save_calibration
 from recon.errors import InputError
 from recon.types import Calibration
 

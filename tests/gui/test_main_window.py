@@ -19,7 +19,7 @@ from gui.session import BenchSession
 from gui.theme import THEMES
 from gui.widgets.message import TextWindow
 from gui.widgets.question import choose_path
-from instrument.snapshot import Light
+from instrument.runs.snapshot import Light
 
 WAIT_MS = 60_000
 
@@ -290,6 +290,6 @@ def test_lists_are_read_without_a_word(window: MainWindow) -> None:
 def test_what_drivers_and_instrument_tell_is_in_the_log(qtbot: QtBot, session: BenchSession) -> None:
     lines: list[tuple[str, str]] = []
     session.logged.connect(lambda level, text: lines.append((level, text)))
-    for room in ("drivers.stage", "instrument.bench", "calibration_routines.sweep"):
+    for room in ("drivers.stage", "instrument.bench.bench", "calibration_routines.psf.sweep"):
         logging.getLogger(room).info("told by %s", room)
     qtbot.waitUntil(lambda: sum("told by" in text for _, text in lines) == 3, timeout=WAIT_MS)

@@ -10,8 +10,8 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.sweeps import SweepsPanel
-from instrument.calibration_file import load_calibration
-from instrument.config_file import led_microscope_text
+from instrument.bench.config_file import led_microscope_text
+from instrument.files.calibration_file import load_calibration
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 120_000

@@ -13,8 +13,8 @@ from pytestqt.qtbot import QtBot
 
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
-from gui.views.entry import PathEntry
-from instrument.calibration_file import (
+from gui.widgets.entry import PathEntry
+from instrument.files.calibration_file import (
     CalibrationFileError,
     calibrated_depths_um,
     newest_calibration,

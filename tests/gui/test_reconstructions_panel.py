@@ -17,13 +17,13 @@ from gui.jobs import JobState
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
-from gui.views.reconstruct_form import PSF, VOLUME
 from gui.widgets.question import Question
-from instrument.images import read_image, write_image
-from instrument.reconstruction_request import VolumeRequest
-from instrument.stored_result import open_result
-from instrument.volume_source import VolumeSource
-from recon.auto import Wishes
+from gui.widgets.reconstruct_form import PSF, VOLUME
+from instrument.files.images import read_image, write_image
+from instrument.files.volume_source import VolumeSource
+from instrument.reconstruction.request import VolumeRequest
+from instrument.reconstruction.stored_result import open_result
+from recon.reconstruction.overrides import Wishes
 
 WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4

@@ -11,11 +11,12 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtWidgets import QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
-from calibration_routines.sweep_procedure import SweepProcedure
+from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
-from instrument.store import Run, RunCondition
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 60_000

@@ -12,7 +12,7 @@ from drivers.simulated.world import SimulatedWorld
 from gui.main_window import MainWindow
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.panels.sweeps import SweepsPanel
-from instrument.images import read_image
+from instrument.files.images import read_image
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 120_000

@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from drivers import registry
+from drivers.registry import registry
 
 MOCK_DRIVERS = {
     "mock.camera": "tests.mocks.devices:MockCamera",

@@ -9,15 +9,16 @@ import pytest
 
 from drivers.errors import DeviceError
 from drivers.simulated.world import SimulatedWorld
-from instrument.acquire import acquire, prepare
-from instrument.bench import Bench, open_bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import OFF, SOURCE, Part, Plan, SourceGrid
-from instrument.recording import record
-from instrument.resume import prepare_resume
-from instrument.runner import RunStatus
-from instrument.store import Run, RunCondition
-from instrument.verification import verify
+from instrument.runs.acquire import acquire, prepare
+from instrument.runs.layout import RunCondition
+from instrument.runs.recording import record
+from instrument.runs.resume import prepare_resume
+from instrument.runs.run import Run
+from instrument.runs.runner import RunStatus
+from instrument.runs.verification import verify
 
 BENCH = """
 [bench]

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.claim import Claim, DeviceBusyError
 from drivers.device import Device, DriverOptions, port_claim
-from instrument.bench import Bench
-from instrument.config_file import default_text, parse_config
+from drivers.registry.claim import Claim, DeviceBusyError
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import default_text, parse_config
 from tests.mocks.devices import MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
 ROOT = Path(__file__).parents[2]
 HOLDER = """
 import sys
-from drivers.claim import Claim
+from drivers.registry.claim import Claim
 claim = Claim(sys.argv[1], "stage")
 print("held", flush=True)
 sys.stdin.read()

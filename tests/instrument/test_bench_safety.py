@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import pytest
 
 from drivers.errors import DeviceError, DeviceLostError, LimitError, StoppedError
-from instrument.bench import Bench, open_bench
-from instrument.config_file import parse_config
-from instrument.errors import BenchError, OperatorNeededError
-from instrument.safety import StepsFailedError
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config_file import parse_config
+from instrument.bench.safety import StepsFailedError
+from instrument.files.errors import BenchError, OperatorNeededError
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import zarr
 
-from instrument import calibration_file
-from instrument.calibration_file import (
+from instrument.files import calibration_file
+from instrument.files.calibration_file import (
     CalibrationFileError,
     is_calibration,
     load_calibration,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from instrument.checkpoint import CheckpointFolder, digest
 from instrument.cli import main
-from instrument.errors import FileError
-from recon.operators import PadCropConvolution
+from instrument.files.checkpoint import CheckpointFolder, digest
+from instrument.files.errors import FileError
+from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Fista, SensorAdmm, StoppingRules
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from instrument.bench import open_bench
+from instrument.bench.bench import open_bench
 from instrument.cli import COMMANDS, main
-from instrument.slm_image import write_slm_image
+from instrument.files.slm_image import write_slm_image
 
 MOCK_BENCH = """\
 [camera]

@@ -11,7 +11,9 @@ import pytest
 from instrument.cli import main
 from instrument.plan import Plan
 from instrument.plan.file import load_plan, plan_toml, save_plan
-from instrument.store import FinishReason, Run, RunCondition, RunWriter
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.run import Run
+from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockCamera, MockStage
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

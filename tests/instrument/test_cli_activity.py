@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import zarr
 
-from instrument.activity import COPIES, ActivitySettings, find_activity
 from instrument.cli import main
-from instrument.errors import BenchError
-from instrument.video.output import VideoPictures, create_output
+from instrument.files.errors import BenchError
+from instrument.reconstruction.activity import COPIES, ActivitySettings, find_activity
+from instrument.reconstruction.video_output import VideoPictures, create_output
 
 COUNT, SHAPE, MISSING = 120, (32, 40), 7
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration_routines.angular_response import AngularResponse, Curve, save_response
+from calibration_routines.optics.angular_response import AngularResponse, Curve, save_response
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from instrument.calibration_file import save_calibration
 from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
 from recon.analysis.sampling import gaussian_response, lateral_spacing_um
 from recon.types import Calibration, Geometry
 

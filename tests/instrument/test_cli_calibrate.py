@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from instrument.calibration_file import load_calibration
 from instrument.cli import main
-from instrument.store import FrameToStore, RunWriter
+from instrument.files.calibration_file import load_calibration
+from instrument.runs.writer import FrameToStore, RunWriter
 
 TINY = """
 [camera]
@@ -250,9 +250,9 @@ def test_an_interrupted_sweep_says_what_is_kept_and_how_to_go_on(
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        ("calibration_routines.sweep_procedure.expose_sweep", "no frame was kept"),
+        ("calibration_routines.psf.sweep_procedure.expose_sweep", "no frame was kept"),
         (
-            "calibration_routines.sweep.analyse_sweep",
+            "calibration_routines.psf.sweep.analyse_sweep",
             "All frames of the sweep are kept. For its calibration: ",
         ),
     ],

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from instrument.calibration_file import load_calibration
 from instrument.cli import main
+from instrument.files.calibration_file import load_calibration
 
 BENCH = """
 [bench]

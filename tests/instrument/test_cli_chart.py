@@ -12,16 +12,16 @@ import pytest
 from typer.testing import CliRunner
 
 from instrument.cli import chart as module
-from instrument.reconstruction_job import Job
+from instrument.reconstruction.job import Job
 from recon import Calibration, NoiseModel
-from recon.chart import reconstruction as recon_chart
-from recon.chart.scored import Point
+from recon.evaluation import chart_reconstruction as recon_chart
+from recon.evaluation.scored import Point
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """Two settings, in this process."""
-    import instrument.chart.job as job
+    import instrument.evaluation.chart_job as job
 
     settings = (
         recon_chart.Setting("wiener", "convolution", "none"),
@@ -67,8 +67,8 @@ def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
 
 
 def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_path):
-    import instrument.chart.job as job
-    from instrument.chart.problems import problem_of_scene
+    import instrument.evaluation.chart_job as job
+    from instrument.evaluation.chart_problems import problem_of_scene
 
     whole = job.in_own_process
 
@@ -98,7 +98,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
 
 
 def test_a_chart_tells_noise_erasures_and_truth_apart():
-    from instrument.chart.problems import problem_of_scene
+    from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     others = [
@@ -111,7 +111,7 @@ def test_a_chart_tells_noise_erasures_and_truth_apart():
 
 
 def test_the_noise_that_the_photograph_tells_is_used():
-    from instrument.chart.problems import problem_of_job
+    from instrument.evaluation.chart_problems import problem_of_job
 
     calibration = Calibration(np.ones((1, 1, 8, 8), np.float32), np.array([[0, 0, 1e4]]))
     grey = Job(np.ones((8, 8), np.float32), calibration, {}, known_noise=NoiseModel(3.0, 0.3))
@@ -155,8 +155,8 @@ def test_mistakes_are_named(arguments, said, tmp_path):
 
 
 def test_a_setting_runs_in_a_process_of_its_own():
-    from instrument.chart.problems import problem_of_scene
-    from instrument.chart.process import in_own_process
+    from instrument.evaluation.chart_problems import problem_of_scene
+    from instrument.evaluation.chart_process import in_own_process
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     found = in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
@@ -171,7 +171,7 @@ def test_memory_taken_aside_does_not_count():
     # In a process of its own: what this one has freed before would be taken again, and not count as taken.
     program = """
 import numpy as np
-from instrument.chart.process import MemoryMeter
+from instrument.evaluation.chart_process import MemoryMeter
 meter = MemoryMeter()
 own = np.ones(6 << 20)  # 48 MiB
 with meter.aside():
@@ -187,7 +187,7 @@ print(meter.peak_mib())
 
 @pytest.mark.usefixtures("quick")
 def test_holograms_are_charted(monkeypatch, tmp_path):
-    import instrument.chart.job as job
+    import instrument.evaluation.chart_job as job
 
     def here(problem, setting, limit_s):
         if setting.frames == 2:
@@ -215,7 +215,7 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
 def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
     import multiprocessing
 
-    from instrument.chart import process
+    from instrument.evaluation import chart_process as process
 
     ended = []
     waited = SimpleNamespace(join=lambda: ended.append("parent is gone"))
@@ -228,7 +228,7 @@ def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
 def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
     import signal
 
-    from instrument.chart import process
+    from instrument.evaluation import chart_process as process
 
     masks = []
     blocked = lambda: masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))  # noqa: E731
@@ -242,8 +242,8 @@ def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
     "content", [b"", b"PK\x03\x04 cut off", b"no archive"], ids=["empty", "cut", "other"]
 )
 def test_damaged_photographs_are_refused_by_name(tmp_path, content):
-    from instrument.chart.bench_photographs import photographs
-    from instrument.errors import FileError
+    from instrument.evaluation.bench_photographs import photographs
+    from instrument.files.errors import FileError
 
     damaged = tmp_path / "photographs.npz"
     damaged.write_bytes(content)
@@ -254,7 +254,7 @@ def test_damaged_photographs_are_refused_by_name(tmp_path, content):
 @pytest.fixture
 def few(monkeypatch):
     """Four photographs and two scenes that cost nothing; how often each was taken."""
-    from instrument.chart import bench_photographs as module
+    from instrument.evaluation import bench_photographs as module
 
     taken = []
 
@@ -274,7 +274,7 @@ def few(monkeypatch):
 
 
 def test_photographs_count_in_the_budget_and_go_on_where_they_stopped(few, tmp_path):
-    from instrument.chart.bench_photographs import OutOfTimeError, photographs
+    from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
 
     whole = photographs(30, tmp_path / "whole.npz", lambda *_: None)
     assert few == [0, 1, 2, 3, 4, 5]
@@ -298,7 +298,7 @@ def test_photographs_count_in_the_budget_and_go_on_where_they_stopped(few, tmp_p
 
 
 def test_photographs_taken_before_an_interruption_are_kept(few, tmp_path):
-    from instrument.chart.bench_photographs import photographs
+    from instrument.evaluation.bench_photographs import photographs
 
     def interrupted(done, _total):
         if done == 3:
@@ -311,8 +311,8 @@ def test_photographs_taken_before_an_interruption_are_kept(few, tmp_path):
 
 
 def test_photographs_that_do_not_fit_together_are_refused(few, tmp_path):
-    from instrument.chart.bench_photographs import photographs
-    from instrument.errors import FileError
+    from instrument.evaluation.bench_photographs import photographs
+    from instrument.files.errors import FileError
 
     path = tmp_path / "p.npz"
     for images, truths in (((6, 30, 30), (0,)), ((2, 31, 30), (0,)), ((7, 30, 30), (2, 150, 150))):
@@ -326,8 +326,8 @@ def test_photographs_that_do_not_fit_together_are_refused(few, tmp_path):
 
 
 def test_what_ends_a_setting_is_told_in_its_row():
-    from instrument.chart.problems import problem_of_scene
-    from instrument.chart.process import in_own_process
+    from instrument.evaluation.chart_problems import problem_of_scene
+    from instrument.evaluation.chart_process import in_own_process
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     broken = replace(problem, measurement=None)
@@ -342,8 +342,8 @@ def own(tmp_path):
     """Two calibrations and a photograph."""
     import tifffile
 
-    from instrument.calibration_file import save_calibration
-    from recon.scenes import make_scene
+    from instrument.files.calibration_file import save_calibration
+    from recon.evaluation.scene import make_scene
 
     for grid, name in ((5, "fine"), (1, "one")):
         scene = make_scene("sparse-picture", size=24, grid=grid, fall_off_deg=20.0, seed=3)
@@ -369,8 +369,8 @@ def test_whether_a_setting_is_even_with_the_best_is_said(capsys, names, said):
 
 
 def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
-    import instrument.chart.job as job
-    import recon.chart.own_calibrations as module
+    import instrument.evaluation.chart_job as job
+    import recon.evaluation.own_calibrations as module
 
     monkeypatch.setattr(module, "ITERATIONS", 3)
     monkeypatch.setattr(job, "in_own_process", lambda problem, setting, limit_s: problem.run(setting))

@@ -11,8 +11,8 @@ import tifffile
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from instrument.calibration_file import load_calibration, save_calibration
 from instrument.cli import main
+from instrument.files.calibration_file import load_calibration, save_calibration
 from recon.types import Calibration
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))

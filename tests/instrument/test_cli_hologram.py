@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from instrument.bench.config_file import default_text, parse_config
+from instrument.bench.display_setup import bench_display
 from instrument.cli import main
-from instrument.config_file import default_text, parse_config
-from instrument.display_setup import bench_display
-from instrument.errors import BenchError, FileError
-from instrument.hologram_job import prepare_target
-from instrument.images import read_image, write_image
-from instrument.sample_images import SAMPLES, load_sample
-from instrument.slm_image import levels_phase, phase_levels, read_slm_image
+from instrument.display.hologram_job import prepare_target
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_image, write_image
+from instrument.files.sample_images import SAMPLES, load_sample
+from instrument.files.slm_image import levels_phase, phase_levels, read_slm_image
 from recon.holography import HologramModel
 from recon.holography.judge import compare
 

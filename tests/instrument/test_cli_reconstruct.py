@@ -19,12 +19,12 @@ import pytest
 import tifffile
 from scipy.signal import convolve2d
 
-from instrument.calibration_file import save_calibration
 from instrument.cli import main
 from instrument.cli.reconstruct_options import Method, PriorName
-from instrument.images import read_image, write_image
-from recon.methods import method_names
-from recon.picture import PRIORS
+from instrument.files.calibration_file import save_calibration
+from instrument.files.images import read_image, write_image
+from recon.reconstruction.picture import PRIORS
+from recon.solvers.methods import method_names
 from recon.types import Calibration, Geometry
 
 RNG = np.random.default_rng(3)

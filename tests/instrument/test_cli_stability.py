@@ -10,13 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from instrument.cli.stability import app
-from instrument.errors import BenchError, FileError
-from instrument.stability_figure import ticks_of
-from instrument.stability_file import CellLog, read_stability
-from recon.stability import catalogue
-from recon.stability.failure import Failure
-from recon.stability.map import Axis, StressMap, Trial
-from recon.stability.run import run_map
+from instrument.evaluation.stability_figure import ticks_of
+from instrument.files.errors import BenchError, FileError
+from instrument.files.stability_file import CellLog, read_stability
+from recon.evaluation import catalogue
+from recon.evaluation.stability_run import run_map
+from recon.verdict.failure import Failure
+from recon.verdict.map import Axis, StressMap, Trial
 
 CALLS: list[tuple[str, float, float]] = []
 
@@ -81,7 +81,7 @@ def test_cells_of_another_program_or_scene_are_made_again(
     assert CellLog(tmp_path).of(stress, "quick") == [cell]
     assert CellLog(tmp_path).of(replace(stress, base="twenty points"), "quick") == []
     with monkeypatch.context() as patch:
-        patch.setattr("instrument.stability_file.version", lambda _: "99.0")
+        patch.setattr("instrument.files.stability_file.version", lambda _: "99.0")
         assert CellLog(tmp_path).of(stress, "quick") == []
     # As it was written before these were told apart.
     entry = json.loads((tmp_path / "cells.jsonl").read_text())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from instrument.calibration_file import save_calibration
 from instrument.cli import main
+from instrument.files.calibration_file import save_calibration
 from recon import Calibration, Geometry
 
 SIZE, DEPTHS, OFFSET = 32, 4, 100

@@ -23,8 +23,8 @@ preset = "tiny"
 PROGRAM = """
 import time
 from pathlib import Path
-from instrument import closing_at_exit
-from instrument.bench import open_bench
+from instrument.bench import closing_at_exit
+from instrument.bench.bench import open_bench
 
 bench = open_bench(Path("bench.toml"))
 bench.source_on()
@@ -69,7 +69,7 @@ def test_a_driver_that_hangs_does_not_keep_the_program_from_ending(tmp_path: Pat
 def test_a_bench_that_was_closed_is_not_touched_again(tmp_path: Path, count: int) -> None:
     (tmp_path / "bench.toml").write_text(BENCH)
     program = (
-        "from pathlib import Path\nfrom instrument.bench import open_bench\n"
+        "from pathlib import Path\nfrom instrument.bench.bench import open_bench\n"
         f"for _ in range({count}):\n    bench = open_bench(Path('bench.toml')); bench.close()\n"
         "bench.close = lambda: print('again', flush=True)\n"
     )

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from instrument.config_file import parse_config
-from instrument.errors import ConfigError
+from instrument.bench.config_file import parse_config
+from instrument.files.errors import ConfigError
 
 TEXT = """\
 [camera]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from instrument.config import CameraTable
-from instrument.config_file import load_config, parse_config
-from instrument.errors import ConfigError, FileError
+from instrument.bench.config import CameraTable
+from instrument.bench.config_file import load_config, parse_config
+from instrument.files.errors import ConfigError, FileError
 from tests.mocks.devices import MockOptions, MockStage
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

@@ -14,10 +14,13 @@ import tifffile
 
 from drivers.frame import FrameMetadata
 from instrument.cli import main
-from instrument.errors import FileError
-from instrument.export import export
+from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
-from instrument.store import BenchRecord, FinishReason, FrameToStore, Gap, Run, RunError, RunWriter
+from instrument.runs.export import export
+from instrument.runs.frame_record import Gap
+from instrument.runs.layout import FinishReason
+from instrument.runs.run import Run, RunError
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 METADATA = FrameMetadata(
     frame_id=0,

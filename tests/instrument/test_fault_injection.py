@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceError
-from instrument.acquire import prepare
-from instrument.bench import Bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.bench.safety import StepsFailedError
 from instrument.plan import Part, Plan
-from instrument.resume import prepare_resume
-from instrument.safety import StepsFailedError
-from instrument.store import Run, RunCondition, RunError
-from instrument.verification import verify
+from instrument.runs.acquire import prepare
+from instrument.runs.layout import RunCondition
+from instrument.runs.resume import prepare_resume
+from instrument.runs.run import Run, RunError
+from instrument.runs.verification import verify
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from instrument.figures import Convergence, Panel, Summary, save_figure, summary_figure
+from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 
 
 def make(*, sweep: bool = True, simulated: bool = True) -> Summary:

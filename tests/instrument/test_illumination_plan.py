@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from instrument.errors import BenchError
+from instrument.files.errors import BenchError
 from instrument.plan import Plan
 from instrument.plan.illumination import illumination_plan
 

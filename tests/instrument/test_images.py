@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
-from instrument.errors import FileError
-from instrument.images import read_image, read_stack, write_image
+from instrument.files.errors import FileError
+from instrument.files.images import read_image, read_stack, write_image
 
 RNG = np.random.default_rng(7)
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from instrument.bench import open_bench
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import load_config
 from instrument.cli import main
-from instrument.config_file import load_config
-from instrument.images import ImageFile, read_image, write_image
-from instrument.reconstruction_job import Job
-from instrument.reconstruction_record import noise_of
-from instrument.reconstruction_words import parse_noise
+from instrument.files.images import ImageFile, read_image, write_image
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.record import noise_of
+from instrument.reconstruction.words import parse_noise
 from recon import Calibration, NoiseModel
 
 FACTS = {"noise": {"read_noise_counts": 3.0, "counts_per_electron": 0.2}}

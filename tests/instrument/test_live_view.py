@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
-from drivers.stream import FrameStream
-from instrument.bench import open_bench
-from instrument.config_file import parse_config
-from instrument.live import LiveView, live_view
+from instrument.bench.bench import open_bench
+from instrument.bench.config_file import parse_config
+from instrument.live.live import LiveView, live_view
 from recon import Calibration, InputError
-from recon.live import LivePicture, LiveReconstructor, SceneState
+from recon.streams.live import LivePicture, LiveReconstructor
+from recon.streams.stillness import SceneState
 from tests.mocks.free_running import FreeRunningCamera
 
 BENCH = """

@@ -8,11 +8,11 @@ import tifffile
 from scipy.signal import fftconvolve
 
 from instrument.cli import main
-from instrument.errors import BenchError, FileError
-from instrument.images import ImageFile, write_image
-from instrument.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
-from instrument.preparation import Crop
-from recon.bayer import PATTERNS
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import ImageFile, write_image
+from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
+from instrument.reconstruction.preparation import Crop
+from recon.camera.bayer import PATTERNS
 
 HEIGHT, WIDTH = 36, 48
 COLOURS = np.array([1.0, 0.5, 0.2])

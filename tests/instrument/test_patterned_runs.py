@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from instrument.calibration_file import save_calibration
 from instrument.cli import main
-from instrument.errors import BenchError, FileError
-from instrument.patterned import PatternedRequest, prepare_patterned
+from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import BenchError, FileError
 from instrument.plan.file import load_plan
 from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
+from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
 from recon import Calibration
-from recon.metrics import psnr
+from recon.base.metrics import psnr
 from tests.mocks.recordings import write_recording
 
 SHAPE = (24, 30)

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from instrument.calibration_file import save_calibration
-from instrument.erasures import erasures_of, reduce_valid
-from instrument.errors import BenchError, FileError
-from instrument.images import ImageFile, write_image
-from instrument.preparation import (
+from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import ImageFile, write_image
+from instrument.reconstruction.erasures import erasures_of, reduce_valid
+from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
+from instrument.reconstruction.preparation import (
     Crop,
     auto_binning,
     bin_image,
@@ -23,7 +24,6 @@ from instrument.preparation import (
     reduce,
     saturated_pixels,
 )
-from instrument.reconstruction_job import find_calibration, job_from_calibration, job_from_files
 from recon.types import Calibration, Geometry
 
 

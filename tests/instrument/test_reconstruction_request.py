@@ -6,10 +6,10 @@ import tifffile
 from scipy.signal import fftconvolve
 
 from instrument.cli import main
-from instrument.errors import BenchError
-from instrument.reconstruction_request import PictureRequest, Settings, VolumeRequest
-from recon.auto import Wishes
+from instrument.files.errors import BenchError
+from instrument.reconstruction.request import PictureRequest, Settings, VolumeRequest
 from recon.errors import InputError
+from recon.reconstruction.overrides import Wishes
 
 SIZE = 48
 

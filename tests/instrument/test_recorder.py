@@ -13,12 +13,14 @@ import zarr
 from ome_zarr_models.v05 import Image
 
 from drivers.errors import DeviceError, DeviceLostError
-from instrument.bench import Bench
-from instrument.config_file import parse_config
-from instrument.errors import BenchError
-from instrument.recorder import Recorder, RecordingStatus
-from instrument.recording import prepare_recording, record
-from instrument.store import FinishReason, FrameToStore, Run, RunCondition, RunError, RunWriter
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.files.errors import BenchError
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.recorder import Recorder, RecordingStatus
+from instrument.runs.recording import prepare_recording, record
+from instrument.runs.run import Run, RunError
+from instrument.runs.writer import FrameToStore, RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 from tests.mocks.free_running import FreeRunningCamera
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from drivers.registry import KINDS, driver_names, load_driver
+from drivers.registry.registry import KINDS, driver_names, load_driver
+from instrument.bench.config import DEVICE_TABLES, PLAIN_TABLES
+from instrument.bench.config_file import default_text, parse_config
+from instrument.bench.config_reference import reference
 from instrument.cli import COMMANDS
-from instrument.config import DEVICE_TABLES, PLAIN_TABLES
-from instrument.config_file import default_text, parse_config
-from instrument.config_reference import reference
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
 
@@ -18,7 +18,7 @@ def test_the_configuration_reference_is_what_the_models_say() -> None:
     """Should it fail on a driver missing here: the installation is older than pyproject.toml (run make)."""
     page = (DOCS / "bench-toml.md").read_text("utf-8")
     assert page == reference(), (
-        "renew it: python -m instrument.config_reference > docs/reference/bench-toml.md"
+        "renew it: python -m instrument.bench.config_reference > docs/reference/bench-toml.md"
     )
 
 

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceError
-from instrument.acquire import prepare
-from instrument.bench import Bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
-from instrument.resume import inspect, prepare_resume
-from instrument.runner import RunStatus
-from instrument.store import FinishReason, Run, RunCondition, RunError, RunWriter
+from instrument.runs.acquire import prepare
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.resume import inspect, prepare_resume
+from instrument.runs.run import Run, RunError
+from instrument.runs.runner import RunStatus
+from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceError, DeviceLostError
-from instrument.acquire import acquire, prepare
-from instrument.bench import Bench
-from instrument.config_file import parse_config
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import parse_config
+from instrument.bench.safety import StepsFailedError
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
-from instrument.runner import Runner, RunState, RunStatus
-from instrument.safety import StepsFailedError
-from instrument.store import FinishReason, Run, RunCondition, RunWriter
+from instrument.runs.acquire import acquire, prepare
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.run import Run
+from instrument.runs.runner import Runner, RunState, RunStatus
+from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

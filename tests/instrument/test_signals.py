@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from instrument.store import Run, RunCondition
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
 
 ROOT = Path(__file__).parents[2]
 SETUP = """
 import sys, time
 from importlib.metadata import EntryPoint
-from drivers import registry
+from drivers.registry import registry
 from tests.mocks.devices import MockCamera, MockDevice
 MockCamera.snap_time_s = 0.02
 mocks = {f"mock.{k}": f"tests.mocks.devices:Mock{n}" for k, n in
@@ -106,7 +107,8 @@ def test_killed_it_says_crashed_and_everything_logged_is_there(here: Path) -> No
 def test_a_program_that_forgets_to_close_its_bench_leaves_no_light_on(here: Path) -> None:
     code = (
         SETUP
-        + "from instrument.bench import open_bench\nbench = open_bench('bench.toml')\nbench.source_on()\n"
+        + "from instrument.bench.bench import open_bench\n"
+        + "bench = open_bench('bench.toml')\nbench.source_on()\n"
     )
     process = program(code, here)
     out, _ = process.communicate(timeout=60)
@@ -121,8 +123,8 @@ def test_stop_does_not_wait_for_the_exposure(here: Path) -> None:
         SETUP
         + """
 import threading
-from instrument.acquire import prepare
-from instrument.bench import open_bench
+from instrument.runs.acquire import prepare
+from instrument.bench.bench import open_bench
 from instrument.plan.file import load_plan
 from drivers.errors import StoppedError
 ended = threading.Event()

@@ -14,16 +14,10 @@ from ome_zarr_models.v05 import Image
 
 from drivers.frame import FrameMetadata
 from instrument.plan import Part, Plan
-from instrument.store import (
-    BenchRecord,
-    FinishReason,
-    FrameToStore,
-    Run,
-    RunCondition,
-    RunError,
-    RunWriter,
-)
-from instrument.store.durable import AppendOnlyLog, read_lines, write_json
+from instrument.runs.durable import AppendOnlyLog, read_lines, write_json
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.run import Run, RunError
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord(
     {"bench": {"name": "b"}},

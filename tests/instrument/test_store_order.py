@@ -18,7 +18,9 @@ import pytest
 
 from drivers.frame import FrameMetadata
 from instrument.plan import Part, Plan
-from instrument.store import BenchRecord, FinishReason, FrameToStore, Run, RunCondition, RunError, RunWriter
+from instrument.runs.layout import FinishReason, RunCondition
+from instrument.runs.run import Run, RunError
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord({}, "", {}, True, 6.5, {"exposure_ms": 1.0, "gain": 1.0}, {})
 METADATA = FrameMetadata(
@@ -126,7 +128,7 @@ def test_the_test_above_can_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     disk = HonestDisk(root, monkeypatch)
     plan = Plan(label="order", parts=(Part(label="a"),))
     with RunWriter.create(root, label="order", bench=BENCH, plan=plan) as writer:
-        monkeypatch.setattr("instrument.store.durable.SyncPool.folders", lambda *_: None)
+        monkeypatch.setattr("instrument.runs.durable.SyncPool.folders", lambda *_: None)
         writer.write([FrameToStore(0, np.zeros((4, 5), np.uint8), METADATA)])
     (run,) = (p for p in disk.after_power_cut(tmp_path / "copy").iterdir() if p.name[0] != ".")
     try:

@@ -9,14 +9,14 @@ import pytest
 import tifffile
 
 from instrument.cli import main
-from instrument.errors import FileError
-from instrument.images import write_image
-from instrument.result_list import find_results, free_name
-from instrument.stored_result import open_result, record_file
-from instrument.volume_source import open_volume, volume_in_memory
-from instrument.volume_views import in_colour_of_depth, project
-from instrument.volume_zarr import write_volume_zarr
-from recon.volume.result import VolumeGrid
+from instrument.files.errors import FileError
+from instrument.files.images import write_image
+from instrument.files.volume_source import open_volume, volume_in_memory
+from instrument.files.volume_zarr import write_volume_zarr
+from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.stored_result import open_result, record_file
+from instrument.reconstruction.volume_views import in_colour_of_depth, project
+from recon.reconstruction.volume_result import VolumeGrid
 
 SHAPE = (5, 40, 30)
 UNKNOWN = VolumeGrid(SHAPE, (20, 15), np.full(5, np.nan), np.full(5, np.nan))
@@ -65,7 +65,7 @@ def test_a_tiff_in_one_piece_is_mapped_not_read(tmp_path, volume, monkeypatch):
 
 
 def test_side_views_of_large_planes_come_from_a_coarser_level(tmp_path, monkeypatch):
-    monkeypatch.setattr("instrument.volume_source._SIDE_PIXELS", 128 * 128)
+    monkeypatch.setattr("instrument.files.volume_source._SIDE_PIXELS", 128 * 128)
     voxels = np.random.default_rng(1).random((2, 256, 256), np.float32)
     write_volume_zarr(tmp_path / "v.ome.zarr", voxels, UNKNOWN, {})
     source = open_volume(tmp_path / "v.ome.zarr")

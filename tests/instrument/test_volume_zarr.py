@@ -5,9 +5,9 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.reconstruction_file import Outputs
-from instrument.volume_zarr import write_volume_zarr
-from recon.volume.result import VolumeGrid
+from instrument.files.volume_zarr import write_volume_zarr
+from instrument.reconstruction.result_file import Outputs
+from recon.reconstruction.volume_result import VolumeGrid
 
 Z_UM = np.array([9000.0, 10000.0, 11500.0])
 GRID = VolumeGrid((3, 300, 200), (150, 100), Z_UM, 2e-3 * Z_UM)
@@ -54,7 +54,7 @@ def test_a_volume_there_before_survives_a_failure(tmp_path, volume, monkeypatch)
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("instrument.volume_zarr._sync", full)
+    monkeypatch.setattr("instrument.files.volume_zarr._sync", full)
     with pytest.raises(OSError, match="No space"):
         write_volume_zarr(path, 2 * volume, GRID, {})
     np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], volume)

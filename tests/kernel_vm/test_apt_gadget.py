@@ -9,8 +9,8 @@ import pytest
 
 from drivers.apt.options import AptOptions
 from drivers.apt.stage import AptStage
-from drivers.discovery import FoundDevice
 from drivers.errors import DeviceError
+from drivers.registry.discovery import FoundDevice
 from tests.mocks.apt_controller import AptController, split_messages
 from tests.mocks.moving_axis import MovingAxis
 from tests.mocks.usb_gadget import UsbSerialGadget

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from drivers.buses import hid_devices
 from drivers.dlpc900 import commands
 from drivers.dlpc900.commands import Board
 from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.errors import DeviceError
+from drivers.registry.buses import hid_devices
 from tests.mocks.dlpc900_device import Dlpc900Emulator
 from tests.mocks.uhid_device import UhidDevice
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.buses import hid_devices, serial_ports, usb_devices, video_devices
+from drivers.registry.buses import hid_devices, serial_ports, usb_devices, video_devices
 from tests.mocks.dlpc900_device import Dlpc900Emulator
 from tests.mocks.uhid_device import UhidDevice
 from tests.mocks.usb_gadget import UsbSerialGadget

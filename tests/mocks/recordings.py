@@ -10,7 +10,9 @@ import numpy as np
 
 from drivers.frame import FrameMetadata
 from instrument.plan import Plan
-from instrument.store import BenchRecord, FinishReason, FrameToStore, Gap, RunWriter
+from instrument.runs.frame_record import Gap
+from instrument.runs.layout import FinishReason
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord(
     {"bench": {"name": "b"}},

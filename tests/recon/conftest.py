@@ -89,9 +89,9 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
     """
 
     def draw(x_name: str, x: Sequence[float], y_name: str, rows: Mapping[object, Sequence[float]]) -> str:
-        from instrument.figures import save_figure
-        from instrument.stability_figure import map_figure
-        from recon.stability.map import Axis, as_text
+        from instrument.evaluation.stability_figure import map_figure
+        from instrument.files.figures import save_figure
+        from recon.verdict.map import Axis, as_text
 
         axes = Axis(x_name, x_name, "", tuple(x), ()), Axis(y_name, y_name, "", tuple(range(len(rows))), ())
         grid = np.array(list(rows.values()), float)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import fft
-from recon.operators import Erasures, PadCropConvolution
+from recon.base import fft
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.erasures import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, LiteralAdmm, Penalties, StoppingRules, StopReason
 from recon.solvers.prior_splits import split_prior

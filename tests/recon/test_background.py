@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.fft import dctn
 
-from recon.operators import Convolution3D
-from recon.operators.background import BackgroundRemoval
+from recon.camera.background import BackgroundRemoval
+from recon.camera.convolution3d import Convolution3D
 from recon.solvers import StoppingRules
-from recon.volume import DouglasRachford
+from recon.solvers.douglas_rachford import DouglasRachford
 
 
 @pytest.mark.parametrize("erased", [0.0, 0.3])

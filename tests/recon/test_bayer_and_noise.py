@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recon import InputError, reconstruct
-from recon.bayer import PATTERNS, interpolate_bayer, split_bayer
-from recon.metrics import psnr
-from recon.noise import estimate_deviation
+from recon.base.metrics import psnr
+from recon.base.noise import estimate_deviation
+from recon.camera.bayer import PATTERNS, interpolate_bayer, split_bayer
 
 
 def mosaic(image, pattern):

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.chart.even import even_with_best
-from recon.chart.judge import Judge
-from recon.chart.reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
-from recon.chart.scored import Point, pareto
 from recon.errors import InputError, StructureError
-from recon.picture import PRIORS, reconstruct
-from recon.scenes import make_scene
+from recon.evaluation.chart_judge import Judge
+from recon.evaluation.chart_reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
+from recon.evaluation.even import even_with_best
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scored import Point, pareto
+from recon.reconstruction.picture import PRIORS, reconstruct
 from recon.types import Calibration
 
 
@@ -60,7 +60,7 @@ def test_held_out_pixels_were_not_looked_at():
 
 @pytest.mark.parametrize("shape", [(102, 98), (100, 97), (96, 110), (99, 103)])
 def test_held_out_scores_are_of_the_same_light_at_every_binning(shape, monkeypatch):
-    from recon.auto.reduced import binned
+    from recon.reconstruction.reduced import binned
 
     rng = np.random.default_rng(0)
     psf = np.zeros((1, 1, *shape), np.float32)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.chart.calibration import (
+from recon.errors import InputError
+from recon.evaluation.chart_calibration import (
     FINE,
     SCENES,
     CalibrationProblem,
@@ -16,8 +17,7 @@ from recon.chart.calibration import (
     Photographs,
     coarse,
 )
-from recon.chart.scored import KINDS, fronts
-from recon.errors import InputError
+from recon.evaluation.scored import KINDS, fronts
 from recon.types import Geometry
 
 SIZE, PITCH_UM, DISTANCE_MM, Z_UM = 40, 20.0, 2.0, 2000.0
@@ -88,7 +88,7 @@ def test_settings_are_what_the_photographs_allow(problem):
 
 
 def test_more_places_help_where_psfs_vary_and_more_depths_where_beads_are(problem, monkeypatch):
-    monkeypatch.setattr("recon.chart.calibration.ITERATIONS", 40)
+    monkeypatch.setattr("recon.evaluation.chart_calibration.ITERATIONS", 40)
     scores = {}
     points = []
     for setting in problem.settings():

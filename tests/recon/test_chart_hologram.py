@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.chart.hologram import HologramProblem, HologramSetting
-from recon.chart.scored import KINDS, fronts
 from recon.errors import InputError
+from recon.evaluation.chart_hologram import HologramProblem, HologramSetting
+from recon.evaluation.scored import KINDS, fronts
 from recon.holography import Display, HologramModel, Target, compute_hologram, judge, random_mask
 from recon.holography.optimise import Budget
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.chart.own_calibrations import OwnCalibration, OwnCalibrationsProblem
-from recon.chart.reconstruction import ChartProblem
+from recon.evaluation.chart_reconstruction import ChartProblem
+from recon.evaluation.own_calibrations import OwnCalibration, OwnCalibrationsProblem
 from recon.types import Calibration
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
-from recon import threads
+from recon.base import threads
+from recon.camera.base import estimate_norm
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution3d import Convolution3D
 from recon.errors import InputError
-from recon.operators.base import estimate_norm
-from recon.operators.convolution import PadCropConvolution
-from recon.operators.convolution3d import Convolution3D
 
 
 def dot_test(operator, rtol, seed=0):

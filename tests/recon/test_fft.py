@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from recon import fft
-from recon.threads import in_blocks
+from recon.base import fft
+from recon.base.threads import in_blocks
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_blocks_within_blocks_end(threads):
 
 def test_import_is_light():
     code = (
-        "import sys, recon, recon.operators, recon.solvers, recon.priors, recon.metrics;"
+        "import sys, recon, recon.camera.convolution, recon.solvers, recon.priors, recon.base.metrics;"
         "sys.exit('numba' in sys.modules or 'scipy' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

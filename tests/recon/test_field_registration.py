@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.registration import Registration
-from recon.scenes import SceneSpec, make_scene
-from recon.stability.scene_trial import Options, judge, solve
+from recon.camera.camera_model import sort_by_depth
+from recon.camera.field_registration import NOT_ON_AXIS, filled_in, one_psf
+from recon.camera.registration import Registration
+from recon.evaluation.scene import SceneSpec, make_scene
+from recon.evaluation.scene_trial import Options, judge, solve
 from recon.types import Geometry
-from recon.volume.field_registration import NOT_ON_AXIS, filled_in, one_psf
-from recon.volume.model import sort_by_depth
 
 SPEC = SceneSpec(
     "sparse-picture", size=48, seed=1001, z_near=1.0, z_far=1.0, photons=10_000.0, fall_off_deg=40.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from recon.operators import PadCropConvolution
+from recon.camera.convolution import PadCropConvolution
 from recon.priors import L1, NonNegativity, Zero
 from recon.solvers import Fista, StoppingRules, StopReason
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from recon.base.threads import get_threads, set_threads
 from recon.errors import InputError
 from recon.holography import (
     DcTerm,
@@ -17,7 +18,6 @@ from recon.holography import (
     random_mask,
 )
 from recon.holography.judge import intensity, judge, low_pass, seen_image
-from recon.threads import get_threads, set_threads
 
 RNG = np.random.default_rng(7)
 

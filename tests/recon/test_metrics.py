@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.metrics import nrmse, psnr, scale_to, ssim
+from recon.base.metrics import nrmse, psnr, scale_to, ssim
 
 
 def test_known_values():

@@ -5,11 +5,14 @@ import threading
 import numpy as np
 import pytest
 
-from recon import fft, threads
-from recon.operators import BackgroundRemoval, Convolution3D, Erasures, FieldOfPsfs, local_convolution
+from recon.base import fft, threads
+from recon.camera.background import BackgroundRemoval
+from recon.camera.convolution3d import Convolution3D
+from recon.camera.erasures import Erasures
+from recon.camera.local_convolution import FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
-from recon.volume.operator_admm import OperatorAdmm
+from recon.solvers.operator_admm import OperatorAdmm
 
 POINTS = np.array([(y, x) for y in (-6, 0, 6) for x in (-6, 0, 6)], float)
 SENSOR = (14, 13)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
-from recon.operators import Erasures, LinearOperator, PadCropConvolution, estimate_norm
+from recon.camera.base import LinearOperator, estimate_norm
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.erasures import Erasures
 
 
 def matrix(operator: LinearOperator) -> np.ndarray:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from recon import InputError, reconstruct
-from recon.metrics import psnr
-from recon.operators import PadCropConvolution
-from recon.operators.base import estimate_norm
-from recon.patterned import PatternedCamera, reconstruct_patterned
+from recon.base.metrics import psnr
+from recon.camera.base import estimate_norm
+from recon.camera.convolution import PadCropConvolution
+from recon.reconstruction.patterned import PatternedCamera, reconstruct_patterned
 
 SHAPE = (24, 30)
 

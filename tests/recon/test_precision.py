@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import recon
-from recon.auto.wishes import Wishes
 from recon.errors import InputError
-from recon.scenes import make_scene
-from recon.volume.channel import ChannelProblem
-from recon.volume.reconstruct import prepare_volume
+from recon.evaluation.scene import make_scene
+from recon.reconstruction.channel import ChannelProblem
+from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.volume import prepare_volume
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
-from recon.metrics import psnr
+from recon.base.metrics import psnr
 from recon.solvers import StopReason
 
 ROOT = Path(__file__).parents[2]

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct, reconstruct_volume
-from recon.solvers import StopReason
-from recon.volume import memory
-from recon.volume.channel import ChannelProblem
-from recon.volume.model import choose_model, members_of_depths, sort_by_depth
+from recon.camera.camera_model import choose_model, members_of_depths, sort_by_depth
+from recon.reconstruction.channel import ChannelProblem
+from recon.solvers import StopReason, memory
 
 SIZE, DEPTHS, SPAN = 40, 8, 0.4
 PITCH_UM, DISTANCE_MM = 10.0, 5.0

@@ -9,9 +9,9 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.correlation import similarity
 from recon.analysis.field import across_field
+from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf, rescaled
+from recon.camera.registration import register
 from recon.errors import InputError
-from recon.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf, rescaled
-from recon.registration import register
 from recon.types import Calibration, Geometry
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0))

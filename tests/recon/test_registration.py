@@ -8,19 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from recon.camera.registration import aligned, depth_scale, displacement, expected_shift, register, scaled
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
 from recon.optics.grid import PixelGrid
 from recon.optics.spectrum import GREEN
 from recon.optics.wave import WavePropagator
-from recon.registration import (
-    aligned,
-    depth_scale,
-    displacement,
-    expected_shift,
-    register,
-    scaled,
-)
 
 Image = npt.NDArray[np.float32]
 D_UM, PITCH_UM = 8900.0, 13.0

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from recon import fft
-from recon.metrics import psnr
-from recon.operators import Convolution3D, Erasures, PadCropConvolution
+from recon.base import fft
+from recon.base.metrics import psnr
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution3d import Convolution3D
+from recon.camera.erasures import Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
 from recon.solvers.cosine_preconditioner import CosinePreconditioner

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from recon.camera.base import estimate_norm
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.interpolation import interpolation_weights
+from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.camera.low_rank import low_rank, principal_psfs
 from recon.errors import InputError
-from recon.operators import PadCropConvolution
-from recon.operators.base import estimate_norm
-from recon.operators.interpolation import interpolation_weights
-from recon.operators.local_convolution import FieldOfPsfs, local_convolution
-from recon.operators.low_rank import low_rank, principal_psfs
 
 GRID = np.array([(y, x) for y in (-8, 1, 7) for x in (-9, 0, 8)], float)
 SCATTERED = np.array([(-7, -8), (-6, 7), (0, 1), (8, -5), (7, 9), (2, -9)], float)

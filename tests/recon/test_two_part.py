@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from recon.operators import local_convolution
-from recon.operators.two_part import two_part_field
+from recon.camera.local_convolution import local_convolution
+from recon.camera.two_part import two_part_field
 from recon.optics.fall_off import gaussian_fall_off
 
 PITCH_UM, Z_UM, DISTANCE_UM = 40.0, 3000.0, 2000.0

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import recon
-from recon.operators import local_convolution
-from recon.operators.local_convolution import FieldOfPsfs
-from recon.scenes import make_scene, score
-from recon.volume.light import LEAST_GAIN, levelled
-from recon.volume.model import Depths, sort_by_depth
+from recon.camera.camera_model import Depths, sort_by_depth
+from recon.camera.light import LEAST_GAIN, levelled
+from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scene_score import score
 
 
 def depths_of(gains: list[float]) -> Depths:

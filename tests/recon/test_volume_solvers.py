@@ -5,11 +5,13 @@ import threading
 import numpy as np
 import pytest
 
-from recon import threads
-from recon.operators import Convolution3D
+from recon.base import threads
+from recon.camera.convolution3d import Convolution3D
 from recon.priors import L1, NonNegativity
 from recon.solvers import Fista, StoppingRules, StopReason
-from recon.volume import DouglasRachford, LeanTotalVariation, LiteralAdmm
+from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.literal_volume import LiteralAdmm
+from recon.solvers.tv_admm_volume import LeanTotalVariation
 
 LONG = StoppingRules(iterations=3000, tolerance=1e-7)
 

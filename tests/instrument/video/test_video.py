@@ -19,25 +19,25 @@ import zarr
 from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
-from instrument.errors import BenchError, FileError
+from instrument.files.errors import BenchError, FileError
 from instrument.plan import Part, Plan
-from instrument.reconstruction_request import Settings
-from instrument.store import Run
-from instrument.video import block as block_module
-from instrument.video.block import BlockReport
-from instrument.video.crew import cluster, on_cluster
-from instrument.video.mp4 import as_shown, levels_of
-from instrument.video.output import VideoPictures
-from instrument.video.reconstruction import (
+from instrument.reconstruction import video_block as block_module
+from instrument.reconstruction.request import Settings
+from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
     finish_video,
     prepare_video,
     solve_video,
 )
-from instrument.video.source import has_light, require_video
+from instrument.reconstruction.video_block import BlockReport
+from instrument.reconstruction.video_mp4 import as_shown, levels_of
+from instrument.reconstruction.video_output import VideoPictures
+from instrument.reconstruction.video_source import has_light, require_video
+from instrument.reconstruction.video_workers import cluster, on_cluster
+from instrument.runs.run import Run
 from recon import reconstruct
-from recon.metrics import psnr
+from recon.base.metrics import psnr
 from tests.mocks.recordings import write_recording
 
 SHAPE = (40, 52)
@@ -149,7 +149,7 @@ def test_a_video_cut_off_goes_on_and_ends_the_same(
     wanted = request(recording, tmp_path)
     prepared = prepare_video(wanted)
     cancel = threading.Event()
-    monkeypatch.setattr("instrument.video.crew.get_threads", lambda: 1)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.get_threads", lambda: 1)
     assert not solve_video(prepared, lambda _: cancel.set(), cancel)
     first = {0, 1, 2, 3}
     written = {t for t in range(11) if VideoPictures(wanted.out).is_written(t)}
@@ -177,7 +177,7 @@ def test_a_kill_between_pictures_and_mark_loses_nothing(
     wanted = request(recording, tmp_path)
     prepared = prepare_video(wanted)
     with monkeypatch.context() as patch:
-        patch.setattr("instrument.video.job.VideoJob.mark_done", die)
+        patch.setattr("instrument.reconstruction.video_job.VideoJob.mark_done", die)
         with pytest.raises(KilledError):
             block_module.solve_block(str(prepared.job.folder), str(wanted.out), 1)
     reports = solved(wanted)
@@ -289,9 +289,9 @@ def test_blocks_solved_together_are_in_memory_one_after_the_other(
         present.remove(number)
         return BlockReport(number, 0, 0, 0.0)
 
-    monkeypatch.setattr("instrument.video.crew.get_threads", lambda: 4)
-    monkeypatch.setattr("instrument.video.crew.set_threads", threads.append)
-    monkeypatch.setattr("instrument.video.crew.solve_block", solve)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.get_threads", lambda: 4)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.set_threads", threads.append)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.solve_block", solve)
     prepared = prepare_video(request(recording, tmp_path, over_time="tv"))
     assert solve_video(prepared, lambda _: None, threading.Event())
     assert (at_once, threads) == ([1, 1, 1], [4, 4])
@@ -327,7 +327,7 @@ def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path,
 
 
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("instrument.video.crew.CONNECT_S", 1)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.CONNECT_S", 1)
     with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
         pass
 
@@ -335,7 +335,7 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) 
 def test_an_unknown_scheduler_leaves_nothing_behind(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("instrument.video.crew.CONNECT_S", 1)
+    monkeypatch.setattr("instrument.reconstruction.video_workers.CONNECT_S", 1)
     arguments = ["reconstruct", str(recording), "--video", "--psf", str(recording.parent / "psf.npy")]
     out = ["--out", str(tmp_path / "s.ome.zarr"), "--scheduler", "tcp://127.0.0.1:9"]
     assert main([*arguments, "--dark", "20", *out]) == 2

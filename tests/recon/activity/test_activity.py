@@ -7,7 +7,8 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.activity import aligned, baseline, change, fading, find_regions, local_correlation, motion
+from recon.streams.baseline import aligned, baseline, change, fading, motion
+from recon.streams.regions import find_regions, local_correlation
 
 SHAPE = (40, 48)
 PLACES = ((10, 12), (12, 34), (29, 20))

@@ -9,8 +9,8 @@ from recon.analysis.correlation import autocorrelate, correlate, critical_scale,
 from recon.analysis.field import FieldPoint, convolution_holds_deg, field_of_view
 from recon.analysis.resolution import AxialResolution, axial_resolution, lateral_resolution
 from recon.analysis.sampling import axial_spacing_per_um, gaussian_response, lateral_spacing_um, voxel_grid
+from recon.camera.refocus import rescaled
 from recon.errors import InputError
-from recon.refocus import rescaled
 
 
 def gaussian(sigma: float, size: int = 65, centre: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:

@@ -9,11 +9,14 @@ import pytest
 
 import recon
 from recon import InputError
-from recon.auto import Wishes, choose, choose_picture
-from recon.auto.planes import put_back
-from recon.auto.precision import drift, precision_of
-from recon.auto.reduced import binned, enlarged, reduced_calibration
-from recon.scenes import make_scene, score
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scene_score import score
+from recon.reconstruction.decide import choose
+from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.planes import put_back
+from recon.reconstruction.precision import drift, precision_of
+from recon.reconstruction.reduced import binned, enlarged, reduced_calibration
+from recon.reconstruction.selection_picture import choose_picture
 from recon.solvers.stopping import StopReason
 
 
@@ -86,7 +89,7 @@ def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, 
     assert 0 < max(chosen_beads.provenance["light_in_planes_left_out"]) < 1
     assert not any("left out" in w for w in chosen_beads.warnings)
     wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
-    monkeypatch.setattr("recon.auto.volume.choose", lambda *_, **__: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection_volume.choose", lambda *_, **__: wrong)
     result = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", judged=False)
     assert result.choice is not None
     assert set(result.choice.planes) > {0, 1, 2}
@@ -104,7 +107,7 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
 ):
     scene = make_scene("beads", size=40, depths=6, grid=3, layers=(0.0, 0.3), density=0.5, seed=31)
     wrong = replace(choose(scene.measurement, scene.calibration, prior=prior), planes=tried)
-    monkeypatch.setattr("recon.auto.volume.choose", lambda *_, **__: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection_volume.choose", lambda *_, **__: wrong)
     runs = []
 
     def second_is_cancelled(*arguments, **settings):
@@ -117,7 +120,7 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
         runs.append(recon.reconstruct_volume(*arguments, **{**settings, "callback": count, "cancel": stop}))
         return runs[-1]
 
-    monkeypatch.setattr("recon.auto.volume.reconstruct_volume", second_is_cancelled)
+    monkeypatch.setattr("recon.reconstruction.selection_volume.reconstruct_volume", second_is_cancelled)
     result = recon.reconstruct_volume(scene.measurement, scene.calibration, prior=prior, judged=False)
     assert [len(run.histories[0]) for run in runs][1:] == [stopped_at]
     assert result.stop_reasons == (StopReason.CANCELLED,)
@@ -216,7 +219,7 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
         "y": {"values": [32, 64]},
         "methods": {"admm tv": {"error": [[1e-4, 1e-3], [1e-3, 1e-2]]}},
     }}  # fmt: skip
-    monkeypatch.setattr("recon.auto.precision.shipped_maps", lambda: rough)
+    monkeypatch.setattr("recon.reconstruction.precision.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
     assert precision_of(Wishes(), 1000, 64).value == "float64"
     assert precision_of(Wishes(precision="float32"), 1000, 64).value == "float32"
@@ -315,7 +318,7 @@ def test_a_strong_background_is_noticed_and_none_is_added_to_one_that_was_given(
 @pytest.mark.parametrize("factor", [2, 3])
 def test_binned_and_enlarged_keep_place_and_light(n, factor):
     rng = np.random.default_rng(0)
-    from recon.operators import PadCropConvolution
+    from recon.camera.convolution import PadCropConvolution
 
     psf = np.zeros((1, n, n), np.float32)
     psf[0, n // 2, n // 2] = 1

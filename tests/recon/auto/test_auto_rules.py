@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 
 import recon
-from recon.auto import Wishes, choose, choose_picture
-from recon.operators.local_convolution import FieldOfPsfs
-from recon.scenes import make_scene, score
-from recon.volume import field_registration, remembered
-from recon.volume.channel import ChannelProblem
-from recon.volume.field_registration import NOT_ON_AXIS
-from recon.volume.model import sort_by_depth
-from recon.volume.reconstruct import prepare_volume
+from recon.camera import field_registration
+from recon.camera import registration_cache as remembered
+from recon.camera.camera_model import sort_by_depth
+from recon.camera.field_registration import NOT_ON_AXIS
+from recon.camera.local_convolution import FieldOfPsfs
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scene_score import score
+from recon.reconstruction.channel import ChannelProblem
+from recon.reconstruction.decide import choose
+from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.selection_picture import choose_picture
+from recon.reconstruction.volume import prepare_volume
 
 
 def decision(choice, name):

@@ -8,14 +8,14 @@ import pytest
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.psf_step import BeadMixer, limit_rank, solve_psfs
 from recon.blind.start import first_psf, offset_of
+from recon.camera.interpolation import interpolation_weights
+from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
+from recon.camera.registration import displacement, shifted
 from recon.errors import InputError
-from recon.operators.interpolation import interpolation_weights
-from recon.operators.local_convolution import FieldOfPsfs, field_of, local_convolution
 from recon.optics.diffuser import microlens_diffuser
 from recon.optics.grid import PixelGrid
 from recon.optics.rays import RayPropagator
 from recon.optics.spectrum import mixed_spectrum
-from recon.registration import displacement, shifted
 
 SENSOR, PSF = (16, 18), (7, 5)
 POINTS = np.array([(r, c) for r in (-4, 4) for c in (-5, 5)], float)

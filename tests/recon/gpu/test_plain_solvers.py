@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 import recon
-from recon import threads
+from recon.base import threads
+from recon.base.metrics import psnr
+from recon.base.namespace import array_namespace, require_memory
+from recon.camera.background import BackgroundRemoval
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution3d import Convolution3D
+from recon.camera.erasures import Erasures
 from recon.errors import InputError, StructureError
-from recon.gpu import DepthCamera, PlainDouglasRachford, PlainTotalVariation, array_namespace
-from recon.gpu.namespace import require_memory
-from recon.gpu.picture import picture_solver
-from recon.metrics import psnr
-from recon.operators import BackgroundRemoval, Convolution3D, Erasures, PadCropConvolution
 from recon.priors import L1, Box, NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm, StoppingRules
-from recon.volume import DouglasRachford, LeanTotalVariation
+from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.gpu_camera import DepthCamera
+from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
+from recon.solvers.gpu_picture import picture_solver
+from recon.solvers.gpu_total_variation import PlainTotalVariation
+from recon.solvers.tv_admm_volume import LeanTotalVariation
 
 SENSOR = (12, 11)
 
@@ -184,7 +190,7 @@ def test_the_gpus_method_makes_the_picture_or_says_what_to_install(monkeypatch, 
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
             recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
-    monkeypatch.setattr("recon.gpu.array_namespace", lambda _device: np)
+    monkeypatch.setattr("recon.base.namespace.array_namespace", lambda _device: np)
     plain = recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
     assert plain.image.dtype == np.float32
     assert psnr(plain.image, shot.truth) > 26
@@ -209,9 +215,9 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
     # Another module than numpy, with its functions: what a GPU's is to the code.
     twin = types.ModuleType("twin")
     twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
-    monkeypatch.setattr("recon.gpu.total_variation.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.gpu.douglas_rachford.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.volume.channel.array_namespace", lambda _device: twin)
+    monkeypatch.setattr("recon.solvers.gpu_total_variation.require_memory", lambda *_: None)
+    monkeypatch.setattr("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None)
+    monkeypatch.setattr("recon.reconstruction.channel.array_namespace", lambda _device: twin)
     device = recon.reconstruct_volume(measurement, calibration, device="gpu", **options)
     assert host.volume.max() > 0
     np.testing.assert_allclose(device.volume, host.volume, atol=2e-3 * host.volume.max())

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from recon import Calibration, InputError, NoiseModel, reconstruct
-from recon.live import LivePicture, LiveReconstructor, SceneState, SceneWatch
-from recon.live.level import Level, binned
-from recon.live.pace import HOLD, Pace, Spent
-from recon.metrics import psnr
+from recon.base.metrics import psnr
+from recon.streams.live import LivePicture, LiveReconstructor
+from recon.streams.live_level import Level, binned
+from recon.streams.pace import HOLD, Pace, Spent
+from recon.streams.stillness import SceneState, SceneWatch
 
 SHAPE = (64, 96)
 AMPLE_MS = 5000.0
@@ -186,7 +187,7 @@ def lacking(monkeypatch: pytest.MonkeyPatch) -> set[int]:
                 raise MemoryError("none left")
             super().__init__(psfs, binning, *rest)
 
-    monkeypatch.setattr("recon.live.reconstructor.Level", NoMemory)
+    monkeypatch.setattr("recon.streams.live.Level", NoMemory)
     return binnings
 
 
@@ -217,7 +218,7 @@ def test_a_finer_binning_without_memory_is_not_tried_again(
     lacking: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reconstructor = live(coarsest=4, budget_ms=AMPLE_MS)
-    monkeypatch.setattr("recon.live.reconstructor.AT_ONCE", 500)  # begins coarse
+    monkeypatch.setattr("recon.streams.live.AT_ONCE", 500)  # begins coarse
     lacking.add(1)
     assert iterated(reconstructor, photograph(0, 0)).binning == 4
     tried: list[int] = []
@@ -259,7 +260,7 @@ def test_an_error_in_making_a_level_is_told_by_the_next_frame(monkeypatch: pytes
         def __init__(self, *_: object) -> None:
             raise ValueError("broken")
 
-    monkeypatch.setattr("recon.live.reconstructor.Level", Broken)
+    monkeypatch.setattr("recon.streams.live.Level", Broken)
     reconstructor = live()
     reconstructor.feed(photograph(0, 0))
     assert reconstructor._coming is not None

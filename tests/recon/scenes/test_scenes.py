@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from recon import InputError, reconstruct
-from recon.registration import expected_shift
-from recon.scenes import FAMILIES, make_scene, score, spec_of
-from recon.scenes.lenslets import build_camera
+from recon.camera.registration import expected_shift
+from recon.evaluation.lenslets import build_camera
+from recon.evaluation.scene import FAMILIES, make_scene, spec_of
+from recon.evaluation.scene_score import score
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -16,13 +16,13 @@ from scipy.interpolate import griddata
 from recon.analysis.points import Noise, try_points
 from recon.analysis.resolution import axial_resolution
 from recon.analysis.window import WindowProblem
-from recon.scenes import SceneSpec
-from recon.scenes.lenslets import build_camera
-from recon.stability.catalogue import map_named
-from recon.stability.failure import DIP, worst
-from recon.stability.map import boundary
-from recon.stability.maps_scene import local_condition
-from recon.stability.scene_trial import Options, judge_image, run_scene, scene_of, solve
+from recon.evaluation.catalogue import map_named
+from recon.evaluation.lenslets import build_camera
+from recon.evaluation.maps_scene import local_condition
+from recon.evaluation.scene import SceneSpec
+from recon.evaluation.scene_trial import Options, judge_image, run_scene, scene_of, solve
+from recon.verdict.failure import DIP, worst
+from recon.verdict.map import boundary
 
 if TYPE_CHECKING:
     from tests.recon.conftest import DrawnMap

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from recon.camera.convolution import PadCropConvolution
 from recon.errors import InputError
-from recon.operators import PadCropConvolution
+from recon.evaluation.catalogue import MAPS, map_named
+from recon.evaluation.maps_solver import _OffBalance
+from recon.evaluation.stability_run import run_map
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.stability.catalogue import MAPS, map_named
-from recon.stability.failure import Failure
-from recon.stability.map import Axis, Cell, StressMap, Trial, as_text, boundary, severity_grid
-from recon.stability.maps_solver import _OffBalance
-from recon.stability.run import run_map
+from recon.verdict.failure import Failure
+from recon.verdict.map import Axis, Cell, StressMap, Trial, as_text, boundary, severity_grid
 
 X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
 Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))

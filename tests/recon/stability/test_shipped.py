@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from instrument.stability_file import read_stability
-from recon.stability.catalogue import MAPS
-from recon.stability.shipped import shipped_file
+from instrument.files.stability_file import read_stability
+from recon.evaluation.catalogue import MAPS
 from recon.verdict.cases import ALIKE, ALIKE_VOLUMES, DERIVED, GROUPS, cases_of, mixed_scenes
 from recon.verdict.evidence import Evidence
 from recon.verdict.judge import FEWEST, STRESSES
+from recon.verdict.shipped import shipped_file
 
 DOCS = Path(__file__).parents[3] / "docs"
 SHIPPED = read_stability(shipped_file())["maps"]

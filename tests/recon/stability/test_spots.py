@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.stability.spots import spot_severity
+from recon.evaluation.stability_spots import spot_severity
 
 Floats = np.ndarray
 

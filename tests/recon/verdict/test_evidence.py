@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from recon import InputError, reconstruct, reconstruct_volume
-from recon.scenes import SceneSpec, make_scene
+from recon.camera.camera_model import Depths
+from recon.camera.light import plane_gains
+from recon.evaluation.scene import SceneSpec, make_scene
+from recon.reconstruction.channel import Scaled
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import _dimming, _similarity, measure
 from recon.verdict.verdict import Region
-from recon.volume.channel import Scaled
-from recon.volume.light import plane_gains
-from recon.volume.model import Depths
 
 RNG = np.random.default_rng(1)
 
@@ -198,8 +198,8 @@ def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("recon.volume.reconstruct.evidence_of", fail)
-    monkeypatch.setattr("recon.picture.evidence_of", fail)
+    monkeypatch.setattr("recon.reconstruction.volume.evidence_of", fail)
+    monkeypatch.setattr("recon.reconstruction.picture.evidence_of", fail)
     volume = make_scene(SceneSpec("beads", size=32, depths=2))
     picture = make_scene(SceneSpec("sparse-picture", size=32))
     for result in (

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from recon import InputError
-from recon.operators import PadCropConvolution
+from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm
-from recon.video import video_camera
-from recon.video.joint import JointAdmm, OverTimeName, solve_together
-from recon.video.over_time import LowRankPlusSparse, TemporalTotalVariation
+from recon.streams.joint import JointAdmm, OverTimeName, solve_together
+from recon.streams.over_time import LowRankPlusSparse, TemporalTotalVariation
+from recon.streams.video import video_camera
 
 
 def dual_minimum(course: np.ndarray, threshold: float) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""The demo: calibrate, photograph, reconstruct on the simulated bench."""

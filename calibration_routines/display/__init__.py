@@ -1,0 +1,1 @@
+"""SLM response, mask alignment, hologram photographs."""

@@ -1,0 +1,234 @@
+"""Find the scattering mask's pose by spots on the camera, and move the stage to take out what it can.
+
+Kuo 2020, Sec. 7.4, hill-climbs the brightness of one spot, which is felt only within one SLM pixel. Here
+nothing moves at first: each picture holds many spots, each computed for another hypothesis about the pose.
+
+1. The mask's own speckle (blank SLM) registers the camera.
+2. Search: shift in steps of one SLM pixel, at a few depths; the spots that stand out are candidates, tried
+   with rotations and scales, then on finer grids (:mod:`~calibration_routines.display.mask_search`).
+3. Refinement: pairs of spots on either side of the pose, a pair a parameter; all eight parameters in one
+   step (:mod:`~calibration_routines.display.mask_refinement`).
+4. The stage: a small move and back tells which way its axes go and how well it comes back; then it takes out
+   shift, depth, rotation and significant tilts, until a further move promises less than that repeatability
+   (:mod:`~calibration_routines.display.mask_stage`).
+5. Sections of the SLM make spots of their own: their shifts give the smooth rest of the displacement, which
+   stays in the model. Then 3 once more, about that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.alignment_session import (
+    AlignmentFailedError,
+    AlignmentSession,
+    AlignmentSettings,
+    Progress,
+)
+from calibration_routines.display.display_io import DisplayBench, approach_from_below
+from calibration_routines.display.mask_refinement import Measured, measure_sections, refine_pose
+from calibration_routines.display.mask_search import search_pose
+from calibration_routines.display.mask_stage import MaskStage
+from calibration_routines.display.placement_cost import PlacementCost
+from calibration_routines.display.spot_camera import SpotLook
+from recon.errors import InputError
+from recon.holography import Display
+from recon.holography.camera_map import CameraMap
+from recon.holography.pose import NAMES, Pose
+from recon.holography.sections import SmoothField
+
+__all__ = ["AlignmentFailedError", "AlignmentReport", "AlignmentSettings", "MaskAlignment"]
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(slots=True)
+class AlignmentReport:
+    """What was found.
+
+    Attributes
+    ----------
+    pose : Pose
+        What is left, with the stage where it ended; holograms are to be computed with it.
+    error : ndarray, float64, (8,)
+        Standard uncertainty of each parameter.
+    rest : ndarray, float64, (rows, columns, 2)
+        Smooth displacement beyond the pose's, on the nodes of :meth:`Pose.displacement`, mask pixels.
+    efficiency : float
+        Brightness of spots at the pose over the model's ideal (the display's DC term taken off).
+    psnr_lost_db : float
+        What a hologram computed with the result is expected to lose to what remains unknown or cannot be
+        modelled: uncertainties, distance, tilts.
+    repeatability_db : float
+        What a hologram would lose to the difference between two visits of the same place; nan where the
+        stage was not moved.
+    found_at : Pose
+        What was found before the stage moved.
+    directions : dict of axis name to 1 or -1
+        As tested; -1 goes against its name.
+    frames : int
+    mask_shape : (int, int)
+        Of the mask, in its pixels.
+    camera : CameraMap
+    brightness_per_ms : float
+        Camera counts a millisecond for the mean intensity.
+    log : list of str
+    efficiencies : list of (int, float)
+        Frames taken and efficiency after each step.
+    """
+
+    pose: Pose
+    error: npt.NDArray[np.float64]
+    rest: npt.NDArray[np.float64]
+    efficiency: float
+    psnr_lost_db: float
+    repeatability_db: float
+    found_at: Pose
+    directions: dict[str, int]
+    frames: int
+    mask_shape: tuple[int, int]
+    camera: CameraMap
+    brightness_per_ms: float
+    log: list[str] = field(default_factory=list)
+    efficiencies: list[tuple[int, float]] = field(default_factory=list)
+
+    def displacement(self, mask_shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        """Return the displacement field for :class:`recon.holography.Display`."""
+        return self.pose.displacement(mask_shape) + self.rest
+
+
+class MaskAlignment:
+    """Runs the procedure on an open bench.
+
+    Parameters
+    ----------
+    io : DisplayBench
+    display : Display
+        What is known of the display; its displacement is not used.
+    settings : AlignmentSettings
+    progress : callable, optional
+        ``progress(words, frames_taken)``; may raise to end the alignment.
+    on_look : callable, optional
+        Called with every picture of spots.
+    """
+
+    def __init__(
+        self,
+        io: DisplayBench,
+        display: Display,
+        settings: AlignmentSettings | None = None,
+        *,
+        progress: Progress | None = None,
+        on_look: Callable[[SpotLook], object] | None = None,
+    ) -> None:
+        self.io = io
+        self.settings = settings or AlignmentSettings()
+        self.session = AlignmentSession(io, display, self.settings, progress, on_look)
+        self._cost = PlacementCost(self.session.display)
+        self._repeatability_db = float("nan")
+        self._directions: dict[str, int] = {}
+
+    def run(self) -> AlignmentReport:
+        """Align; returns what was found and leaves the stage at the best pose.
+
+        Raises
+        ------
+        AlignmentFailedError
+            When the pose was not found or too many frames would be needed. The stage is back where it was.
+        DeviceError
+            When a device fails or a move is refused; the stage stays where it is.
+        """
+        stage = self.io.bench.stage
+        start = stage.commanded_position() if stage is not None else {}
+        try:
+            return self._run()
+        except (AlignmentFailedError, InputError) as error:
+            if stage is not None and stage.commanded_position() != start:
+                approach_from_below(stage, start)
+            if isinstance(error, InputError):
+                raise AlignmentFailedError(str(error)) from error
+            raise
+
+    def _run(self) -> AlignmentReport:
+        session, settings = self.session, self.settings
+        stage = MaskStage(session, self.io.bench.stage) if self.io.bench.stage and settings.moves else None
+        if stage is not None:
+            stage.go(stage.position)  # from below, as every place from now on
+        session.register()
+        found = refine_pose(session, search_pose(session), 3)
+        found_at = found.pose
+        if stage is not None:
+            session.check(found.efficiency, floor=0.15)
+            found = self._move(stage, found)
+        smooth, _ = measure_sections(session, found.pose)
+        pose, rest = _place(found.pose, smooth, session.display.mask.shape)
+        session.spots.maker.rest = rest
+        last = refine_pose(session, pose, settings.refinements, quick=0)
+        session.check(last.efficiency)
+        # Sections see the displacement better than probes of the whole SLM do, those see depth and tilts.
+        deep = [NAMES.index(name) for name in ("z_um", "pitch_mrad", "yaw_mrad")]
+        values, error = pose.vector(), smooth.error.copy()
+        values[deep], error[deep] = last.pose.vector()[deep], last.error[deep]
+        pose = Pose(*(float(v) for v in values))
+        return AlignmentReport(
+            pose,
+            error,
+            rest,
+            last.efficiency,
+            self._cost.lost_db(pose, error[deep], rest, smooth.modes),
+            self._repeatability_db,
+            found_at,
+            self._directions,
+            self.io.frames,
+            session.display.mask.shape,
+            session.spots.camera,
+            session.spots.mean_per_ms,
+            session.log,
+            session.efficiencies,
+        )
+
+    def _move(self, stage: MaskStage, at: Measured) -> Measured:
+        """Take out what the stage can, as long as that promises more than its repeatability."""
+        session, cost = self.session, self._cost
+        at, apart = stage.test(at)
+        self._directions = stage.direction
+        self._repeatability_db = cost.of_difference_db(stage.removable(at.pose), apart)
+        session.say(f"repeatability: {self._repeatability_db:.2f} dB")
+        visited = [(cost.psnr_db(at.pose), at, stage.position)]
+        for move in range(self.settings.moves):
+            psnr, at, _ = visited[-1]
+            promised = cost.in_place(stage.removable(at.pose))
+            session.say(f"a move promises {promised - psnr:+.2f} dB")
+            if promised - psnr <= self._repeatability_db:
+                break
+            if session.frames_left < self.settings.last_frames + 8:
+                session.say("no frames are left for another move")
+                break
+            expected = stage.take_out(at)
+            if expected is None:
+                break
+            session.register()
+            at = refine_pose(session, expected, 4)
+            visited.append((cost.psnr_db(at.pose), at, stage.position))
+            session.say(f"stage move {move + 1}: efficiency {at.efficiency:.2f}")
+        best = max(visited, key=lambda place: place[0])
+        if best is not visited[-1]:
+            session.say("back to the best place")
+            stage.go(best[2])
+            session.register()
+            return refine_pose(session, best[1].pose, 2, quick=0)
+        return visited[-1][1]
+
+
+def _place(
+    pose: Pose, smooth: SmoothField, mask_shape: tuple[int, int]
+) -> tuple[Pose, npt.NDArray[np.float64]]:
+    """Add a smooth field to a pose; the pose's own distortion becomes part of the rest."""
+    plain = pose.with_(cubic=0.0)
+    rest = smooth.rest + pose.displacement(mask_shape) - plain.displacement(mask_shape)
+    return plain.plus(smooth.change), rest

@@ -1,0 +1,93 @@
+"""Find the mask roughly without moving anything: every spot is another hypothesis about its pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.alignment_session import AlignmentSession
+from recon.holography.pose import Pose
+from recon.holography.spots import depth_um
+
+Array = npt.NDArray[Any]
+
+SHORT_LIST = 24
+"""Shifts that are tried with rotations: a mask at the largest rotation is seldom the brightest, but among
+these."""
+
+
+def search_pose(session: AlignmentSession) -> Pose:
+    """Search shift and depth on a grid, then the best ones with rotations and scales, then on finer grids."""
+    candidates = _shifts(session)
+    settings, k, depth = session.settings, session.display.factor, depth_um(session.display)
+    roll, scale = settings.roll_mrad, settings.scale
+    turned = [c.with_(roll_mrad=r) for c in candidates for r in (-0.6 * roll, 0.0, 0.6 * roll)]
+    candidates = _best(session, turned, 6, "rotation")
+    scaled = [
+        c.with_(roll_mrad=c.roll_mrad + r, scale=s)
+        for c in candidates
+        for r in (-0.25 * roll, 0.0, 0.25 * roll)
+        for s in (-0.6 * scale, 0.0, 0.6 * scale)
+    ]
+    candidates = _best(session, scaled, 3, "rotation and scale")
+    steps = np.array([-0.75, -0.375, 0, 0.375, 0.75]) * k
+    moved = [
+        c.with_(shift_x=c.shift_x + x, shift_y=c.shift_y + y)
+        for c in candidates
+        for x in steps
+        for y in steps
+    ]
+    candidates = _best(session, moved, 2, "shift")
+    deep = [
+        c.with_(z_um=c.z_um + z, roll_mrad=c.roll_mrad + r)
+        for c in candidates
+        for z in np.linspace(-1, 1, 9) * depth
+        for r in (-0.15 * roll, 0.0, 0.15 * roll)
+    ]
+    return _best(session, deep, 1, "depth")[0]
+
+
+def _shifts(session: AlignmentSession) -> list[Pose]:
+    """Search the whole reach in steps of one SLM pixel, at as many depths as spots need."""
+    settings, k = session.settings, session.display.factor
+    steps = int(np.ceil(settings.reach / k))
+    layers = max(1, int(np.ceil(settings.depth_um / depth_um(session.display))))
+    depths = np.linspace(-1, 1, 2 * layers + 1)[1::2] * settings.depth_um if layers > 1 else np.zeros(1)
+    grid = [(i, j) for i in range(-steps, steps + 1) for j in range(-steps, steps + 1)]
+    hypotheses = [Pose(shift_x=k * j, shift_y=k * i, z_um=z) for z in depths for i, j in grid]
+    brightness = np.empty(len(hypotheses))
+    order = np.random.default_rng(1).permutation(len(hypotheses))
+    for first in range(0, len(order), settings.spots):
+        chosen = order[first : first + settings.spots]
+        brightness[chosen], _ = session.spots.measure([hypotheses[n] for n in chosen], shifts_only=True)
+        session.tell("search for the shift")
+    score = _smooth(brightness.reshape(len(depths), 2 * steps + 1, 2 * steps + 1)).ravel()
+    ranked = np.argsort(score)[::-1]
+    beyond = score[ranked[min(SHORT_LIST, len(ranked) - 1)]]
+    session.say(
+        f"search: {len(hypotheses)} hypotheses, best {score[ranked[0]]:.1f}, first left out {beyond:.1f}, "
+        f"median {np.median(score):.2f}"
+    )
+    return [hypotheses[n] for n in ranked[:SHORT_LIST]]
+
+
+def _best(session: AlignmentSession, poses: Sequence[Pose], count: int, words: str) -> list[Pose]:
+    """Measure poses twice with other places for the spots and return the brightest ones."""
+    total = sum(session.spots.measure(poses)[0] for _ in range(2))
+    session.tell(words)
+    order = np.argsort(total)[::-1]
+    return [poses[n] for n in order[:count]]
+
+
+def _smooth(maps: Array) -> Array:
+    """Add neighbours in shift, weighted: a mask between two hypotheses lights both."""
+    padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)))
+    height, width = maps.shape[1:]
+    total = np.zeros_like(maps)
+    for i, wy in enumerate((0.4, 1.0, 0.4)):
+        for j, wx in enumerate((0.4, 1.0, 0.4)):
+            total += wy * wx * padded[:, i : i + height, j : j + width]
+    return total

@@ -1,0 +1,175 @@
+"""The stage that carries the mask: which way its axes go, how well it comes back, taking out a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.alignment_session import AlignmentFailedError, AlignmentSession
+from calibration_routines.display.display_io import approach_from_below
+from calibration_routines.display.mask_refinement import Measured, refine_pose
+from drivers.stage import Stage
+from recon.holography.pose import NAMES, Pose
+
+Values = dict[str, float]
+
+PARAMETERS = {
+    "x_um": "shift_x",
+    "y_um": "shift_y",
+    "z_um": "z_um",
+    "roll_mrad": "roll_mrad",
+    "pitch_mrad": "pitch_mrad",
+    "yaw_mrad": "yaw_mrad",
+}
+"""Stage axes and the pose parameters that they change."""
+
+TEST_STEPS = {"x_um": 1.1, "y_um": 0.6, "z_um": 0.5, "roll_mrad": 0.5}
+"""Test moves, in the steps that cost a spot a third to a half of its light. They differ between x and y, so
+that exchanged axes do not pass. Tilts of a few milliradians are not felt by spots and not tested."""
+
+
+class MaskStage:
+    """Moves the mask on an open bench; every place is approached from below on every axis.
+
+    Parameters
+    ----------
+    session : AlignmentSession
+    stage : Stage
+        Homed.
+    """
+
+    def __init__(self, session: AlignmentSession, stage: Stage) -> None:
+        self.session = session
+        self.stage = stage
+        self.axes = [axis.name for axis in stage.axes if axis.name in PARAMETERS]
+        self.direction: dict[str, int] = {}
+        pitch = session.display.mask_pitch_um
+        self._units = {name: pitch if name in ("x_um", "y_um") else 1.0 for name in PARAMETERS}
+
+    @property
+    def position(self) -> Values:
+        """Commanded position of the axes that are used."""
+        here = self.stage.commanded_position()
+        return {name: here[name] for name in self.axes}
+
+    def go(self, target: Mapping[str, float]) -> None:
+        """Move there, from below."""
+        approach_from_below(self.stage, target)
+
+    def values(self, pose: Pose) -> Values:
+        """Return the pose's parameters that the axes change, in the axes' units."""
+        return {n: getattr(pose, PARAMETERS[n]) * self._units[n] for n in self.axes}
+
+    def test(self, at: Measured, pictures: int = 2) -> tuple[Measured, Pose]:
+        """Find out which way the axes go by a small move of all of them, and how well the stage comes back.
+
+        Parameters
+        ----------
+        at : Measured
+            Where the mask is now.
+        pictures : int
+            For each of the measurements after the moves.
+
+        Returns
+        -------
+        Measured
+            Where the mask is, back at its place.
+        Pose
+            By how much that differs from before: repeatability of stage and measurement together.
+
+        Raises
+        ------
+        AlignmentFailedError
+            When an axis did not do what it was asked for.
+        """
+        session, here = self.session, self.position
+        steps = self._test_move(at.pose)
+        if not steps:
+            return at, Pose()
+        self.go({name: here[name] + step for name, step in steps.items()})
+        session.register()
+        # Where the axes go the way of their names the mask is found at once; else from where it was before,
+        # which every step leaves within reach.
+        moved = refine_pose(session, self._moved(at.pose, steps), pictures, quick=1, floor=-1)
+        if moved.efficiency < 0.6 * at.efficiency:
+            moved = refine_pose(session, at.pose, pictures, quick=3)
+        before, after, error = self.values(at.pose), self.values(moved.pose), self._errors(at, moved)
+        for name, step in steps.items():
+            found = after[name] - before[name]
+            if abs(abs(found) - abs(step)) > max(0.35 * abs(step), 4 * error[name]):
+                self.go(here)
+                raise AlignmentFailedError(
+                    f"Axis {name} of {self.stage.name} was moved by {step:+.3g}; the spots say {found:+.3g} "
+                    f"+- {error[name]:.2g}. Check which axis it is, its unit, and whether the mask is fixed."
+                )
+            self.direction[name] = 1 if found * step > 0 else -1
+        self.go(here)
+        session.register()
+        back = refine_pose(session, at.pose, pictures + 1, quick=0)
+        turned = [name for name, sign in self.direction.items() if sign < 0]
+        session.say(
+            f"axes tested: {', '.join(self.direction)}"
+            + (f"; reversed: {', '.join(turned)}" if turned else "")
+        )
+        return back, Pose(*(float(v) for v in back.pose.vector() - at.pose.vector()))
+
+    def take_out(self, at: Measured) -> Pose | None:
+        """Move against a pose; returns the pose to be expected, or None where no axis can do anything.
+
+        Axes that were not tested (tilts) are moved only for what clearly stands out of its uncertainty, and
+        are taken to go the way of their names.
+        """
+        here, limits = self.position, self.stage.limits
+        errors = self.values(Pose(*(float(v) for v in at.error)))
+        target: Values = {}
+        left = self.values(at.pose)
+        for name, value in list(left.items()):
+            tested = self.direction.get(name, 0)
+            if not tested and abs(value) < 3 * errors[name]:
+                continue
+            sign = tested or 1
+            low, high = limits[name]
+            wanted = here[name] - sign * value
+            target[name] = float(np.clip(wanted, low, high))
+            left[name] = value + sign * (target[name] - here[name])
+            if target[name] != wanted:
+                self.session.say(f"{name} reaches its limit; {left[name]:+.3g} stay")
+        if not target:
+            return None
+        self.go(target)
+        self.session.say("stage: " + ", ".join(f"{n} {target[n] - here[n]:+.3g}" for n in target))
+        return self._with(at.pose, left)
+
+    def removable(self, pose: Pose) -> Pose:
+        """Return the pose with everything that the axes change taken out."""
+        return pose.with_(**{PARAMETERS[name]: 0.0 for name in self.axes})
+
+    def _test_move(self, pose: Pose) -> Values:
+        """Return a small step of each axis, towards the right place if it goes the way of its name."""
+        session, here = self.session, self.position
+        natural = dict(zip(NAMES, session.probe.steps, strict=True))
+        values, steps = self.values(pose), {}
+        for name in self.axes:
+            if name not in TEST_STEPS:
+                continue
+            step = TEST_STEPS[name] * float(natural[PARAMETERS[name]]) * self._units[name]
+            low, high = self.stage.limits[name]
+            towards = -1 if values[name] > 0 else 1
+            fitting = [s * step for s in (towards, -towards) if low <= here[name] + s * step <= high]
+            if fitting:
+                steps[name] = fitting[0]
+        return steps
+
+    def _moved(self, pose: Pose, steps: Values) -> Pose:
+        """Return the pose after steps of axes that go the way of their names."""
+        values = self.values(pose)
+        return self._with(pose, {name: values[name] + step for name, step in steps.items()})
+
+    def _with(self, pose: Pose, values: Values) -> Pose:
+        return pose.with_(**{PARAMETERS[n]: v / self._units[n] for n, v in values.items()})
+
+    def _errors(self, a: Measured, b: Measured) -> Values:
+        total: npt.NDArray[np.float64] = np.hypot(a.error, b.error)
+        return self.values(Pose(*(float(v) for v in total)))

@@ -1,0 +1,1 @@
+"""Angular response, DPC, beads, photographs."""

@@ -1,0 +1,333 @@
+"""A diffuser's phase and height by differential phase contrast with the LED array (Kuo 2020, A.2).
+
+The diffuser is the sample of a microscope lit by half circles of the array; four images and dark frames give
+the phase (:mod:`recon.analysis.dpc`), the material's index the height, and the height the histograms of
+slope and deflection that tell a diffuser's quality.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.errors import CalibrationError, RunEndedError
+from calibration_routines.psf.auto_exposure import AutoExposure, auto_expose, hot_pixels
+from calibration_routines.psf.axial_analysis import DarkModel, replace_hot
+from drivers.led_array import LedArray
+from instrument.bench.bench import Bench
+from instrument.files.atomic import whole_file, write_text
+from instrument.files.errors import BenchError, SettingsError
+from instrument.plan import OFF, Light, Part, Plan, check
+from instrument.runs.acquire import abilities_of, prepare
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import Progress
+from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
+
+OVERFILL = 1.3
+"""Aperture of the lit half circles over the objective's. More than 1, so that deflected light enters on one
+side as it leaves on the other (docs/decisions/0016-dpc.md)."""
+LEAST_LEDS = 24
+"""Inside the objective's aperture: fewer, and slopes show in steps, as single LEDs cross the pupil's edge."""
+BANDS = ("red", "green", "blue")
+RESULT_FILE, HEIGHT_FILE = "dpc.json", "height_um.npy"
+SETUP_FILE = "dpc_setup.json"
+"""In the run's folder: what its frames are for."""
+_TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
+_EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
+
+Image = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class DpcSetup:
+    """The microscope and the sample.
+
+    Attributes
+    ----------
+    objective_na : float
+    magnification : float
+        From the sample to the camera.
+    index : float
+        Refractive index of the sample at the wavelength, in air (polycarbonate: 1.58).
+    band : {"red", "green", "blue"}
+        LEDs used.
+    average, dark_frames : int
+    """
+
+    objective_na: float
+    magnification: float
+    index: float = 1.58
+    band: str = "green"
+    average: int = 8
+    dark_frames: int = 8
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not 0 < self.objective_na < 0.95:
+            problems.append(
+                ("objective_na", f"the objective's NA lies between 0 and 0.95, not {self.objective_na:g}")
+            )
+        if not self.magnification > 0:
+            problems.append(("magnification", f"the magnification is above 0, not {self.magnification:g}"))
+        if not 1 < self.index < 4:
+            problems.append(("index", f"the index lies between 1 and 4, not {self.index:g}"))
+        if self.band not in BANDS:
+            problems.append(("band", f"the LEDs are red, green or blue, not {self.band!r}"))
+        if min(self.average, self.dark_frames) < 1:
+            name = "average" if self.average < 1 else "dark_frames"
+            problems.append((name, "average and dark frames are at least 1"))
+        if problems:
+            raise SettingsError(problems)
+
+
+@dataclass(frozen=True)
+class DiffuserSurface:
+    """What was measured.
+
+    Attributes
+    ----------
+    height_um : ndarray, float32, (height, width)
+        Relative to the plane that fits best.
+    phase_rad : ndarray, float32, (height, width)
+    pitch_um : float
+        In the sample.
+    slope_deg, deflection_deg : ndarray, float64, (height, width)
+        Magnitudes of the surface's slope, and of a normal ray's deflection.
+    bench : str
+    simulated : bool
+    """
+
+    height_um: Image
+    phase_rad: Image
+    pitch_um: float
+    slope_deg: npt.NDArray[np.float64]
+    deflection_deg: npt.NDArray[np.float64]
+    bench: str = ""
+    simulated: bool = False
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures of merit as the dissertation gives them (A.2): slope and deflection in degrees."""
+        return {
+            "height_rms_um": float(self.height_um.std()),
+            "slope_mean_deg": float(self.slope_deg.mean()),
+            "slope_rms_deg": float(np.sqrt((self.slope_deg**2).mean())),
+            "deflection_hwhm_deg": half_width_deg(self.deflection_deg),
+            "deflection_largest_deg": float(np.quantile(self.deflection_deg, _EDGE_QUANTILE)),
+        }
+
+
+def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
+    """Return the half width at half maximum of the deflection along one axis, degrees.
+
+    A Gaussian's, from the root mean square of both axes: a diffuser's data sheet gives this width.
+    """
+    rms_axis = float(np.sqrt((deflection_deg**2).mean() / 2))
+    return rms_axis * float(np.sqrt(2 * np.log(2)))
+
+
+def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
+    """Return the plan: dark frames, then the four halves.
+
+    Raises
+    ------
+    BenchError
+        When the array does not reach beyond the objective's aperture.
+    """
+    na, rgb = _illumination_na(array, setup), _rgb(setup)
+    lights = [Light.of(array.dpc_half(side, na, rgb)) for side in SIDES]
+    return Plan(
+        label="dpc",
+        parts=(
+            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=setup.dark_frames),
+            *(
+                Part(label=side, light=(light,), exposures_ms=(exposure_ms,), repeats=setup.average)
+                for side, light in zip(SIDES, lights, strict=True)
+            ),
+        ),
+    )
+
+
+def measure_diffuser(
+    bench: Bench,
+    setup: DpcSetup,
+    folder: Path | str | None = None,
+    *,
+    on_progress: Progress | None = None,
+    control: RunControl | None = None,
+) -> tuple[DiffuserSurface, Path]:
+    """Photograph the four halves and compute the surface; saved in the run's folder.
+
+    Returns
+    -------
+    surface : DiffuserSurface
+    file : Path
+        ``dpc.json``; ``height_um.npy`` lies beside it.
+
+    Raises
+    ------
+    BenchError
+        When there is no LED array, or it does not suit the objective.
+    CalibrationError
+        When no exposure is usable or the run ended early.
+    """
+    array = _array(bench)
+    where = Path(folder) if folder is not None else None
+    optics = dpc_optics(bench, setup)
+    check(dpc_plan(array, setup, bench.camera.exposure_ms), abilities_of(bench, where))
+    exposure = _expose(bench, array, setup)
+    plan = dpc_plan(array, setup, exposure.exposure_ms)
+    runner = prepare(bench, plan, where, on_progress=on_progress, control=control)
+    record = {
+        "setup": asdict(setup),
+        "optics": asdict(optics),
+        "exposure_ms": exposure.exposure_ms,
+        "bench": bench.label,
+        "simulated": bool(bench.simulated_kinds),
+    }
+    write_text(runner.path / SETUP_FILE, json.dumps(record, indent=1) + "\n")
+    return finish_diffuser(runner.execute())
+
+
+def is_dpc(run: Path) -> bool:
+    """Whether a run's frames are those of a diffuser's surface."""
+    return (run / SETUP_FILE).is_file()
+
+
+def finish_diffuser(run: Run) -> tuple[DiffuserSurface, Path]:
+    """Compute the surface from a complete run, e.g. one that was resumed, and save it in its folder.
+
+    Raises
+    ------
+    CalibrationError
+        When the run is none of a diffuser's surface, is not complete, or saturates.
+    """
+    path = run.path / SETUP_FILE
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        setup, optics = DpcSetup(**record["setup"]), DpcOptics(**record["optics"])
+        exposure_ms, bench = float(record["exposure_ms"]), str(record["bench"])
+        simulated = bool(record["simulated"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}): the run is none of calibrate dpc, or the file was changed. "
+            "The frames beside it are not touched."
+        ) from error
+    if run.condition is not RunCondition.COMPLETED:
+        raise RunEndedError("The run", run)
+    phase = phase_from_halves(_halves(run), optics)
+    height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (setup.index - 1)))).astype(np.float32)
+    slope = slopes_deg(height, optics.pitch_um)
+    surface = DiffuserSurface(
+        height,
+        phase,
+        optics.pitch_um,
+        slope,
+        deflections_deg(slope, setup.index),
+        bench,
+        simulated,
+    )
+    return surface, _save(surface, setup, optics, exposure_ms, run)
+
+
+def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
+    """Return the optics that the phase is computed with.
+
+    Raises
+    ------
+    BenchError
+        As :func:`dpc_plan`.
+    """
+    array = _array(bench)
+    sines = array.led_na
+    inside = np.hypot(sines[:, 0], sines[:, 1]) <= setup.objective_na
+    lit = np.mean([np.count_nonzero(inside & (sines[:, k] != 0)) for k in (0, 1)]) / np.count_nonzero(inside)
+    return DpcOptics(
+        pitch_um=bench.camera.pixel_pitch_um * bench.camera.binning / setup.magnification,
+        wavelength_nm=array.wavelengths_nm[BANDS.index(setup.band)],
+        objective_na=setup.objective_na,
+        illumination_na=_illumination_na(array, setup),
+        lit_share=float(lit),
+    )
+
+
+def _illumination_na(array: LedArray, setup: DpcSetup) -> float:
+    wanted = OVERFILL * setup.objective_na
+    radius = np.hypot(array.led_na[:, 0], array.led_na[:, 1])
+    if not (
+        np.count_nonzero(radius <= setup.objective_na) >= LEAST_LEDS
+        and radius.max() > 1.1 * setup.objective_na
+    ):
+        raise BenchError(
+            f"The LED array reaches an aperture of {radius.max():.3g} with "
+            f"{np.count_nonzero(radius <= setup.objective_na)} LEDs inside the objective's "
+            f"{setup.objective_na:g}; wanted are {LEAST_LEDS} inside or more, and a tenth beyond. Change "
+            "the array's distance, or the objective."
+        )
+    return float(min(wanted, radius.max() * (1 + 1e-9)))
+
+
+def _array(bench: Bench) -> LedArray:
+    if bench.led_array is None:
+        raise BenchError(f"{bench.config.label} has no [led_array]: differential phase contrast needs one.")
+    return bench.led_array
+
+
+def _rgb(setup: DpcSetup) -> tuple[int, int, int]:
+    red, green, blue = (255 if band == setup.band else 0 for band in BANDS)
+    return red, green, blue
+
+
+def _expose(bench: Bench, array: LedArray, setup: DpcSetup) -> AutoExposure:
+    """Find an exposure that suits all halves: for the first, with room for the others."""
+    try:
+        bench.scene_off()
+        array.off()
+        dark = bench.camera.snap()
+        array.set_pattern(array.dpc_half(SIDES[0], _illumination_na(array, setup), _rgb(setup)))
+        found = auto_expose(bench.camera, target=_TARGET, hot=hot_pixels(dark.image, dark.full_scale))
+    finally:
+        array.off()
+    if not found.usable:
+        raise CalibrationError(found.message)
+    return found
+
+
+def _halves(run: Run) -> dict[str, Image]:
+    full_scale = (1 << run.metadata(0).significant_bits) - 1
+    dark = DarkModel((1.0,), (run.images("dark"),), full_scale)
+    halves = {}
+    for side in SIDES:
+        frames = run.images(side)
+        if np.any((frames >= full_scale).any(axis=0) & ~dark.hot):
+            raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
+        light = replace_hot(frames.mean(axis=0, dtype=np.float32) - dark.at(1.0), dark.hot)
+        halves[side] = np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+    return halves
+
+
+def _save(surface: DiffuserSurface, setup: DpcSetup, optics: DpcOptics, exposure_ms: float, run: Run) -> Path:
+    with whole_file(run.path / HEIGHT_FILE) as file:
+        np.save(file, surface.height_um)
+    data: dict[str, Any] = {
+        "format": "diffuserbench dpc",
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "bench": surface.bench,
+        "simulated": surface.simulated,
+        "setup": asdict(setup),
+        "optics": asdict(optics),
+        "exposure_ms": exposure_ms,
+        "height_file": HEIGHT_FILE,
+        "pitch_um": surface.pitch_um,
+        "figures": surface.figures,
+    }
+    write_text(run.path / RESULT_FILE, json.dumps(data, indent=1) + "\n")
+    return run.path / RESULT_FILE

@@ -1,0 +1,1 @@
+"""PSF sweeps: plan, exposures, quality, analysis, record."""

@@ -1,0 +1,312 @@
+"""Judge every PSF of a sweep while it is taken, and take it again at once where that can help.
+
+The watch sees each photograph as the runner stores it. When a point's last frame is there, the PSF is judged
+on a binned copy: saturation, signal to noise, clipped support, and its place against the neighbour's at the
+same depth (or the reference), which the stage says. Each visit to the reference tells whether the source
+drifts. What is found goes out as events, e.g. to a window. The sweep's last judgement, which sees all points
+together, comes after the last frame (:mod:`calibration_routines.psf.sweep`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.display.stage_fit import (
+    MAX_GAIN_ERROR,
+    MAX_ROTATION_MRAD,
+    find_pattern,
+    nominal_px_per_um,
+)
+from calibration_routines.psf.axial_analysis import (
+    Counts,
+    DarkModel,
+    PlaneFrames,
+    channels_first,
+    noise_of_mean,
+    plane_light,
+    saturated_pixels,
+)
+from calibration_routines.psf.background import block_mean
+from calibration_routines.psf.drift import LARGEST_PX, compare_visit, judge_visit
+from calibration_routines.psf.psf_quality import (
+    MAX_STEP_PX,
+    PsfQuality,
+    judge_next,
+    measure_psf,
+    with_finding,
+)
+from calibration_routines.psf.sweep_plan import (
+    DARK,
+    REFERENCE,
+    Position,
+    Sweep,
+    axis_point,
+    depths_um,
+    reference_point,
+)
+from instrument.bench.photograph import Snapshot
+from instrument.plan import Step
+from recon.types import Geometry
+
+Float = npt.NDArray[np.float32]
+
+_SATURATED_DIMMING = 0.7  # a PSF that saturated is taken again with this part of its exposure
+_SLACK = MAX_GAIN_ERROR + 1e-3 * MAX_ROTATION_MRAD  # of a shift: what a wrong d or a turned camera may do
+
+
+@dataclass(frozen=True, slots=True)
+class PointTaken:
+    """A PSF has been taken and judged.
+
+    Attributes
+    ----------
+    number, total : int
+        Which point of the sweep, from 1, and how many there are.
+    take : int
+        1, and more for what was taken again.
+    quality : PsfQuality
+        So far: lengths in pixels of the PSFs; the whole sweep may tell more when it is over.
+    exposure_ms : float
+    retaking : bool
+        Whether it is taken again at once.
+    image : ndarray, float32, (height, width)
+        The PSF without its dark frame, counts, colours averaged, binned to half a megapixel at most.
+    """
+
+    number: int
+    total: int
+    take: int
+    quality: PsfQuality
+    exposure_ms: float
+    retaking: bool
+    image: Float
+
+
+@dataclass(frozen=True, slots=True)
+class SourceVisit:
+    """The source has been at the reference point again.
+
+    Attributes
+    ----------
+    number : int
+        From 1, the first, which the others are held against.
+    before_point : int
+        Points of the sweep that had been taken before.
+    brightness : float
+        Light received, relative to the first visit.
+    shift_px : float
+        Distance of the pattern from its place at the first visit, pixels of the camera.
+    findings : tuple of str
+        What changed since the visit before; empty when the source stayed what it was.
+    """
+
+    number: int
+    before_point: int
+    brightness: float
+    shift_px: float
+    findings: tuple[str, ...]
+
+
+SweepEvent = PointTaken | SourceVisit
+OnEvent = Callable[[SweepEvent], None]
+TakeAgain = Callable[[Position, float], list[Snapshot]]
+"""Takes a point's frames again, given its place and exposure."""
+
+
+class SweepWatch:
+    """Sees a sweep's photographs one by one and judges its points.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    geometry : Geometry
+        Of the camera's pixels.
+    on_event : callable, optional
+        Called with a :class:`PointTaken` or :class:`SourceVisit` in the thread that executes.
+    take_again : callable, optional
+        None: points that need it are only reported.
+    """
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        geometry: Geometry,
+        *,
+        on_event: OnEvent | None = None,
+        take_again: TakeAgain | None = None,
+    ) -> None:
+        self._sweep, self._geometry = sweep, geometry
+        self.on_event, self.take_again = on_event, take_again
+        self._numbers = {point: number for number, point in enumerate(sweep.points_um, start=1)}
+        self._central = {axis_point(sweep, z_um) for z_um in depths_um(sweep)}
+        self._reference = reference_point(sweep)
+        self._parts: dict[int, list[Snapshot]] = {}
+        self._dark_frames: dict[float, list[Counts]] = {}
+        self._dark: DarkModel | None = None
+        self._anchor: tuple[Position, Float] | None = None  # the newest good pattern
+        self._planes: list[PsfQuality] = []  # good central PSFs, one a depth
+        self._first_visit: tuple[Position, Float] | None = None
+        self._visits: list[SourceVisit] = []
+        self._points_done = 0
+
+    def see(self, step: Step, snapshot: Snapshot) -> bool:
+        """Take in a photograph (:data:`~instrument.runs.runner.FrameWatch`); True when the bench was used."""
+        if step.label == DARK:
+            frames = self._dark_frames.setdefault(snapshot.metadata.exposure_ms, [])
+            frames.append(_counts(snapshot))
+            return False
+        self._parts.setdefault(step.part, []).append(snapshot)
+        if len(self._parts[step.part]) < self._sweep.average:
+            return False
+        taken = self._parts.pop(step.part)
+        if step.label == REFERENCE:
+            self._visit(taken)
+            return False
+        point = self._sweep.points_um[0] if step.source_um is None else step.source_um
+        self._points_done += 1
+        return self._point(point, taken)
+
+    # Points ----------------------------------------------------------------------------------------------
+    def _point(self, point: Position, taken: list[Snapshot]) -> bool:
+        """Judge a point, and take it again as often as the sweep allows; True when the bench was used."""
+        take = 1
+        while True:
+            plane = self._plane(point, taken)
+            image = self._image(plane)
+            quality = self._judged(plane, image)
+            again = quality.retake and self.take_again is not None and take <= self._sweep.retakes
+            number, total = self._numbers[point], len(self._numbers)
+            self._tell(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
+            if not again or self.take_again is None:
+                break
+            taken = self.take_again(point, plane.exposure_ms * retake_dimming(quality))
+            take += 1
+        if not quality.retake and quality.signal > 0:
+            self._anchor = point, image
+            if point in self._central:
+                self._planes.append(quality)
+        return take > 1
+
+    def _plane(self, point: Position, taken: list[Snapshot]) -> PlaneFrames:
+        return PlaneFrames(
+            source_um=point,
+            exposure_ms=taken[0].metadata.exposure_ms,
+            frames=_stacked([_counts(snapshot) for snapshot in taken]),
+            full_scale=taken[0].full_scale,
+            off_axis=point not in self._central,
+        )
+
+    def _image(self, plane: PlaneFrames) -> Float:
+        """Return a point's light, (height, width), binned to :data:`LARGEST_PX` at most."""
+        light = channels_first(plane_light(plane, self._dark_model(plane.full_scale)))
+        grey: Float = light.mean(axis=0)
+        return block_mean(grey, _factor(grey))
+
+    def _judged(self, plane: PlaneFrames, image: Float) -> PsfQuality:
+        frame_shape = plane.frames.shape[1:3]
+        factor = max(1, frame_shape[0] // image.shape[0])
+        binning = max(1, self._sweep.binning)
+        x_um, y_um, z_um = plane.source_um
+        found = measure_psf(
+            image[np.newaxis],
+            z_um=z_um,
+            noise=noise_of_mean(plane.frames) / binning,
+            saturated_pixels=saturated_pixels(plane, self._dark_model(plane.full_scale).hot),
+            may_be_clipped=plane.off_axis,
+        )
+        found = replace(
+            found,
+            x_um=x_um,
+            y_um=y_um,
+            centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
+            radius_px=found.radius_px * factor / binning,
+        )
+        if plane.source_um in self._central:
+            d_mm = self._geometry.diffuser_distance_mm
+            found = judge_next(self._planes, found, None if d_mm is None else 1e3 * d_mm)
+        return self._against_stage(found, image, factor, binning)
+
+    def _against_stage(self, found: PsfQuality, image: Float, factor: int, binning: int) -> PsfQuality:
+        """Hold the pattern's step from the newest good one at this depth against the stage's."""
+        known = [one for one in (self._anchor, self._first_visit) if one is not None]
+        anchor = next((one for one in known if one[0][2] == found.z_um), None)
+        nominal = nominal_px_per_um(self._geometry, found.z_um)
+        if anchor is None or nominal is None or not found.signal > 0:
+            return found
+        step_um = np.array([found.y_um - anchor[0][1], found.x_um - anchor[0][0]])
+        registered = find_pattern(image, anchor[1], step_um, nominal, factor)
+        if registered is None or not registered.reliable:
+            return found  # too different from its neighbour; the whole sweep will tell
+        expected = -step_um * nominal
+        measured = factor * np.array([registered.rows, registered.columns])
+        off_px = float(np.hypot(*(measured - expected)))
+        allowed = MAX_STEP_PX * binning + _SLACK * float(np.hypot(*expected))
+        found = replace(found, step_px=max(found.step_px, off_px / binning))
+        if off_px > allowed:
+            found = with_finding(
+                found,
+                f"the pattern lies {off_px / binning:.1f} pixels from where the stage says, seen from the "
+                f"point before it (up to {allowed / binning:.1f} expected): the stage or the source slipped. "
+                "Take it again.",
+                retake=True,
+            )
+        return found
+
+    # The source ------------------------------------------------------------------------------------------
+    def _visit(self, taken: list[Snapshot]) -> None:
+        assert self._reference is not None
+        plane = self._plane(self._reference, taken)
+        image = self._image(plane)
+        if self._first_visit is None:
+            seen = self._judged(plane, image)
+            self._planes += [] if seen.retake else [seen]
+            self._first_visit = self._reference, image
+            visit = SourceVisit(1, self._points_done, 1.0, 0.0, ())
+        else:
+            before = self._visits[-1]
+            brightness, shift_px = compare_visit(image, self._first_visit[1])
+            frame = taken[0].image
+            shift_px *= max(1, frame.shape[0] // image.shape[0])
+            findings = judge_visit(
+                (before.brightness, brightness),
+                (before.shift_px, shift_px),
+                (before.before_point, self._points_done),
+            )
+            visit = SourceVisit(before.number + 1, self._points_done, brightness, shift_px, findings)
+        self._visits.append(visit)
+        self._tell(visit)
+
+    def _tell(self, event: SweepEvent) -> None:
+        if self.on_event is not None:
+            self.on_event(event)
+
+    def _dark_model(self, full_scale: int) -> DarkModel:
+        if self._dark is None:
+            stacks = [_stacked(frames) for frames in self._dark_frames.values()]
+            self._dark = DarkModel(list(self._dark_frames), stacks, full_scale)
+            self._dark_frames = {}
+        return self._dark
+
+
+def retake_dimming(quality: PsfQuality) -> float:
+    """Return which part of its exposure a PSF that is taken again gets: less where it saturated."""
+    return _SATURATED_DIMMING if quality.saturated_pixels else 1.0
+
+
+def _counts(snapshot: Snapshot) -> Counts:
+    if snapshot.image.dtype == np.float32:
+        raise TypeError("A sweep stores single frames, not means: averaging comes with the analysis.")
+    return cast(Counts, snapshot.image)
+
+
+def _stacked(frames: Sequence[Counts]) -> Counts:
+    return cast(Counts, np.stack(frames))
+
+
+def _factor(image: Float) -> int:
+    return max(1, int(np.ceil(np.sqrt(image.size / LARGEST_PX))))

@@ -1,0 +1,1 @@
+"""What several drivers share: streams, pixels, serial lines, polled stages."""

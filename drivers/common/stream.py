@@ -1,0 +1,299 @@
+"""Continuous acquisition into a ring: every frame for those who want all, the newest for live views."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import TYPE_CHECKING, NamedTuple, Self
+
+import numpy as np
+
+from drivers.common.ring import BufferPool, Pixels
+from drivers.common.stream_reader import StreamReader, Subscription
+from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.frame import Frame
+
+if TYPE_CHECKING:
+    from drivers.camera import Camera
+
+_POLL_S = 0.25
+
+
+class Slot(NamedTuple):
+    """A frame in the ring."""
+
+    number: int
+    """Running number among the frames that came out of the driver."""
+    position: int
+    """Running number among the frames that the camera exposed: dropped ones count."""
+    frame: Frame
+
+
+class FrameStream:
+    """A running sequence of a camera, read by one thread into a fixed ring of preallocated buffers.
+
+    The thread never waits for a consumer: who is slow misses frames, and is told how many. Frames are
+    read-only views of the ring's buffers; a buffer that somebody still holds is not used again, so a frame
+    never changes, but who keeps more frames than the ring has buffers starves the stream (copy images that
+    you keep).
+
+    Use as a context manager, or iterate over it, which starts and ends it::
+
+        for frame in camera.stream():
+            ...
+
+    Parameters
+    ----------
+    camera : Camera
+        Open and not streaming.
+    n_buffers : int
+        Frames that the ring holds.
+    """
+
+    def __init__(self, camera: Camera, n_buffers: int = 16) -> None:
+        if n_buffers < 3:
+            raise ValueError(f"A stream needs at least 3 buffers, not {n_buffers}.")
+        self.camera = camera
+        self.n_buffers = n_buffers
+        self.changed = threading.Condition()
+        self.ring: deque[Slot] = deque()
+        self.acquired = 0
+        self.dropped = 0
+        self.error: DeviceError | None = None
+        self._running = False
+        self._thread: threading.Thread | None = None
+        self._subscriptions: list[Subscription] = []
+        self._clock_offset_ns: int | None = None
+
+    # Starting and ending -------------------------------------------------------------------------
+    def start(self) -> Self:
+        """Start the camera's sequence."""
+        if self._thread is not None:
+            raise DeviceError(self.camera.name, "this stream has been started before.", "Make a new one.")
+        shape, dtype = self.camera.frame_shape, self.camera.frame_dtype
+        # Two beyond the ring: one being filled, one for a reader that has just taken the oldest.
+        self._pool = BufferPool(self.n_buffers + 2, shape, dtype)
+        self._scratch: Pixels = np.empty(shape, dtype)
+        self.camera.start_sequence(self.n_buffers)
+        self._running = True
+        self._thread = threading.Thread(
+            target=self._produce, name=f"stream of {self.camera.name}", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """End the sequence and wait for the stream's threads; closing twice does nothing.
+
+        The ring is let go of; frames that somebody holds stay as they are.
+
+        Raises
+        ------
+        Exception
+            What a callback given to ``subscribe`` raised.
+        """
+        self._end()
+        if self._thread is not None:
+            self.camera.stop_sequence()
+            if self._thread is not threading.current_thread():
+                self._thread.join()
+        subscriptions, self._subscriptions = self._subscriptions, []
+        errors = [error for error in (s.join() for s in subscriptions) if error is not None]
+        with self.changed:
+            self.ring.clear()
+        if errors:
+            raise errors[0]
+
+    @property
+    def is_running(self) -> bool:
+        """Whether frames are coming."""
+        return self._running
+
+    def __enter__(self) -> Self:
+        return self.start() if self._thread is None else self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Getting frames ------------------------------------------------------------------------------
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield every frame from now on; starts the stream, and ends it, if it was not running."""
+        reader = self.reader()
+        mine = self._thread is None
+        if mine:
+            self.start()
+        try:
+            while (frame := reader.next_frame()) is not None:
+                yield frame
+        finally:
+            if mine:
+                self.close()
+
+    def reader(self) -> StreamReader:
+        """Return a reader that gets every frame from now on; any number may read, each at its own pace.
+
+        Made before ``start``, it gets the first frame too.
+        """
+        return StreamReader(self)
+
+    def newest(self) -> Frame | None:
+        """Return the newest frame, at once; None before the first."""
+        with self.changed:
+            return self.ring[-1].frame if self.ring else None
+
+    def wait_newer(self, than: Frame | None, timeout_s: float) -> Frame | None:
+        """Return the newest frame as soon as it is another than ``than``; None when none came in time."""
+        with self.changed:
+            self.changed.wait_for(
+                lambda: not self._running or (bool(self.ring) and self.ring[-1].frame is not than), timeout_s
+            )
+            newest = self.ring[-1].frame if self.ring else None
+        if self.error is not None:
+            raise self.error
+        return newest if newest is not than else None
+
+    def fresh(self, since_ns: int | None = None, timeout_s: float | None = None) -> Frame:
+        """Return a frame that was exposed wholly after a moment: after a move, a change of light.
+
+        Parameters
+        ----------
+        since_ns : int, optional
+            The moment, by ``time.monotonic_ns()``; None means now.
+        timeout_s : float, optional
+            None means what the exposure needs, with a margin.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            When no such frame came in time.
+
+        Notes
+        -----
+        Frames on their way to the host (the camera's ``frames_in_flight``) and the one being exposed are let
+        go. Frames that lay in the driver's buffers are told by the device's clock: the host time of an
+        exposure's end is the device's time plus the smallest difference between arrival and device time seen
+        so far, which is late by the fastest frame's way to the host. Without a device clock, as many frames
+        are let go as the driver's buffers can hold.
+        """
+        since_ns = time.monotonic_ns() if since_ns is None else since_ns
+        if timeout_s is None:
+            timeout_s = self.camera.longest_silence_s + (self.n_buffers + 4) * self.camera.exposure_ms / 1e3
+        deadline_s = time.monotonic() + timeout_s
+        reader = self.reader()
+        to_skip = self.camera.frames_in_flight + 1
+        previous: Frame | None = None
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            frame = reader.next_frame(left_s)
+            if frame is None:
+                break
+            if previous is None and frame.metadata.device_time_ns is None:
+                to_skip += self.n_buffers
+            to_skip -= 1 + frame.metadata.dropped_before
+            if to_skip < 0 and self._began_after(frame, previous, since_ns):
+                return frame
+            previous = frame
+        if not self._running:
+            raise StoppedError(self.camera.name, "the stream ended while a fresh frame was waited for.")
+        raise DeviceTimeoutError(
+            self.camera.name,
+            f"no frame exposed wholly after the change came within {timeout_s:g} s.",
+            f"Exposure is {self.camera.exposure_ms:g} ms.",
+        )
+
+    def subscribe(self, callback: Callable[[Frame], None], *, newest_only: bool = False) -> Subscription:
+        """Have ``callback`` called with frames in a thread of its own, until the stream ends.
+
+        Parameters
+        ----------
+        callback : callable
+            What it raises ends its subscription, and is raised by ``close``.
+        newest_only : bool
+            Skip to the newest frame each time (live views); otherwise every frame that the callback is fast
+            enough for.
+        """
+        subscription = Subscription(self, callback, newest_only)
+        self._subscriptions.append(subscription)
+        return subscription
+
+    # The producer --------------------------------------------------------------------------------
+    def _produce(self) -> None:
+        silent_s = 0.0
+        try:
+            while self._running:
+                buffer = self._buffer()
+                began_s = time.monotonic()
+                try:
+                    metadata = self.camera.next_frame_into(
+                        self._scratch if buffer is None else buffer, _POLL_S
+                    )
+                except DeviceTimeoutError as error:
+                    silent_s += time.monotonic() - began_s
+                    limit_s = self.camera.longest_silence_s + 3 * self.camera.exposure_ms / 1e3
+                    if self.camera.trigger_mode == "free_run" and silent_s > limit_s:
+                        raise DeviceTimeoutError(
+                            error.device, f"has sent no frame for {silent_s:.1f} s.", error.remedy
+                        ) from error
+                    continue
+                silent_s = 0.0
+                self._note_clock(metadata.device_time_ns, metadata.host_time_ns)
+                with self.changed:
+                    self.dropped += metadata.dropped_before
+                    if buffer is not None:
+                        position = self.acquired + self.dropped
+                        self.ring.append(Slot(self.acquired, position, Frame(buffer, metadata)))
+                    self.acquired += 1
+                    if len(self.ring) > self.n_buffers:
+                        self.ring.popleft()
+                    self.changed.notify_all()
+        except StoppedError:
+            pass
+        except DeviceError as error:
+            self.error = error
+        except Exception as error:  # noqa: BLE001 - a driver's mistake: readers must not wait for ever
+            self.error = DeviceError(self.camera.name, f"its stream failed: {error!r}.", "Report this.")
+            self.error.__cause__ = error
+        finally:
+            # Hundreds of megabytes: not to be kept by who keeps the stream, or an error with its traceback.
+            del self._pool
+            self._end()
+
+    def _buffer(self) -> Pixels | None:
+        """Return a free buffer, giving up the oldest frames of the ring for it; None when all are held."""
+        while (buffer := self._pool.take()) is None:
+            with self.changed:
+                if len(self.ring) <= 1:
+                    return None
+                self.ring.popleft()
+        return buffer
+
+    def _note_clock(self, device_ns: int | None, host_ns: int) -> None:
+        if device_ns is not None:
+            offset = host_ns - device_ns
+            if self._clock_offset_ns is None or offset < self._clock_offset_ns:
+                self._clock_offset_ns = offset
+
+    def _began_after(self, frame: Frame, previous: Frame | None, since_ns: int) -> bool:
+        """Whether a frame's exposure began after a moment, by the device's clock (see ``fresh``)."""
+        ended_ns = frame.metadata.device_time_ns
+        if ended_ns is None or self._clock_offset_ns is None:
+            return True
+        before_ns = None if previous is None else previous.metadata.device_time_ns
+        if before_ns is None:
+            return False
+        exposure_ns = int(frame.metadata.exposure_ms * 1e6)
+        period_ns = (ended_ns - before_ns) // (1 + frame.metadata.dropped_before)
+        on_its_way_ns = self.camera.frames_in_flight * max(period_ns, exposure_ns)
+        return ended_ns + self._clock_offset_ns - on_its_way_ns - exposure_ns >= since_ns
+
+    def _end(self) -> None:
+        with self.changed:
+            self._running = False
+            self.changed.notify_all()

@@ -1,0 +1,1 @@
+"""Which drivers there are, what is connected, and who has it."""

@@ -1,1 +1,0 @@
-"""Widgets that show results: pictures, volumes, holograms, charts. They know no bench."""

@@ -1,0 +1,245 @@
+"""Stability maps: where a method fails, cell by cell, with every method's boundary over it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
+
+from gui.theme import colours
+from gui.widgets.arrow_keys import ArrowKeys
+from gui.widgets.plot import curve_pen, plot_widget, restyle
+from recon.verdict.failure import Failure
+
+_SPAN = 1.0
+"""The colours reach from a tenth of the severity at the boundary to ten times of it."""
+_STRENGTH = 0.75
+"""Of the colours: figures are read on them."""
+_BRIGHT = 0.3
+"""Lightness of a cell from which on its figure is written dark."""
+
+
+class StabilityView(QWidget):
+    """One map of a ``stability.json``: a method's cells in colour, the boundaries of all as lines."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._maps: Mapping[str, Any] = {}
+        self.map = QComboBox()
+        self.map.setToolTip("Which two stresses are varied")
+        self.map.currentIndexChanged.connect(lambda _: self._choose_map())
+        self.method = QComboBox()
+        self.method.setToolTip("Whose cells are coloured; the lines are the boundaries of all methods")
+        self.method.currentIndexChanged.connect(lambda _: self._draw())
+        self.question = QLabel()
+        self.question.setWordWrap(True)
+        self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.place = QLabel(_hint())
+        self.place.setProperty("role", "dim")
+        self.place.setWordWrap(True)
+        self.legend = QLabel()
+        self.legend.setWordWrap(True)
+        self.plot: Any = plot_widget(grid=False)
+        self.plot.setMouseEnabled(x=False, y=False)
+        self.image: Any = pg.ImageItem()
+        self.plot.scene().sigMouseMoved.connect(self._moved)
+        self.cell = (0, 0)
+        """Column and row of the cell that was told of last, from the lower left."""
+        self.keys = ArrowKeys(self.plot)
+        self.keys.entered.connect(lambda: self._step(0, 0))
+        self.keys.moved.connect(self._step)
+        self._cursor: Any = pg.QtWidgets.QGraphicsRectItem()
+        self._cursor.setZValue(3)
+        self._cursor.hide()
+        self.keys.left.connect(self._cursor.hide)
+        self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
+        row = QHBoxLayout()
+        row.addWidget(self.map, 2)
+        row.addWidget(self.method, 1)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(row)
+        layout.addWidget(self.question)
+        layout.addWidget(self.plot, 1)
+        layout.addWidget(self.legend)
+        layout.addWidget(self.place)
+
+    def show_maps(self, maps: Mapping[str, Any]) -> None:
+        """Show the maps of a ``stability.json``, by name."""
+        self._maps = maps
+        self.map.blockSignals(True)
+        self.map.clear()
+        for name, record in maps.items():
+            self.map.addItem(record["title"], name)
+        self.map.blockSignals(False)
+        self._choose_map()
+
+    @property
+    def record(self) -> Mapping[str, Any] | None:
+        """The map that is shown."""
+        name = self.map.currentData()
+        return None if name is None else self._maps[name]
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        restyle(self.plot)
+        self.place.setText(_hint())
+        self._draw()
+
+    def _choose_map(self) -> None:
+        record = self.record
+        self.method.blockSignals(True)
+        self.method.clear()
+        if record is not None:
+            self.method.addItems(list(record["methods"]))
+        self.method.blockSignals(False)
+        self._draw()
+
+    def _draw(self) -> None:
+        self.plot.clear()
+        self.boundaries = {}
+        record, name = self.record, self.method.currentText()
+        if record is None or not name:
+            return
+        self.question.setText(f"{record['question']} ({record['size']} map)")
+        method = record["methods"][name]
+        severity = _grid(method["severity"])
+        level = np.log10(np.maximum(severity, 1e-2))
+        cells = _coloured(level)
+        self.image.setImage(cells, levels=(0, 255))
+        self.image.setRect(-0.5, -0.5, severity.shape[1], severity.shape[0])
+        self.plot.addItem(self.image)
+        self._cursor.setPen(pg.mkPen(colours().text, width=2))
+        self.plot.addItem(self._cursor, ignoreBounds=True)
+        self._write_errors(_grid(method["error"]), cells)
+        for number, (other, found) in enumerate(record["methods"].items()):
+            self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
+        self.legend.setText(
+            "Boundaries: "
+            + " &nbsp; ".join(
+                f'<span style="color:{_colour(number)}">●</span> {other}'
+                + ("" if found["boundary"] else " (none here)")
+                for number, (other, found) in enumerate(record["methods"].items())
+            )
+        )
+        for side, which in (("bottom", "x"), ("left", "y")):
+            about = record[which]
+            unit = f" ({about['unit']})" if about["unit"] else ""
+            self.plot.setLabel(side, f"{about['label']}{unit}")
+            self.plot.getAxis(side).setTicks(
+                [list(enumerate(about.get("ticks") or map(_short, about["values"])))]
+            )
+        rows, columns = severity.shape
+        self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
+        self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
+
+    def _write_errors(self, errors: npt.NDArray[np.float64], cells: npt.NDArray[np.uint8]) -> None:
+        for (iy, ix), error in np.ndenumerate(errors):
+            if np.isfinite(error):
+                ground = pg.mkColor(*(int(c) for c in cells[iy, ix]))
+                colour = colours().window if ground.lightnessF() > _BRIGHT else colours().text
+                text = pg.TextItem(f"{error:.2g}", color=colour, anchor=(0.5, 0.5))
+                text.setPos(ix, iy)
+                self.plot.addItem(text)
+
+    def _draw_boundary(
+        self, number: int, name: str, points: Sequence[Sequence[float]], record: Any, *, chosen: bool
+    ) -> None:
+        places = np.array([(_place(record["x"], x), _place(record["y"], y)) for x, y in points], float)
+        self.boundaries[name] = places.reshape(-1, 2)
+        width = 4.0 if chosen else 2.0
+        self.plot.plot(
+            *self.boundaries[name].T,
+            pen=curve_pen(number, width),
+            symbol="o",
+            symbolSize=9 if chosen else 6,
+            symbolPen=None,
+            symbolBrush=_colour(number),
+        )
+
+    def _moved(self, place: Any) -> None:
+        point = self.plot.getPlotItem().vb.mapSceneToView(place)
+        self.place.setText(self.describe(round(point.x()), round(point.y())))
+
+    def _step(self, across: float, down: float) -> None:
+        """Tell of the next cell in the direction of an arrow key."""
+        record = self.record
+        if record is None:
+            return
+        steps = [0 if not by else (1 if by > 0 else -1) for by in (across, -down)]
+        sizes = len(record["x"]["values"]), len(record["y"]["values"])
+        ix, iy = (min(max(c + s, 0), n - 1) for c, s, n in zip(self.cell, steps, sizes, strict=True))
+        self.cell = ix, iy
+        self._cursor.setRect(ix - 0.5, iy - 0.5, 1, 1)
+        self._cursor.show()
+        self.place.setText(self.describe(ix, iy))
+
+    def describe(self, ix: int, iy: int) -> str:
+        """Return a cell in words; empty outside of the map."""
+        record = self.record
+        if record is None:
+            return ""
+        x, y = record["x"], record["y"]
+        if not (0 <= ix < len(x["values"]) and 0 <= iy < len(y["values"])):
+            return ""
+        said = [f"{_stress(x, ix)}, {_stress(y, iy)}"]
+        for name, method in record["methods"].items():
+            severity, error = method["severity"][iy][ix], method["error"][iy][ix]
+            if severity is None:
+                said.append(f"{name}: not made")
+                continue
+            failure = method["failure"][iy][ix]
+            words = f"fails ({Failure[failure.upper()]})" if failure else "works"
+            value = "" if error is None else f", {record['error']} {error:.3g}"
+            said.append(f"{name}: {words}{value}, severity {severity:.2f}")
+        return ";  ".join(said)
+
+
+def _grid(rows: Sequence[Sequence[float | None]]) -> npt.NDArray[np.float64]:
+    return np.array([[np.nan if v is None else v for v in row] for row in rows], float)
+
+
+def _hint() -> str:
+    fails, works = ("Bright", "dim") if colours().red_light_only else ("Red", "green")
+    return (
+        f"{fails} fails, {works} works, dark is the boundary; numbers are errors. Point at a cell, "
+        "or go there by arrow keys, for more."
+    )
+
+
+def _colour(number: int) -> str:
+    return colours().curves[number % len(colours().curves)]
+
+
+def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Return (rows, columns, 3): green or dim works, red or bright fails, dark at the boundary."""
+    now = colours()
+    good = now.line if now.red_light_only else now.ok
+    works, middle, fails = (pg.mkColor(c).getRgb()[:3] for c in (good, now.window, now.error))
+    share = np.clip(np.nan_to_num(level) / _SPAN, -1, 1)[..., None]
+    end = np.where(share < 0, np.array(works, float), np.array(fails, float))
+    shown = np.array(middle, float) + np.abs(share) * _STRENGTH * (end - np.array(middle, float))
+    shown[~np.isfinite(level)] = pg.mkColor(now.line).getRgb()[:3]
+    pixels: npt.NDArray[np.uint8] = np.round(shown).astype(np.uint8)
+    return pixels
+
+
+def _place(axis: Mapping[str, Any], value: float) -> float:
+    """Return where a value lies between the cells of an axis, counted in cells."""
+    values = np.array(axis["values"], float)
+    if axis["logarithmic"]:
+        values, value = np.log(values), float(np.log(value))
+    return float(np.interp(value, values, np.arange(len(values))))
+
+
+def _stress(axis: Mapping[str, Any], index: int) -> str:
+    return f"{axis['label']} {_short(axis['values'][index])} {axis['unit']}".rstrip()
+
+
+def _short(value: float) -> str:
+    return f"{value / 1000:g}k" if abs(value) >= 10000 else f"{value:g}"

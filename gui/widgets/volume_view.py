@@ -1,0 +1,392 @@
+"""A volume to browse: brightest along each axis, depth as colour, slices through any point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QSlider,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.jobs import Job, JobContext, JobRunner
+from gui.theme import colours
+from gui.widgets.levels_bar import LevelsBar
+from gui.widgets.plot import curve_pen, plot_widget, restyle
+from gui.widgets.slice_reader import Axis, Slice, SliceReader
+from gui.widgets.stretched_image import StretchedImage
+from instrument.files.volume_source import Plane, VolumeSource
+from instrument.reconstruction.volume_views import Projections, grey, in_colour_of_depth, project
+
+Mode = Literal["brightest", "slices"]
+Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+
+_AXES: tuple[Axis, Axis, Axis] = ("z", "y", "x")
+
+
+class VolumeView(QWidget):
+    """Four views of one volume, and what is under the mouse in words.
+
+    Nothing is read in the window's thread: projections are a job, slices come from a :class:`SliceReader`.
+
+    Parameters
+    ----------
+    jobs : JobRunner
+    parent : QWidget, optional
+
+    Signals
+    -------
+    failed : str
+        The volume could not be read.
+    hovered : str
+        Place and value under the mouse.
+    """
+
+    failed = Signal(str)
+    hovered = Signal(str)
+
+    def __init__(self, jobs: JobRunner, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._jobs = jobs
+        self._job: Job | None = None
+        self._reader: SliceReader | None = None
+        self._source: VolumeSource | None = None
+        self._planes: Planes | None = None
+        self.projections: Projections | None = None
+        self.slices: dict[Axis, Slice] = {}
+        self._asked: dict[Axis, int] = {}
+        self.point = (0, 0, 0)
+        """Plane, row and column through which the slices go."""
+        self.mode: Mode = "brightest"
+
+        self.front, self.coloured = StretchedImage(), StretchedImage()
+        self.side, self.top = StretchedImage(keep_aspect=False), StretchedImage(keep_aspect=False)
+        self.profile = plot_widget("plane")
+        self._along: Any = self.profile.plot(pen=curve_pen(0))
+        self._here: Any = pg.InfiniteLine(pen=colours().dim)
+        self.profile.addItem(self._here)
+        self.profile.setToolTip("Values along depth through the chosen pixel, of the views' resolution")
+        self._titles = [QLabel() for _ in range(4)]
+        for label in self._titles:
+            label.setProperty("role", "heading")
+        self._lines = {view: (_line(view, 90), _line(view, 0)) for view in (self.front, self.side, self.top)}
+        self.front.clicked.connect(lambda column, row: self.go_to(self.point[0], row, column))
+        self.side.clicked.connect(lambda column, row: self.go_to(column, row, self.point[2]))
+        self.top.clicked.connect(lambda column, row: self.go_to(row, self.point[1], column))
+        self._step_by_keys(self.front, lambda across, down: (0, down, across))
+        self._step_by_keys(self.side, lambda across, down: (across, down, 0))
+        self._step_by_keys(self.top, lambda across, down: (down, 0, across))
+        for view in (self.front, self.side, self.top, self.coloured):
+            view.setMinimumSize(70, 50)
+            view.hovered.connect(self.hovered)
+        self.profile.setMinimumSize(70, 50)
+
+        self.brightest_button = QPushButton("Brightest")
+        self.brightest_button.setToolTip("The brightest voxels along each axis (Ctrl+B)")
+        self.brightest_button.setShortcut("Ctrl+B")
+        self.slices_button = QPushButton("Slices")
+        self.slices_button.setToolTip(
+            "Slices through one point: a click or arrows in a view move it (Ctrl+J)"
+        )
+        self.slices_button.setShortcut("Ctrl+J")
+        group = QButtonGroup(self)
+        for button in (self.brightest_button, self.slices_button):
+            button.setCheckable(True)
+            group.addButton(button)
+        self.brightest_button.setChecked(True)
+        self.brightest_button.clicked.connect(lambda: self.set_mode("brightest"))
+        self.slices_button.clicked.connect(lambda: self.set_mode("slices"))
+        self.slider = QSlider(Qt.Orientation.Horizontal)
+        self.slider.setToolTip("Depth plane of the front view (arrow keys)")
+        self.slider.valueChanged.connect(lambda z: self.go_to(z, *self.point[1:]))
+        self.plane_label = QLabel()
+        self.progress = QProgressBar()
+        self.progress.setFormat("reading plane %v of %m")
+        self.progress.hide()
+        self.levels = LevelsBar()
+        self.levels.changed.connect(self._show)
+        self._arrange()
+        self.set_mode("brightest")
+
+    def _arrange(self) -> None:
+        grid = QGridLayout()
+        grid.setSpacing(3)
+        cells: list[tuple[QWidget, int, int]] = [
+            (self.front, 0, 0),
+            (self.side, 0, 1),
+            (self.top, 1, 0),
+            (self.coloured, 1, 1),
+        ]
+        for (widget, row, column), title in zip(cells, self._titles, strict=True):
+            grid.addWidget(title, 2 * row, column)
+            grid.addWidget(widget, 2 * row + 1, column)
+        grid.addWidget(self.profile, 3, 1)
+        grid.setRowStretch(1, 3)
+        grid.setRowStretch(3, 2)
+        grid.setColumnStretch(0, 3)
+        grid.setColumnStretch(1, 2)
+        bar = QHBoxLayout()
+        bar.addWidget(self.brightest_button)
+        bar.addWidget(self.slices_button)
+        bar.addWidget(self.slider, 1)
+        bar.addStretch()
+        bar.addWidget(self.plane_label)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(bar)
+        layout.addWidget(self.progress)
+        layout.addLayout(grid, 1)
+        layout.addWidget(self.levels)
+
+    # What is shown -------------------------------------------------------------------------------
+    def open(self, source: VolumeSource, planes_um: Planes | None = None) -> Job:
+        """Browse a volume, which is this view's to close; the one before is closed.
+
+        Parameters
+        ----------
+        source : VolumeSource
+        planes_um : (ndarray, ndarray), optional
+            Depth and lateral pitch of each plane in micrometres.
+        """
+        self.release()
+        self._source, self._planes = source, planes_um
+        self._reader = SliceReader(source, self)
+        self._reader.arrived.connect(self._take_slice)
+        self._reader.failed.connect(self.failed)
+        n_z, height, width = source.shape
+        self.slider.setRange(0, n_z - 1)
+        self.progress.setRange(0, n_z)
+        self.progress.setValue(0)
+        self.progress.show()
+
+        def work(context: JobContext) -> Projections:
+            return project(source, lambda done, _: context.report(done))
+
+        job = self._jobs.compute(f"Looking through {source.path.name}", work)
+        job.progressed.connect(self.progress.setValue)
+        job.succeeded.connect(lambda found: self._take_projections(job, found))
+        job.failed.connect(self.failed)
+        job.ended.connect(lambda: self._projecting_ended(job))
+        self._job = job
+        self.go_to(n_z // 2, height // 2, width // 2)
+        return job
+
+    def show_front(self, front: Plane, *, keep_levels: bool) -> None:
+        """Show only a front view: that of a volume in the making."""
+        self.release()
+        self.levels.set_image(grey(front), keep_levels=keep_levels)
+        self.front.set_colour_map(self.levels.colour_map)
+        self.front.show_over(front, (front.shape[1], front.shape[0]), self.levels.levels)
+        for view in (self.side, self.top, self.coloured):
+            view.clear()
+
+    def release(self) -> None:
+        """End reading and close the volume; nothing is shown then."""
+        if self._job is not None:
+            self._job.cancel()
+            self._job = None
+        if self._reader is not None:
+            self._reader.end()
+            self._reader = None
+        self._source = self.projections = None
+        self.slices, self._asked = {}, {}
+        self.progress.hide()
+
+    def set_mode(self, mode: Mode) -> None:
+        """Show the brightest along each axis, or slices through a point."""
+        self.mode = mode
+        (self.brightest_button if mode == "brightest" else self.slices_button).setChecked(True)
+        slices = mode == "slices"
+        for view in (self.front, self.side, self.top):
+            view.arrows_pan = not slices
+        self.slider.setVisible(slices)
+        self.plane_label.setVisible(slices)
+        self.profile.setVisible(slices)
+        self.coloured.setVisible(not slices)
+        for lines in self._lines.values():
+            for line in lines:
+                line.setVisible(slices)
+        self._show()
+
+    def go_to(self, plane: int, row: int, column: int) -> None:
+        """Let the slices go through a voxel."""
+        if self._source is None or self._reader is None:
+            return
+        n_z, height, width = self._source.shape
+        point = (min(max(plane, 0), n_z - 1), min(max(row, 0), height - 1), min(max(column, 0), width - 1))
+        self.point = point
+        self.slider.blockSignals(True)
+        self.slider.setValue(point[0])
+        self.slider.blockSignals(False)
+        self.plane_label.setText(f"plane {point[0] + 1} of {n_z}{self._depth_words(point[0])}")
+        for axis, index in zip(_AXES, point, strict=True):
+            if self._asked.get(axis) != index:
+                self._asked[axis] = index
+                self._reader.ask(axis, index)
+        self._place_lines()
+        if self.mode == "slices":
+            self._show_profile()
+
+    def _step_by_keys(self, view: StretchedImage, step: Callable[[int, int], tuple[int, int, int]]) -> None:
+        """Let the arrow keys in a view move the point by voxels; among projections they pan."""
+
+        def moved(across: float, down: float) -> None:
+            if self.mode == "slices":
+                plane, row, column = step(_voxels(across), _voxels(down))
+                self.go_to(self.point[0] + plane, self.point[1] + row, self.point[2] + column)
+
+        view.keys.moved.connect(moved)
+
+    @property
+    def images(self) -> dict[str, Plane]:
+        """What the views show, by name: for export."""
+        if self.mode == "slices":
+            names: dict[Axis, str] = {"z": "slice", "y": "slice-xz", "x": "slice-yz"}
+            return {names[axis]: held.pixels for axis, held in self.slices.items()}
+        if self.projections is None:
+            return {}
+        p = self.projections
+        return {"front": p.front, "top": p.top, "side": p.side, "depth": self._coloured(p)}
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        now = colours()
+        for view in (self.front, self.side, self.top, self.coloured):
+            view.graphics.setBackground(now.window)
+        restyle(self.profile)
+        self._along.setPen(curve_pen(0))
+        self._here.setPen(now.dim)
+        self.levels.restyle()
+        self._show()
+
+    # Inside --------------------------------------------------------------------------------------
+    def _take_projections(self, job: Job, found: Projections) -> None:
+        if job is not self._job:
+            return
+        self.projections = found
+        self.levels.set_image(found.front)
+
+    def _projecting_ended(self, job: Job) -> None:
+        if job is self._job:
+            self.progress.hide()
+
+    def _take_slice(self, held: Slice) -> None:
+        if self.sender() is not self._reader:
+            return  # of the volume before
+        self.slices[held.axis] = held
+        if self.mode == "slices":
+            self._show_slice(held, self.levels.levels)
+            self._name_slices()
+            if held.axis == "y":
+                self._show_profile()
+
+    def _show(self) -> None:
+        if self._source is None:
+            return
+        for view in (self.front, self.side, self.top, self.coloured):
+            view.set_colour_map(self.levels.colour_map)
+        if self.mode == "slices":
+            self._show_slices()
+        elif self.projections is not None:
+            self._show_projections(self.projections)
+
+    def _show_projections(self, p: Projections) -> None:
+        levels = self.levels.levels
+        self._draw(self.front, p.front, levels)
+        self._draw(self.top, p.top, levels)
+        self._draw(self.side, np.ascontiguousarray(p.side.T), levels)
+        self._draw(self.coloured, self._coloured(p), (0.0, 1.0))
+        first, last = (self._depth_words(z) or f", plane {z + 1}" for z in (0, len(p.top) - 1))
+        for label, text in zip(
+            self._titles,
+            (
+                "x–y, brightest over depth",
+                "z–y, brightest over x",
+                "x–z, brightest over y",
+                f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace(
+                    "red, ", "red "
+                ),
+            ),
+            strict=True,
+        ):
+            label.setText(text)
+
+    def _show_slices(self) -> None:
+        for held in self.slices.values():
+            self._show_slice(held, self.levels.levels)
+        self._name_slices()
+        self._show_profile()
+
+    def _show_slice(self, held: Slice, levels: tuple[float, float]) -> None:
+        if held.axis == "x":
+            self._draw(self.side, np.ascontiguousarray(np.swapaxes(held.pixels, 0, 1)), levels)
+        else:
+            self._draw(self.front if held.axis == "z" else self.top, held.pixels, levels)
+
+    def _name_slices(self) -> None:
+        z, y, x = self.point
+        for label, text in zip(
+            self._titles,
+            (f"x–y at plane {z + 1}", f"z–y at column {x}", f"x–z at row {y}", f"along depth at ({x}, {y})"),
+            strict=True,
+        ):
+            label.setText(text)
+
+    def _draw(self, view: StretchedImage, image: Plane, levels: tuple[float, float]) -> None:
+        """Show an image over the volume's own voxels."""
+        assert self._source is not None
+        n_z, height, width = self._source.shape
+        extents = {self.side: (n_z, height), self.top: (width, n_z)}
+        view.show_over(image, extents.get(view, (width, height)), levels)
+
+    def _show_profile(self) -> None:
+        """Draw the values along depth through the point, from the slice at its row."""
+        held = self.slices.get("y")
+        if held is None or self._source is None:
+            return
+        z, _, x = self.point
+        pixels = grey(held.pixels)
+        column = min(x * pixels.shape[1] // self._source.shape[2], pixels.shape[1] - 1)
+        self._along.setData(np.arange(1, len(pixels) + 1), pixels[:, column].astype(float))
+        self._here.setValue(z + 1)
+
+    def _place_lines(self) -> None:
+        z, y, x = (index + 0.5 for index in self.point)
+        for view, (across, down) in {self.front: (x, y), self.side: (z, y), self.top: (x, z)}.items():
+            self._lines[view][0].setValue(across)
+            self._lines[view][1].setValue(down)
+
+    def _coloured(self, p: Projections) -> Plane:
+        low, high = self.levels.levels
+        shown = in_colour_of_depth(p.front - np.float32(low), p.deepest, len(p.top), max(high - low, 1e-12))
+        if self.levels.colour_map == "red":  # for eyes used to the dark: no channel but red
+            shown[..., 0] = shown.max(axis=-1)
+            shown[..., 1:] = 0
+        return shown.astype(np.float32)
+
+    def _depth_words(self, plane: int) -> str:
+        return "" if self._planes is None else f", {self._planes[0][plane] / 1000:.4g} mm"
+
+
+def _voxels(steps: float) -> int:
+    """Return whole voxels for a step by keys: at least one."""
+    return int(math.copysign(max(1, round(abs(steps))), steps)) if steps else 0
+
+
+def _line(view: StretchedImage, angle: int) -> Any:
+    line = pg.InfiniteLine(angle=angle, pen=pg.mkPen(colours().warning, width=1, style=Qt.PenStyle.DotLine))
+    view.box.addItem(line)
+    return line

@@ -1,0 +1,1 @@
+"""The assembled bench: configuration, devices, lights, safety."""

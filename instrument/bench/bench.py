@@ -1,0 +1,431 @@
+"""The assembled bench: its devices opened together, made safe and closed together."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, cast
+
+from drivers.camera import Camera
+from drivers.device import Device, SharedPart
+from drivers.errors import DeviceLostError, LimitError
+from drivers.frame import Frame, FrameMetadata
+from drivers.led_array import LedArray
+from drivers.registry.claim import Claim
+from drivers.slm import Slm
+from drivers.stage import Stage
+from instrument.bench.camera_settings import apply_table
+from instrument.bench.closing_at_exit import ClosingAtExit
+from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
+from instrument.bench.config_file import load_config
+from instrument.bench.known_optics import known_geometry
+from instrument.bench.lights import Ask, Lights, SceneSwitch
+from instrument.bench.photograph import Snapshot, photograph
+from instrument.bench.safety import Step, StepsFailedError, safe_steps, try_all
+from instrument.bench.source_mount import Position, SourceMount
+from instrument.files.errors import BenchError
+from recon.types import Calibration, Geometry
+
+if TYPE_CHECKING:
+    from instrument.live.live import LiveView
+
+_log = logging.getLogger(__name__)
+_at_exit = ClosingAtExit()
+
+
+class Bench:
+    """Camera and, where the bench has them, stage, LED array and SLM.
+
+    Made by :func:`open_bench`, which opens the devices in this order; ``close`` (or leaving the context)
+    makes the bench safe and closes them in reverse order, each even if another fails. ``stop`` may be called
+    from any thread at any time.
+
+    Parameters
+    ----------
+    config : BenchConfig
+    ask : callable, optional
+        Asks the operator to light or darken something by hand, with a sentence to show; returns when done.
+    """
+
+    def __init__(self, config: BenchConfig, ask: Ask | None = None) -> None:
+        self.config = config
+        self._claims: list[Claim] = []
+        self._opened: set[Device] = set()
+        """Devices that were opened and not closed again: one that is not open any more was lost."""
+        self.shared: Mapping[str, SharedPart] = {
+            name: shared.part(shared.options) for name, shared in config.shared.items()
+        }
+        self.devices: Mapping[Kind, Device] = {
+            kind: device.driver(
+                device.options, self.shared[device.driver.Shared.table] if device.driver.Shared else None
+            )
+            for kind, device in config.devices.items()
+        }
+        switch = next((part for part in self.shared.values() if isinstance(part, SceneSwitch)), None)
+        self.newest_frame: Frame | None = None
+        """The last frame of a photograph, whoever took it: what a window shows while a run goes on."""
+        self._lights = Lights(config.source, config.scene, self.led_array, switch, ask)
+
+    # Devices -----------------------------------------------------------------------------------
+    @property
+    def camera(self) -> Camera:
+        """The camera; every bench has one."""
+        return cast(Camera, self.devices["camera"])
+
+    @property
+    def stage(self) -> Stage | None:
+        """The stage, if the bench has one."""
+        return cast("Stage | None", self.devices.get("stage"))
+
+    @property
+    def led_array(self) -> LedArray | None:
+        """The LED array, if the bench has one."""
+        return cast("LedArray | None", self.devices.get("led_array"))
+
+    @property
+    def slm(self) -> Slm | None:
+        """The SLM, if the bench has one."""
+        return cast("Slm | None", self.devices.get("slm"))
+
+    def open(self) -> Self:
+        """Open every device and apply the configured settings; on failure close again what was opened.
+
+        Raises
+        ------
+        DeviceError
+            Naming the device that is missing, refuses, or is in use by another program, and what to check.
+        """
+        try:
+            for kind in self.devices:
+                self._claim(kind)
+            for kind in self.devices:
+                self.open_device(kind)
+        except BaseException as error:
+            self._close_after(error)
+            raise
+        return self
+
+    def open_device(self, kind: Kind) -> Device:
+        """Open one device and apply its configured settings."""
+        _at_exit.watch(self)
+        self._claim(kind)
+        device = self.devices[kind]
+        device.open()
+        self._opened.add(device)
+        if kind == "camera":
+            try:
+                apply_table(cast(CameraTable, self.config.devices[kind].settings), self.camera)
+            except LimitError as error:
+                error.add_note(f"The value is from [camera] in {self.config.path}.")
+                raise
+        if kind == "led_array":
+            self._refuse_missing_leds(cast(LedArray, device))
+        _log.info("%s opened: %s", device.name, device.identity)
+        return device
+
+    def _refuse_missing_leds(self, led_array: LedArray) -> None:
+        count = len(led_array.led_positions_mm)
+        if missing := [led for led in self.config.source.leds if led >= count]:
+            raise LimitError(
+                led_array.name,
+                f"has LEDs 0 to {count - 1}, but [source] leds in {self.config.path} names "
+                f"{', '.join(map(str, missing))}.",
+            )
+
+    def _claim(self, kind: Kind) -> None:
+        """Keep other programs from a device, before it is touched, until the bench is closed."""
+        held = {claim.resource for claim in self._claims}
+        device = self.config.devices[kind]
+        for resource in device.driver.claims(device.options):
+            if resource not in held:
+                self._claims.append(Claim(resource, self.devices[kind].name))
+
+    # What the bench is -------------------------------------------------------------------------
+    @property
+    def simulated_kinds(self) -> tuple[str, ...]:
+        """Kinds of the open devices that have no hardware behind them."""
+        return tuple(k for k, device in self.devices.items() if device.is_open and device.identity.simulated)
+
+    @property
+    def label(self) -> str:
+        """The bench's name, with the word SIMULATED where it applies."""
+        simulated = self.simulated_kinds
+        if not simulated:
+            return self.config.label
+        part = "" if len(simulated) == len(self.devices) else f": {', '.join(simulated)}"
+        return f"{self.config.label} SIMULATED{part}"
+
+    def __str__(self) -> str:
+        lines = [self.label]
+        for kind, device in self.devices.items():
+            lines.append(f"  {kind}: {device.identity if device.is_open else 'closed'}")
+        return "\n".join(lines)
+
+    @property
+    def geometry(self) -> Geometry:
+        """The optics: as configured, else as the devices know them; the pitch is that of binned pixels."""
+        return known_geometry(self.config.geometry, self.camera, self.shared.values())
+
+    # Photographs -------------------------------------------------------------------------------
+    def snap(self, average: int = 1, *, on_frame: Callable[[int], None] | None = None) -> Snapshot:
+        """Take one photograph, the mean of ``average`` frames, all exposed after this call.
+
+        ``on_frame`` is called with the number of frames taken so far, after each.
+
+        Raises
+        ------
+        DeviceError
+            When the camera fails, or the LED array was lost meanwhile.
+        """
+
+        def noticed(taken: int) -> None:
+            self.require_light()
+            if on_frame is not None:
+                on_frame(taken)
+
+        taken = photograph(
+            self.camera, average, on_frame=noticed, seen=lambda frame: setattr(self, "newest_frame", frame)
+        )
+        return replace(taken, metadata=self.with_surroundings(taken.metadata))
+
+    def require_light(self) -> None:
+        """Refuse frames taken since the LED array was lost: nobody knows what lit them.
+
+        Raises
+        ------
+        DeviceLostError
+            When it was opened and is not open any more.
+        """
+        leds = self.led_array
+        if leds is not None and leds in self._opened and not leds.is_open:
+            raise DeviceLostError(
+                leds.name,
+                "was lost while frames were taken; those since are not kept.",
+                "Check its cable and power, then take them again.",
+            )
+
+    def live(self, calibration: Calibration | Path | str, *, n_buffers: int = 4, **settings: Any) -> LiveView:
+        """Return a live reconstruction of the camera, to be used as a context manager.
+
+        ``settings`` are those of :class:`recon.streams.live.LiveReconstructor`: ``z_um``, ``budget_ms``,
+        ...::
+
+            with bench.live("calibration", budget_ms=33) as live:
+                for result in live:
+                    show(result.picture.image, result.picture.quality)
+
+        Raises
+        ------
+        FileError, InputError
+            When the calibration cannot be used.
+        """
+        from instrument.live.live import live_view
+
+        return live_view(self.camera.stream(n_buffers), calibration, **settings)
+
+    def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
+        """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""
+        return replace(
+            metadata,
+            stage_position=self.stage.position() if self.stage else metadata.stage_position,
+            led_pattern=self.led_array.pattern.description if self.led_array else metadata.led_pattern,
+            slm_image_hash=(
+                hashlib.sha256(self.slm.displayed.tobytes()).hexdigest()
+                if self.slm
+                else metadata.slm_image_hash
+            ),
+        )
+
+    # The point source --------------------------------------------------------------------------
+    @property
+    def source_mount(self) -> SourceMount:
+        """The point source on its stage.
+
+        Raises
+        ------
+        BenchError
+            When the bench has no stage.
+        """
+        if self.stage is None:
+            raise BenchError(f"{self.config.label} has no [stage], so the source cannot be placed.")
+        return SourceMount(self.stage, self.config.source.offset_um)
+
+    @property
+    def source_position_um(self) -> Position:
+        """Where the point source is now, as the stage reads: x, y, z from the diffuser's centre."""
+        return self.source_mount.position_um
+
+    def place_source(
+        self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
+    ) -> Position:
+        """Move the point source to a place given from the diffuser's centre; None keeps a coordinate.
+
+        Returns
+        -------
+        tuple of float
+            The place reached, as the stage reads.
+
+        Raises
+        ------
+        LimitError
+            When the place is out of the stage's reach; nothing moves.
+        BenchError
+            When there is no stage, or it lacks the axis; nothing moves.
+        """
+        mount = self.source_mount
+        mount.stage.move_to(mount.target(x_um, y_um, z_um))
+        return mount.position_um
+
+    def stage_target(
+        self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
+    ) -> dict[str, float]:
+        """Return the stage position that brings the point source to a place; errors as ``place_source``."""
+        return self.source_mount.target(x_um, y_um, z_um)
+
+    def source_on(self) -> None:
+        """Light the point source; confirmed when this returns."""
+        self._lights.switch_source(lit=True)
+
+    def source_off(self) -> None:
+        """Darken the point source."""
+        self._lights.switch_source(lit=False)
+
+    @property
+    def can_switch_source(self) -> bool:
+        """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
+        return self._lights.can_switch_source
+
+    # The scene ---------------------------------------------------------------------------------
+    def scene_on(self) -> None:
+        """Light the scene: the simulated world does it, or the operator is asked."""
+        self._lights.switch_scene(lit=True)
+
+    def scene_off(self) -> None:
+        """Darken the scene: the simulated world does it, or the operator is asked."""
+        self._lights.switch_scene(lit=False)
+
+    @property
+    def can_switch_scene(self) -> bool:
+        """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
+        return self._lights.can_switch_scene
+
+    @property
+    def scene_lit(self) -> bool:
+        """Whether the scene is lit, as far as the program knows: an operator's own switching is not seen."""
+        return self._lights.scene_lit
+
+    @property
+    def source_lit(self) -> bool:
+        """Whether the LEDs of [source] alone are lit, by the last pattern that the array confirmed."""
+        leds = self.led_array
+        return leds is not None and leds.is_open and self._lights.is_source(leds.pattern)
+
+    @property
+    def ask(self) -> Ask | None:
+        """Asks the operator to do something by hand; None where nobody can be asked."""
+        return self._lights.ask
+
+    # Safety ------------------------------------------------------------------------------------
+    def stop(self) -> None:
+        """Stop whatever runs and make the bench safe, from any thread; see ``safe_state``."""
+        self.safe_state()
+
+    def safe_state(self) -> None:
+        """Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
+
+        Raises
+        ------
+        StepsFailedError
+            After every step was tried, naming those that failed.
+        """
+        try_all(self._safe_steps())
+
+    def close(self) -> None:
+        """Make the bench safe and close every device in reverse order, each even if another fails.
+
+        Raises
+        ------
+        StepsFailedError
+            After everything was tried, naming what failed.
+        """
+        steps = self._safe_steps()
+        steps += [
+            (f"close {device.name}", partial(self._close_device, device))
+            for device in reversed(list(self.devices.values()))
+        ]
+        steps += [(f"release {claim.resource}", claim.release) for claim in self._claims]
+        self._claims = []
+        try:
+            try_all(steps)
+        finally:
+            _at_exit.forget(self)
+
+    def _close_device(self, device: Device) -> None:
+        self._opened.discard(device)
+        device.close()
+
+    def _safe_steps(self) -> list[Step]:
+        blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe
+        return safe_steps(
+            self.led_array,
+            self._lights.scene_switch,
+            self.stage,
+            self.camera,
+            self.slm if blanks else None,
+            self._opened,
+        )
+
+    def _close_after(self, error: BaseException) -> None:
+        """Close on the way out of an error, which stays the error that is raised."""
+        try:
+            self.close()
+        except StepsFailedError as failure:
+            _log.error("%s", failure)
+            error.add_note(str(failure))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if exc is None:
+            self.close()
+        else:
+            self._close_after(exc)
+
+
+def open_bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = None) -> Bench:
+    """Open a bench: every device that its configuration names, or none.
+
+    Parameters
+    ----------
+    config : BenchConfig or path, optional
+        None means ``bench.toml`` in the working folder if there is one, otherwise the built-in simulated
+        bench, which says SIMULATED wherever it is named.
+    ask : callable, optional
+        Asks the operator to do something by hand, with a sentence to show; returns when it is done.
+
+    Returns
+    -------
+    Bench
+        Open; use it as a context manager, or call ``close``.
+
+    Raises
+    ------
+    ConfigError, FileError
+        When the configuration is wrong; no device was touched.
+    DeviceError
+        When a device is missing or refuses; the others were closed again.
+    """
+    if not isinstance(config, BenchConfig):
+        config = load_config(config)
+    return Bench(config, ask).open()

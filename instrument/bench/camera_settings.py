@@ -1,0 +1,150 @@
+"""A camera's settings: as configured, read, and brought back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.camera import Camera, Roi
+from drivers.device import Setting
+from drivers.errors import DeviceError, LimitError
+from instrument.bench.config import CameraTable
+
+
+@dataclass(frozen=True, slots=True)
+class CameraState:
+    """What a camera says of itself now, and what it offers.
+
+    Attributes
+    ----------
+    exposure_ms, gain, black_level, binning, roi, pixel_format
+        As read back.
+    exposure_limits_ms, gain_limits, binnings, pixel_formats, sensor_shape
+        What it offers.
+    temperature_c : float or None
+        Of the sensor or the camera, where it has a thermometer; degrees Celsius.
+    settings : mapping
+        All of its settings, by name.
+    """
+
+    exposure_ms: float
+    gain: float
+    black_level: float
+    binning: int
+    roi: Roi
+    pixel_format: str
+    exposure_limits_ms: tuple[float, float]
+    gain_limits: tuple[float, float]
+    binnings: tuple[int, ...]
+    pixel_formats: tuple[str, ...]
+    sensor_shape: tuple[int, int]
+    temperature_c: float | None
+    settings: Mapping[str, Setting]
+
+
+def read_camera(camera: Camera) -> CameraState:
+    """Ask a camera for everything; takes as long as the camera needs to answer."""
+    settings = camera.settings()
+    temperature = next(
+        (v for k, v in settings.items() if "temperature" in k.lower() and isinstance(v, int | float)), None
+    )
+    return CameraState(
+        exposure_ms=camera.exposure_ms,
+        gain=camera.gain,
+        black_level=camera.black_level,
+        binning=camera.binning,
+        roi=camera.roi,
+        pixel_format=camera.pixel_format,
+        exposure_limits_ms=camera.exposure_limits_ms,
+        gain_limits=camera.gain_limits,
+        binnings=camera.binnings,
+        pixel_formats=camera.pixel_formats,
+        sensor_shape=camera.sensor_shape,
+        temperature_c=None if temperature is None else float(temperature),
+        settings=dict(settings),
+    )
+
+
+def camera_settings(camera: Camera) -> dict[str, Any]:
+    """Return format, region, binning, black level, gain and exposure as the camera reports them."""
+    return {
+        "pixel_format": camera.pixel_format,
+        "binning": camera.binning,
+        "roi": list(camera.roi.as_tuple()),
+        "black_level": camera.black_level,
+        "gain": camera.gain,
+        "exposure_ms": camera.exposure_ms,
+    }
+
+
+def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
+    """Bring a camera back to what :func:`camera_settings` returned.
+
+    Raises
+    ------
+    DeviceError
+        Naming the settings that the camera did not take.
+    """
+    now = camera_settings(camera)
+    if now["pixel_format"] != wanted["pixel_format"]:
+        camera.set_pixel_format(wanted["pixel_format"])
+    if now["binning"] != wanted["binning"]:
+        camera.set_binning(wanted["binning"])
+    if now["roi"] != list(wanted["roi"]):
+        camera.set_roi(Roi(*wanted["roi"]))
+    if not _same(camera.black_level, wanted["black_level"]):
+        camera.set_black_level(wanted["black_level"])
+    if not _same(now["gain"], wanted["gain"]):
+        camera.set_gain(wanted["gain"])
+    if not _same(now["exposure_ms"], wanted["exposure_ms"]):
+        camera.set_exposure_ms(wanted["exposure_ms"])
+    now = camera_settings(camera)
+    different = [
+        f"{name} is {now[name]}, was {wanted[name]}" for name in now if not _same(now[name], wanted[name])
+    ]
+    if different:
+        raise DeviceError(
+            camera.name,
+            f"does not take the settings that the run began with: {'; '.join(different)}.",
+            "Is it the same camera?",
+        )
+
+
+def apply_table(wanted: CameraTable, camera: Camera) -> None:
+    """Bring a camera to its configured settings, in the order in which they depend on each other.
+
+    Raises
+    ------
+    LimitError
+        Naming every setting that the camera refuses; the others are set.
+    """
+    setters: dict[str, Callable[[Any], object]] = {
+        "pixel_format": camera.set_pixel_format,
+        "binning": camera.set_binning,
+        "roi": lambda roi: camera.set_roi(Roi(*roi)),
+        "black_level": camera.set_black_level,
+        "gain": camera.set_gain,
+        "exposure_ms": camera.set_exposure_ms,
+    }
+    refused = []
+    for name, set_to in setters.items():
+        value = getattr(wanted, name)
+        if value is None:
+            continue
+        try:
+            set_to(value)
+        except LimitError as error:
+            refused.append((name, error))
+    if len(refused) == 1:
+        raise refused[0][1]
+    if refused:
+        listed = "".join(f"\n  {name}: {error.problem} {error.remedy}".rstrip() for name, error in refused)
+        raise LimitError(camera.name, f"does not take {len(refused)} of its configured settings:{listed}")
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, float) or isinstance(b, float):
+        return math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-9)
+    return bool(list(a) == list(b) if isinstance(a, (list, tuple)) else a == b)

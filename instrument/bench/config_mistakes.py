@@ -1,0 +1,198 @@
+"""Mistakes in a configuration, said so that a person can put them right."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Union
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from instrument.files.errors import ConfigProblem
+from instrument.files.toml_lines import KeyPath
+
+# Suffix to (dimension, factor to its base unit); how units are written in this project's names.
+_UNITS: Mapping[str, tuple[str, float]] = {
+    "ns": ("time", 1e-9), "us": ("time", 1e-6), "ms": ("time", 1e-3), "s": ("time", 1.0),
+    "min": ("time", 60.0),
+    "nm": ("length", 1e-9), "um": ("length", 1e-6), "mm": ("length", 1e-3), "cm": ("length", 1e-2),
+    "m": ("length", 1.0), "urad": ("angle", 1e-6), "mrad": ("angle", 1e-3), "rad": ("angle", 1.0),
+    "deg": ("angle", 0.017453292519943295), "hz": ("rate", 1.0), "khz": ("rate", 1e3),
+}  # fmt: skip
+
+
+class Mistakes:
+    """Collects the mistakes of one file, with lines.
+
+    Parameters
+    ----------
+    lines : mapping
+        From :func:`instrument.files.toml_lines.key_lines`.
+    """
+
+    def __init__(self, lines: Mapping[KeyPath, int]) -> None:
+        self._lines = lines
+        self.problems: list[ConfigProblem] = []
+
+    def __bool__(self) -> bool:
+        return bool(self.problems)
+
+    def add(self, path: KeyPath, where: str, text: str) -> None:
+        """Note one mistake at a key; ``where`` is how the text names it."""
+        self.problems.append(ConfigProblem(self._lines.get(path), where, text))
+
+    def add_all(
+        self,
+        error: ValidationError,
+        model: type[BaseModel],
+        table: tuple[str, ...],
+        known: Sequence[str],
+        content: Mapping[str, Any],
+    ) -> None:
+        """Note every mistake that a model found in a table with this content.
+
+        ``known`` are the keys allowed at the table's top level, which may be more than the model's own.
+        """
+        for detail in error.errors(include_url=False):
+            path = self._place(table, detail["loc"])
+            name = _spell((*path[1:], *_unplaced(table, detail, path)))
+            where = f"[{table[0]}] {name}".rstrip()
+            names_in_loc = [i for i, step in enumerate(detail["loc"]) if isinstance(step, str)]
+            inner = _models_at(model, detail["loc"][: max(names_in_loc, default=0)], content)
+            names = tuple(known) if inner == (model,) else tuple(key for m in inner for key in m.model_fields)
+            self.add(path, where, _sentence(detail, names, inner))
+
+    def _place(self, table: tuple[str, ...], loc: Iterable[str | int]) -> KeyPath:
+        """Follow ``loc`` as far as the file goes; it also holds names of alternatives that no file has."""
+        path: KeyPath = table
+        for step in loc:
+            if (*path, step) in self._lines:
+                path = (*path, step)
+        return path
+
+
+def nearest_name(name: str, names: Iterable[str]) -> str | None:
+    """Return the name that was probably meant, or None where none is close."""
+    names = list(names)
+    if close := difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.6):
+        return close[0]
+    longer = [known for known in names if len(name) > 2 and known.startswith(name.lower())]
+    return longer[0] if len(longer) == 1 else None
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Return ``" Did you mean 'x'?"``, or nothing where no name is close."""
+    close = nearest_name(name, names)
+    return f" Did you mean {close!r}?" if close else ""
+
+
+def _sentence(detail: ErrorDetails, names: Sequence[str], models: Sequence[type[BaseModel]]) -> str:
+    kind, key, value = detail["type"], detail["loc"][-1] if detail["loc"] else "", detail["input"]
+    if kind == "extra_forbidden":
+        hint = _other_unit(str(key), value, names) or nearest(str(key), names)
+        return f"there is no such key.{hint}" + (f" Keys here: {', '.join(names)}." if names else "")
+    if kind == "missing":
+        what = "this value" if isinstance(key, int) else "this key"
+        return f"{what} is missing.{_about(detail, models)}"
+    message = detail["msg"]
+    for start, instead in (
+        ("Input should be a valid ", "must be a "),
+        ("Input should be ", "must be "),
+        ("Value error, ", ""),
+    ):
+        if message.startswith(start):
+            message = instead + message.removeprefix(start)
+            break
+    found = "" if isinstance(value, Mapping) else f", not {value!r}"  # a whole table is in the file to see
+    return f"{_article(message)}{found}.{_about(detail, models)}"
+
+
+def _about(detail: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
+    """Return a space and the description of the key that a mistake is about, or nothing."""
+    names = [step for step in detail["loc"] if isinstance(step, str)]
+    fields = [model.model_fields[names[-1]] for model in models if names and names[-1] in model.model_fields]
+    return f" {fields[0].description}" if fields and fields[0].description else ""
+
+
+def _article(message: str) -> str:
+    articles = (("a array", "an array"), ("a integer", "an integer"), ("an object", "a table"))
+    for wrong, right in (*articles, ("a object", "a table")):
+        message = message.replace(wrong, right)
+    return message.replace("string", "text").replace("boolean", "true or false")
+
+
+def _other_unit(key: str, value: object, names: Iterable[str]) -> str:
+    """Say how ``exposure_s = 0.01`` is written where the key is ``exposure_ms``."""
+    stem, _, unit = key.rpartition("_")
+    if not stem or unit not in _UNITS:
+        return ""
+    dimension, factor = _UNITS[unit]
+    for name in names:
+        other_stem, _, other = name.rpartition("_")
+        if other_stem == stem and other in _UNITS and _UNITS[other][0] == dimension:
+            hint = f" Did you mean {name!r}?"
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                hint += f" {key} = {value:g} would be {name} = {value * factor / _UNITS[other][1]:.6g}."
+            return hint
+    return ""
+
+
+def _spell(path: Iterable[str | int]) -> str:
+    text = ""
+    for step in path:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return text
+
+
+def _unplaced(table: tuple[str, ...], detail: ErrorDetails, path: KeyPath) -> KeyPath:
+    """Return the last step of a mistake's place where the file does not hold it: a missing key."""
+    missing = (
+        detail["type"] == "missing"
+        and detail["loc"]
+        and (len(path) == len(table) or path[-1] != detail["loc"][-1])
+    )
+    return (detail["loc"][-1],) if missing else ()
+
+
+def _models_at(
+    model: type[BaseModel], loc: Iterable[str | int], content: object
+) -> tuple[type[BaseModel], ...]:
+    """Return the models that the keys at a place inside ``model`` belong to, as far as annotations tell.
+
+    It is one, or two where a model has an ``options_model``: a classmethod that tells from the content of its
+    table what checks the keys that it does not know itself.
+    """
+    current: tuple[Any, ...] = (model,)
+    in_table_of_models = False
+    for step in loc:
+        content = content.get(step) if isinstance(content, Mapping) else None
+        if isinstance(step, int):
+            continue  # an element of an array belongs to the model that the array holds
+        if in_table_of_models:
+            in_table_of_models = False
+        else:
+            field = next((m.model_fields[step] for m in current if step in m.model_fields), None)
+            inner = None if field is None else _only_model(field.annotation)
+            if field is None or inner is None:
+                return ()
+            in_table_of_models = typing.get_origin(field.annotation) is dict
+            current = (inner,)
+            if in_table_of_models:
+                continue
+        options_model = getattr(current[0], "options_model", None)
+        more = options_model(content) if options_model else None
+        current = (*current, more) if more else current
+    return current
+
+
+def _only_model(annotation: Any) -> Any:
+    """Return the one model in an annotation such as ``Model | None`` or ``tuple[Model, ...]``, else None."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if typing.get_origin(annotation) in (Union, types.UnionType, tuple, list, dict):
+        models = {found for part in typing.get_args(annotation) if (found := _only_model(part))}
+        return models.pop() if len(models) == 1 else None
+    return None

@@ -1,0 +1,113 @@
+"""What lights the point source and the scene: the LED array, the simulated world, or the operator's hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from drivers.led_array import LedArray, LedPattern
+from instrument.bench.config import SceneTable, SourceTable
+from instrument.files.errors import BenchError, OperatorNeededError
+
+Ask = Callable[[str], None]
+"""Asks the operator to do something by hand and returns when it is done."""
+
+
+@runtime_checkable
+class SceneSwitch(Protocol):
+    """A shared part that can light and darken the scene: the simulated world."""
+
+    scene_lit: bool
+
+
+class Lights:
+    """Switches point source and scene, asking the operator where no device can do it.
+
+    Parameters
+    ----------
+    source : SourceTable
+    scene : SceneTable
+    led_array : LedArray, optional
+    scene_switch : SceneSwitch, optional
+    ask : callable, optional
+        None where nobody can be asked.
+    """
+
+    def __init__(
+        self,
+        source: SourceTable,
+        scene: SceneTable,
+        led_array: LedArray | None,
+        scene_switch: SceneSwitch | None,
+        ask: Ask | None,
+    ) -> None:
+        self._source = source
+        self._led_array = led_array
+        self._by_operator = scene.control == "operator"
+        self.scene_switch = scene_switch
+        self.ask = ask
+        self._asked: dict[str, bool] = {}
+
+    @property
+    def can_switch_source(self) -> bool:
+        """Whether the point source can be lit and darkened: by the LED array, or by asking the operator."""
+        return self._led_array is not None or self.ask is not None
+
+    @property
+    def can_switch_scene(self) -> bool:
+        """Whether the scene can be lit and darkened: by the simulated world, or by asking the operator."""
+        return self.ask is not None if self._by_operator else self.scene_switch is not None
+
+    @property
+    def scene_lit(self) -> bool:
+        """Whether the scene is lit, as far as is known."""
+        if self._by_operator:
+            return self._asked.get("the scene", False)
+        return self.scene_switch is not None and self.scene_switch.scene_lit
+
+    def is_source(self, pattern: LedPattern) -> bool:
+        """Whether a pattern is the point source as it is configured: these LEDs so bright, and no others."""
+        lit = {led: rgb for led, rgb in pattern.levels if any(rgb)}
+        return bool(lit) and lit == dict.fromkeys(self._source.leds, self._source.rgb)
+
+    def switch_source(self, *, lit: bool) -> None:
+        """Light or darken the point source; confirmed when this returns."""
+        if self._led_array is None:
+            self._ask_once("the point source", lit=lit)
+        elif lit:
+            leds, rgb = self._source.leds, self._source.rgb
+            words = f"point source: LED {', '.join(map(str, leds))} rgb {rgb}"
+            self._led_array.set_pattern(LedPattern(words, tuple((led, rgb) for led in leds)))
+        else:
+            self._led_array.off()
+
+    def switch_scene(self, *, lit: bool) -> None:
+        """Light or darken the scene.
+
+        Raises
+        ------
+        BenchError
+            When the configuration leaves it to a simulated world that is not there.
+        OperatorNeededError
+            When nobody can be asked.
+        """
+        if self._by_operator:
+            self._ask_once("the scene", lit=lit)
+        elif self.scene_switch is None:
+            raise BenchError(
+                'bench.toml says [scene] control = "simulated", but no device of this bench is simulated. '
+                'Set it to "operator".'
+            )
+        else:
+            self.scene_switch.scene_lit = lit
+
+    def _ask_once(self, what: str, *, lit: bool) -> None:
+        if self._asked.get(what) == lit:
+            return
+        request = f"Please {'light' if lit else 'darken'} {what}."
+        if self.ask is None:
+            raise OperatorNeededError(
+                f"{request} Nobody can be asked here: use a terminal (in Python: open_bench(..., ask=))."
+            )
+        self.ask(request)
+        self._asked[what] = lit

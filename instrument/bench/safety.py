@@ -1,0 +1,132 @@
+"""Making a bench safe: which steps, in which order, and each tried whatever happens to the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+
+from drivers.camera import Camera
+from drivers.device import Device
+from drivers.errors import DeviceLostError, DeviceNotOpenError
+from drivers.led_array import LedArray
+from drivers.slm import Slm
+from drivers.stage import Stage
+from instrument.bench.lights import SceneSwitch
+from instrument.files.errors import BenchError
+
+Step = tuple[str, Callable[[], None]]
+"""A step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it."""
+
+LIGHT_DOUBT = "The light may be on"
+MOTION_DOUBT = "The stage may be moving"
+_LOOK = "look, and switch its power off if so."
+
+
+class StepsFailedError(BenchError):
+    """Some steps of making the bench safe failed; all were tried.
+
+    Attributes
+    ----------
+    failures : tuple of (str, BaseException)
+        Each failed step in words, with its error.
+    """
+
+    exit_code = 1
+
+    def __init__(self, failures: Iterable[tuple[str, BaseException]]) -> None:
+        self.failures = tuple(failures)
+        listed = "".join(f"\n  {step}: {str(error) or type(error).__name__}" for step, error in self.failures)
+        super().__init__(f"The bench may not be safe. Check by eye what could not be done:{listed}")
+
+
+def safe_steps(
+    led_array: LedArray | None,
+    scene: SceneSwitch | None,
+    stage: Stage | None,
+    camera: Camera,
+    slm: Slm | None,
+    opened: Collection[Device],
+) -> list[Step]:
+    """Return the steps that make a bench safe: light off, motion stopped, exposure ended, SLM blank.
+
+    Devices that are closed by then are safe already; ``slm`` is left out where it may keep its image. An LED
+    array or a stage among ``opened`` (opened by the bench and not closed by it) that is not open was lost: it
+    may shine or move on, and its step fails.
+    """
+    steps: list[Step] = []
+    if led_array is not None:
+        steps.append(
+            (f"light off, {led_array.name}", _made_sure(led_array, led_array.off, opened, LIGHT_DOUBT))
+        )
+    if scene is not None:
+        steps.append(("scene dark, simulated", lambda: setattr(scene, "scene_lit", False)))
+    if stage is not None:
+        steps.append((f"motion stopped, {stage.name}", _made_sure(stage, stage.stop, opened, MOTION_DOUBT)))
+    steps.append((f"exposure ended, {camera.name}", _when_open(camera, camera.stop_sequence)))
+    if slm is not None:
+        steps.append((f"blank, {slm.name}", _when_open(slm, slm.blank)))
+    return steps
+
+
+def _when_open(device: Device, step: Callable[[], None]) -> Callable[[], None]:
+    def run() -> None:
+        if device.is_open:
+            step()
+
+    return run
+
+
+def _made_sure(
+    device: Device, step: Callable[[], None], opened: Collection[Device], doubt: str
+) -> Callable[[], None]:
+    """Return a step whose error says what may be going on; of a lost device it fails whatever happens."""
+
+    def run() -> None:
+        lost = not device.is_open
+        if lost and device not in opened:
+            return
+        try:
+            step()
+        except Exception as error:
+            if not (lost and isinstance(error, DeviceNotOpenError)):
+                text = str(error) or type(error).__name__
+                if doubt in text:
+                    raise
+                raise BenchError(f"{text} {doubt}: {_LOOK}") from error
+        if lost and not device.is_open:
+            raise DeviceLostError(device.name, "was lost.", f"{doubt}: {_LOOK}")
+
+    return run
+
+
+def try_all(steps: Iterable[Step]) -> None:
+    """Run every step in order, each even if those before it failed or were interrupted.
+
+    Parameters
+    ----------
+    steps : iterable of (str, callable)
+        The step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it.
+
+    Raises
+    ------
+    KeyboardInterrupt, SystemExit
+        The first of them that came during a step, after every step was tried; failures are its notes.
+    StepsFailedError
+        When steps failed.
+    """
+    failures: list[tuple[str, BaseException]] = []
+    interruption: BaseException | None = None
+    for name, step in steps:
+        try:
+            step()
+        except Exception as error:  # noqa: BLE001 - the next step must be tried whatever this one raised
+            failures.append((name, error))
+        except BaseException as error:  # noqa: BLE001 - an impatient Ctrl-C must not leave the light on
+            failures.append((name, error))
+            interruption = interruption or error
+    if not failures:
+        return
+    failed = StepsFailedError(failures)
+    if interruption is not None:
+        interruption.add_note(str(failed))
+        raise interruption
+    raise failed

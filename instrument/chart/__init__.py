@@ -1,1 +1,0 @@
-"""Charts of cost against accuracy: run, kept, drawn, read back."""

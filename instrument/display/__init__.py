@@ -1,0 +1,1 @@
+"""Hologram requests, files and figures."""

@@ -1,0 +1,1 @@
+"""Charts, analyses and stability maps as files and figures."""

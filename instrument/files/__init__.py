@@ -1,0 +1,1 @@
+"""Files: images, calibrations, versioned records, figures."""

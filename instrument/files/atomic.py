@@ -1,0 +1,106 @@
+"""Writing files whole or not at all: to a temporary name beside the target, synced, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from instrument.files.errors import FileError
+
+_NEARLY_FULL_BYTES = 1 << 20
+
+
+@contextlib.contextmanager
+def whole_file(path: Path | str) -> Iterator[Path]:
+    """Give a temporary path beside ``path``; what is written there takes its place when the block ends.
+
+    When the block raises, the temporary file is removed and ``path`` stays as it was. The temporary name
+    keeps the suffix, so that writers which choose the format by it do the same.
+
+    Raises
+    ------
+    FileError
+        When the folder is missing or cannot be written to.
+    OSError
+        When writing fails (a full disk), naming ``path``.
+    """
+    path = Path(path)
+    check_writable(path)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        if error.errno is None and shutil.disk_usage(path.parent).free < _NEARLY_FULL_BYTES:
+            # Some writers only notice that less was written than they asked for.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        error.filename = str(path)
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write UTF-8 text; errors as ``whole_file``."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Write bytes; errors as ``whole_file``."""
+    with whole_file(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def check_writable(path: Path | str, n_bytes: int = 0) -> None:
+    """Refuse a file that could not be written, before the work that would fill it.
+
+    Parameters
+    ----------
+    path : path
+        The file to be.
+    n_bytes : int
+        Its expected size; the disk must have that much room.
+
+    Raises
+    ------
+    FileError
+    """
+    path = Path(path)
+    folder = path.parent
+    if path.is_dir():
+        raise FileError(path, "is a folder; a file name is expected.")
+    if path.exists() and not path.is_file():
+        raise FileError(path, "is a device or pipe, which a file would take the place of.", "Name a file.")
+    if not folder.is_dir():
+        found = "is no folder" if folder.exists() else "does not exist"
+        raise FileError(path, f"its folder {folder} {found}.", "Make it first.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise FileError(path, f"no permission to write in {folder.absolute()}.", "Choose another place.")
+    disk = os.statvfs(folder)
+    if disk.f_flag & os.ST_RDONLY:
+        raise FileError(path, f"{folder} is on a read-only disk.", "Choose another place.")
+    free = disk.f_bavail * disk.f_frsize
+    if free < n_bytes:
+        raise FileError(
+            path,
+            f"needs {n_bytes / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free on its disk.",
+            "Free some, or choose another place.",
+        )
+
+
+def sync_folder(folder: Path) -> None:
+    """Put a folder's entries on the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,178 @@
+"""Files of stability maps: cells as they are made (``cells.jsonl``), and ``stability.json`` with all maps."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from instrument.files.atomic import write_text
+from instrument.files.errors import FileError
+from recon.verdict.map import Axis, Cell, Size, StressMap, boundary, severity_grid
+
+FORMAT = "diffuserbench-stability"
+VERSION = 1
+CELLS = "cells.jsonl"
+RESULT = "stability.json"
+_KEY = ("map", "size", "axes", "program", "scene")
+"""What tells cells apart, as a line has it."""
+
+
+class CellLog:
+    """The cells that were made so far, one JSON line each, so that an interrupted map goes on.
+
+    A line belongs to a map, a size, and the axes, scene and version of the program that it was made with:
+    where one of these has changed since, the cells are made again.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / CELLS
+        self._cells: dict[tuple[str, ...], dict[tuple[str, int, int], Cell]] = {}
+        if self.path.exists():
+            self._read()
+
+    def of(self, stress: StressMap, size: Size) -> list[Cell]:
+        """Return the cells of a map."""
+        return list(self._cells.get(_key(stress, size), {}).values())
+
+    def add(self, stress: StressMap, size: Size, cell: Cell) -> None:
+        """Append a cell to the file."""
+        key = _key(stress, size)
+        entry = {**dict(zip(_KEY, key, strict=True)), **cell.as_json()}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry, allow_nan=False) + "\n")
+        self._keep(key, cell)
+
+    def _read(self) -> None:
+        lines = self.path.read_text(encoding="utf-8").splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                entry = json.loads(line)
+                # Lines of old have neither program nor scene: they are of another, whatever it was.
+                key = (*(str(entry[name]) for name in _KEY[:3]), *(str(entry.get(n)) for n in _KEY[3:]))
+                self._keep(key, Cell.from_json(entry))
+            except (ValueError, KeyError, TypeError) as error:
+                if number == len(lines):  # cut off in mid-line: that cell is made again
+                    self._cut_last(lines)
+                    return
+                raise FileError(
+                    self.path, f"line {number} is no cell of a map.", "Remove the file to start again."
+                ) from error
+
+    def _cut_last(self, lines: list[str]) -> None:
+        write_text(self.path, "".join(f"{line}\n" for line in lines[:-1]))
+
+    def _keep(self, key: tuple[str, ...], cell: Cell) -> None:
+        self._cells.setdefault(key, {})[(cell.method, cell.ix, cell.iy)] = cell
+
+
+def _key(stress: StressMap, size: Size) -> tuple[str, ...]:
+    """Return what a map's cells depend on, in the order of ``_KEY``."""
+    axes = ";".join(f"{a.key}:{','.join(f'{v:g}' for v in a.at(size))}" for a in (stress.x, stress.y))
+    scene = f"{stress.draws} {stress.base}".strip()
+    return stress.name, size, axes, version("diffuserbench"), scene
+
+
+def map_record(stress: StressMap, size: Size, cells: Sequence[Cell]) -> dict[str, Any]:
+    """Return a map as ``stability.json`` has it (docs/reference/stability-json.md)."""
+    x, y = stress.x.at(size), stress.y.at(size)
+    methods: dict[str, Any] = {}
+    for method in stress.methods:
+        mine = {(c.iy, c.ix): c for c in cells if c.method == method}
+        if not mine:
+            continue
+        grid = severity_grid(list(cells), method, (len(y), len(x)))
+        methods[method] = {
+            "error": _grid(x, y, lambda k, mine=mine: _maybe(mine, k, "error")),
+            "severity": _grid(x, y, lambda k, mine=mine: _maybe(mine, k, "severity")),
+            "failure": _grid(x, y, lambda k, mine=mine: _failure(mine, k)),
+            "boundary": boundary(x, y, grid, logarithmic=stress.x.logarithmic),
+            "evidence": [
+                {"ix": c.ix, "iy": c.iy, **{k: _short(v) for k, v in e.items()}}
+                for c in mine.values()
+                for e in c.evidence
+            ],
+            "seconds": round(sum(c.seconds for c in mine.values()), 2),
+        }
+    return {
+        "title": stress.title,
+        "question": stress.question,
+        "size": size,
+        "error": stress.error,
+        "x": _axis(stress.x, size),
+        "y": _axis(stress.y, size),
+        "methods": methods,
+    }
+
+
+def write_stability(folder: Path, maps: Mapping[str, Any], command: str) -> Path:
+    """Write ``stability.json``: the given maps take the place of those of their name, others stay."""
+    path = folder / RESULT
+    kept = dict(read_stability(path)["maps"]) if path.exists() else {}
+    record = {
+        "format": FORMAT,
+        "version": VERSION,
+        "program": f"diffuserbench {version('diffuserbench')}",
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": platform.machine(),
+        "command": command,
+        "maps": {**kept, **maps},
+    }
+    write_text(path, json.dumps(record, allow_nan=False, indent=None, separators=(",", ":")) + "\n")
+    return path
+
+
+def read_stability(path: Path) -> dict[str, Any]:
+    """Read ``stability.json``; errors name the file."""
+    if not path.is_file():
+        raise FileError(path, "does not exist.", "Make it with diffuserbench stability.")
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileError(
+            path, f"cannot be read as JSON: {error}.", "Make it with diffuserbench stability."
+        ) from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise FileError(path, "holds no stability maps.", "Make it with diffuserbench stability.")
+    if record.get("version") != VERSION:
+        raise FileError(
+            path, f"has version {record.get('version')}; this program reads {VERSION}.", "Make it again."
+        )
+    return record
+
+
+def _axis(axis: Axis, size: Size) -> dict[str, Any]:
+    ticks = {} if axis.named is None else {"ticks": [axis.named(v, size) for v in axis.at(size)]}
+    return {
+        "key": axis.key,
+        "label": axis.label,
+        "unit": axis.unit,
+        "values": list(axis.at(size)),
+        "logarithmic": axis.logarithmic,
+        **ticks,
+    }
+
+
+def _grid(x: Sequence[float], y: Sequence[float], value: Any) -> list[list[Any]]:
+    return [[value((iy, ix)) for ix in range(len(x))] for iy in range(len(y))]
+
+
+def _maybe(cells: Mapping[tuple[int, int], Cell], key: tuple[int, int], name: str) -> float | None:
+    value = getattr(cells[key], name) if key in cells else None
+    return None if value is None or not np.isfinite(value) else _short(value)
+
+
+def _short(value: float) -> float:
+    """Five digits: more are noise."""
+    return float(f"{value:.5g}")
+
+
+def _failure(cells: Mapping[tuple[int, int], Cell], key: tuple[int, int]) -> str | None:
+    failure = cells[key].failure if key in cells else None
+    return None if failure is None else failure.name.lower()

@@ -1,0 +1,1 @@
+"""Live view and live reconstruction of a camera's frames."""

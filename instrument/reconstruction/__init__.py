@@ -1,0 +1,1 @@
+"""Reconstruction requests: from files to a result with its record."""

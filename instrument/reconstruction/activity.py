@@ -1,0 +1,241 @@
+"""Activity of a reconstructed video, from file to files: traces, regions, dF/F, pictures and a film."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import whole_file, write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.files.plain_json import plain
+from instrument.reconstruction.video_mp4 import DEFAULT_FPS, levels_of, write_mp4
+from instrument.reconstruction.video_output import VideoPictures, create_output
+from recon.streams.baseline import Motion, aligned, baseline, change, fading, motion
+from recon.streams.regions import Region, find_regions, local_correlation
+
+Floats = npt.NDArray[np.float32]
+
+WINDOW_S = 30.0
+"""Of the sliding baseline, where the video's times are known; as many frames as at 10 a second otherwise."""
+
+COPIES = 8
+"""Arrays of the video's size that the work holds at once: 7.1 measured."""
+
+RED_PERCENTILE = 99.9
+"""Of dF/F that is shown fully red."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActivitySettings:
+    """How activity is looked for.
+
+    Attributes
+    ----------
+    window_s : float
+        Of the baseline.
+    percentile : float
+        Of a pixel's values within it.
+    align : bool
+        Move frames back to one place first.
+    least_correlation, radius_px
+        As :func:`recon.streams.regions.find_regions`.
+    """
+
+    window_s: float = WINDOW_S
+    percentile: float = 20.0
+    align: bool = False
+    least_correlation: float = 0.5
+    radius_px: float = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Activity:
+    """What was found in a video.
+
+    Attributes
+    ----------
+    indices : tuple of int
+        The video's frames that there are; all arrays below hold these.
+    times_s : ndarray, float64, (n_frames,)
+        Frame numbers, where the video's times are not known.
+    frames, dff : ndarray, float32, (n_frames, height, width)
+        Fluorescence, and its relative change.
+    correlation : ndarray, float32, (height, width)
+    regions : list of Region
+    traces : ndarray, float32, (n_regions, n_frames)
+        dF/F of the regions' mean fluorescence.
+    motion : Motion
+        Before alignment.
+    faded : float
+        Share of the field's light that is lost by the end; negative where it grows.
+    """
+
+    indices: tuple[int, ...]
+    times_s: npt.NDArray[np.float64]
+    frames: Floats
+    dff: Floats
+    correlation: Floats
+    regions: list[Region]
+    traces: Floats
+    motion: Motion
+    faded: float
+
+
+def find_activity(
+    video: VideoPictures, settings: ActivitySettings | None = None, *, free_bytes: int | None = None
+) -> Activity:
+    """Look for activity in a reconstructed video.
+
+    Parameters
+    ----------
+    video : VideoPictures
+        Colour is averaged.
+    settings : ActivitySettings, optional
+    free_bytes : int, optional
+        Memory that may be taken; refused where the video needs more.
+
+    Raises
+    ------
+    BenchError, FileError, InputError
+        When the video is too short, too large, or dark.
+    """
+    settings = settings or ActivitySettings()
+    indices = [index for index in range(len(video)) if video.is_written(index)]
+    if len(indices) < 3:
+        raise FileError(video.path, f"has {len(indices)} pictures; activity needs three at least.")
+    height, width = video.read(indices[0]).shape[:2]
+    need = COPIES * len(indices) * height * width * 4
+    if free_bytes is not None and need > free_bytes:
+        raise BenchError(
+            f"{video.path}: {len(indices)} pictures of {height} x {width} need {need / 2**30:.1f} GiB of "
+            f"memory, {free_bytes / 2**30:.1f} are free. Reconstruct with --bin 2, or a --crop."
+        )
+    frames = np.empty((len(indices), height, width), np.float32)
+    for place, index in enumerate(indices):
+        picture = video.read(index)
+        frames[place] = picture.mean(axis=2) if picture.ndim == 3 else picture
+    found = motion(frames)
+    if settings.align:
+        frames = aligned(frames, found)
+    period_s = video.period_s
+    window = round(settings.window_s / (period_s or 0.1))
+    fade = fading(frames)
+    base = baseline(frames, max(window, 3), settings.percentile, fade)
+    dff = change(frames, base)
+    regions = find_regions(dff, least_correlation=settings.least_correlation, radius_px=settings.radius_px)
+    traces = np.zeros((len(regions), len(indices)), np.float32)
+    for trace, region in zip(traces, regions, strict=True):
+        light = region.trace(frames)[:, None, None]
+        level = baseline(light, max(window, 3), settings.percentile, fade)
+        trace[...] = ((light - level) / np.maximum(level, np.finfo(np.float32).tiny))[:, 0, 0]
+    return Activity(
+        indices=tuple(indices),
+        times_s=np.array(indices) * (period_s or 1.0),
+        frames=frames,
+        dff=dff,
+        correlation=local_correlation(dff),
+        regions=regions,
+        traces=traces,
+        motion=found,
+        faded=1 - float(fade[-1]),
+    )
+
+
+def write_activity(
+    activity: Activity, video: VideoPictures, folder: Path, settings: ActivitySettings
+) -> list[Path]:
+    """Write what was found into a folder, which is made; returns the files.
+
+    ``traces.csv``, ``regions.csv``, ``activity.png``, ``dff.ome.zarr``, ``activity.mp4``, ``activity.json``.
+    """
+    from instrument.reconstruction.activity_figure import write_figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [folder / name for name in ("traces.csv", "regions.csv", "activity.png", "dff.ome.zarr")]
+    write_text(made[0], _traces_csv(activity, video))
+    write_text(made[1], _regions_csv(activity))
+    simulated = bool(video.attributes.get("diffuserbench", {}).get("simulated"))
+    with whole_file(made[2]) as temporary:
+        write_figure(temporary, activity, simulated=simulated)
+    origin = video.attributes.get("diffuserbench", {})
+    create_output(
+        made[3],
+        len(video),
+        activity.dff.shape[1:],
+        period_s=video.period_s,
+        pitch_um=None,
+        attributes={"quantity": "dF/F", "of": str(video.path.resolve()), "simulated": simulated},
+    )
+    stack = VideoPictures(made[3], write=True)
+    for index, picture in zip(activity.indices, activity.dff, strict=True):
+        stack.write(index, picture)
+    film = folder / "activity.mp4"
+    write_mp4(film, red_over_grey(activity), 1 / video.period_s if video.period_s else DEFAULT_FPS)
+    record = folder / "activity.json"
+    write_text(
+        record,
+        json.dumps(
+            plain(
+                {
+                    "video": str(video.path.resolve()),
+                    "settings": asdict(settings),
+                    "simulated": simulated,
+                    "frames": len(activity.indices),
+                    "regions": len(activity.regions),
+                    "largest_motion_px": activity.motion.largest_px,
+                    "faded": activity.faded,
+                    "software": origin.get("software"),
+                }
+            ),
+            indent=1,
+        ),
+    )
+    return [*made, film, record]
+
+
+def red_over_grey(activity: Activity) -> Any:
+    """Yield the film's pictures: fluorescence in grey, its relative increase in red (Kuo 2020, Fig. 6.5)."""
+    black, white = levels_of(activity.frames[:: max(1, len(activity.frames) // 24)])
+    full = float(np.percentile(activity.dff, RED_PERCENTILE)) or 1.0
+    red = np.array([1.0, 0.1, 0.05])
+    for frame, dff in zip(activity.frames, activity.dff, strict=True):
+        grey = np.clip((frame - black) / (white - black), 0, 1)[..., None]
+        share = np.clip(dff / full, 0, 1)[..., None]
+        yield np.round(255 * ((1 - share) * grey + share * red)).astype(np.uint8)
+
+
+def _traces_csv(activity: Activity, video: VideoPictures) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    time = "time_s" if video.period_s else "frame_number"
+    writer.writerow(["frame", time, *(f"region_{n}_dff" for n in range(len(activity.regions)))])
+    for place, index in enumerate(activity.indices):
+        values = (f"{value:.5f}" for value in activity.traces[:, place])
+        writer.writerow([index, f"{activity.times_s[place]:.6g}", *values])
+    return text.getvalue()
+
+
+def _regions_csv(activity: Activity) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["region", "row", "column", "pixels", "local_correlation", "largest_dff"])
+    for number, (region, trace) in enumerate(zip(activity.regions, activity.traces, strict=True)):
+        row, column = region.centre
+        writer.writerow(
+            [
+                number,
+                f"{row:.2f}",
+                f"{column:.2f}",
+                len(region.rows),
+                f"{region.correlation:.3f}",
+                f"{trace.max():.4f}",
+            ]
+        )
+    return text.getvalue()

@@ -1,0 +1,482 @@
+"""A reconstruction from files, before the work: what goes in, and what was chosen on the way, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.calibration_file import is_calibration, load_calibration
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import ImageFile, read_image
+from instrument.reconstruction.erasures import Choice, Erased, erasures_of, reduce_valid
+from instrument.reconstruction.mosaic import (
+    MosaicChoice,
+    in_colour,
+    matched_mosaic,
+    mosaic_psf,
+    on_every_pixel,
+    pattern_of,
+    reduce_mosaic,
+)
+from instrument.reconstruction.preparation import (
+    Crop,
+    Dark,
+    FloatImage,
+    auto_binning,
+    bin_image,
+    check_pair,
+    check_psf,
+    dark_from_corners,
+    dark_from_counts,
+    dark_from_file,
+    darkest_block,
+    reduce,
+    saturated_pixels,
+)
+from instrument.reconstruction.record import (
+    crop_record,
+    dark_record,
+    describe,
+    describe_window,
+    mosaic_note,
+    noise_note,
+    noise_of,
+    slices_record,
+    source_record,
+)
+from recon.base.noise import NoiseModel
+from recon.camera.refocus import at_depth
+from recon.types import Calibration
+
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """How a photograph became a measurement, to be done again to others of the same camera.
+
+    Attributes
+    ----------
+    first_binning : int
+        To the calibration's pixels, before everything else.
+    dark : float or ndarray
+        Subtracted then, counts.
+    crop : Crop or None
+    binning : int
+        Last.
+    """
+
+    first_binning: int
+    dark: float | FloatImage
+    crop: Crop | None
+    binning: int
+
+    def apply(self, pixels: npt.NDArray[Any]) -> FloatImage:
+        """Return a photograph (height, width[, 3]) as a measurement."""
+        return reduce(bin_image(pixels, self.first_binning), self.dark, self.crop, self.binning)
+
+
+DarkChoice = Literal["auto"] | float | Path
+NoiseChoice = NoiseModel | float | Literal["estimate"] | None
+"""A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
+Binning = int | None
+"""Pixels to average along each axis; None chooses automatically."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What :func:`recon.reconstruct` is called with, and how it came about.
+
+    Attributes
+    ----------
+    measurement : ndarray, float32, (height, width) or (height, width, 3)
+    calibration : Calibration
+        On the measurement's pixels.
+    notes : mapping of str to str
+        What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``.
+    valid : ndarray of bool, shape of the measurement or (height, width), or None
+        The pixels that take part; None means all of them.
+    warnings : tuple of str
+    provenance : mapping
+        Files with checksums and every setting, JSON-compatible.
+    simulated : bool
+        Whether any of the input is known to come from the simulated bench.
+    known_noise : NoiseModel or None
+        Of single pixels, where the photograph's metadata tell.
+    """
+
+    measurement: FloatImage
+    calibration: Calibration
+    notes: Mapping[str, str]
+    valid: npt.NDArray[np.bool_] | None = None
+    warnings: tuple[str, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    simulated: bool = False
+    reduction: Reduction | None = None
+    known_noise: NoiseModel | None = None
+
+    def binned_noise(self, noise: NoiseChoice) -> NoiseModel | float | None:
+        """Return what is left of a single pixel's noise after the averaging that made the measurement.
+
+        None, for what the photograph's metadata tell, becomes a model where they do; "estimate" None.
+        """
+        if noise == "estimate":
+            return None
+        if noise is None:
+            noise = self.known_noise
+        factor: float = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
+        if factor > 1 and self.provenance.get("mosaic"):
+            factor /= 2  # red and blue have a quarter of the pixels
+        if isinstance(noise, NoiseModel):
+            return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
+        return None if noise is None else noise / factor
+
+
+def job_from_files(
+    psf_path: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+    erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
+    allow_saturated: bool = False,
+    allow_mixed_depth: bool = False,
+) -> Job:
+    """Prepare a PSF and an image from anywhere.
+
+    ``mosaic`` names the colour mosaic of which a grey image is the raw frame; its PSF, when grey as well,
+    is taken to be one too.
+
+    Raises
+    ------
+    FileError, BenchError
+        When a file cannot be used, the two do not belong together, or the window or binning does not fit.
+    """
+    psf, image = read_image(psf_path), read_image(image_path)
+    _refuse_constant(image)
+    warnings = check_psf(psf, allow_saturated=allow_saturated)
+    pattern = pattern_of(mosaic, image)
+    check_pair(psf, image, allow_mixed_depth=allow_mixed_depth, mosaic=pattern is not None)
+    level = _dark(dark, psf, image)
+    window = _window(crop, image)
+    factor = auto_binning(window) if binning is None else binning
+    if pattern is not None and binning is None and factor > 1:
+        factor += factor % 2
+    erased = erasures_of(erasures, image)
+    valid = _reduced_valid(erased, crop, factor)
+    if pattern is None:
+        measurement = reduce(image.pixels, level.image, crop, factor)
+        psf_pixels = reduce(psf.pixels, level.psf, crop, factor)
+    else:
+        measurement, known = reduce_mosaic(reduce(image.pixels, level.image, None, 1), pattern, crop, factor)
+        valid = known if valid is None else known & valid[..., None]
+        psf_pixels = mosaic_psf(reduce(psf.pixels, level.psf, None, 1), pattern, crop, factor)
+    psf_pixels = np.maximum(psf_pixels, 0)
+    if not psf_pixels.any():
+        raise FileError(
+            psf.path,
+            f"nothing of the PSF is left in the window after subtracting {level.reason}.",
+            "See --dark.",
+        )
+    return Job(
+        measurement,
+        _calibration_of(psf_pixels, psf),
+        {
+            "PSF": describe(psf),
+            "Image": describe(image),
+            "Dark": level.reason,
+            "Pixels": describe_window(crop, binning, factor, measurement),
+            "Erased": erased.reason,
+            **mosaic_note(pattern),
+            **noise_note(noise_of(image)),
+        },
+        valid,
+        (*warnings, *_saturation(image, erased)),
+        {
+            "psf": source_record(psf),
+            "image": source_record(image),
+            "dark": dark_record(level),
+            "crop": crop_record(crop, image),
+            "binning": factor,
+            "erased": erased.reason,
+            "mosaic": pattern,
+        },
+        psf.is_simulated or image.is_simulated,
+        Reduction(1, level.image, crop, factor),
+        noise_of(image),
+    )
+
+
+def job_from_calibration(
+    folder: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+    erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
+) -> Job:
+    """Prepare an image for a calibration folder, or a run folder with one calibration inside.
+
+    An image with a whole multiple of the calibration's pixels is binned to them first; ``crop`` and
+    ``binning`` then act on the pixels of both. Errors as ``job_from_files``.
+    """
+    folder = find_calibration(folder)
+    return job_with(
+        load_calibration(folder),
+        folder,
+        image_path,
+        dark=dark,
+        crop=crop,
+        binning=binning,
+        erasures=erasures,
+        mosaic=mosaic,
+    )
+
+
+def job_with(
+    calibration: Calibration,
+    folder: Path,
+    image_path: Path,
+    *,
+    dark: DarkChoice = "auto",
+    crop: Crop | None = None,
+    binning: Binning = None,
+    erasures: Choice = "saturated",
+    mosaic: MosaicChoice = "auto",
+) -> Job:
+    """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
+    image = read_image(image_path)
+    _refuse_constant(image)
+    shape = calibration.psfs.shape[-2:]
+    match = _matching_binning(image, shape, folder)
+    pattern = pattern_of(mosaic, image)
+    if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
+        raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
+    pixels, level = _calibrated_dark(dark, image, calibration, match)
+    factor = 1 if binning is None else binning
+    erased = erasures_of(erasures, image)
+    matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
+    valid = _reduced_valid(matched, crop, factor)
+    if pattern is None:
+        measurement = reduce(pixels, level.image, crop, factor)
+    else:
+        offset = on_every_pixel(level.image, match, image.pixels.shape)
+        measurement, known = matched_mosaic(
+            reduce(image.pixels, offset, None, 1), pattern, match, crop, factor
+        )
+        valid = known if valid is None else known & valid[..., None]
+        calibration = in_colour(calibration, pattern, match)
+    return Job(
+        measurement,
+        _reduced_calibration(calibration, crop, factor),
+        {
+            "Calibration": f"{folder}: {len(calibration.psfs)} PSFs of {shape[0]} x {shape[1]}",
+            "Image": describe(image)
+            + (f", binned {match} x {match} to the calibration" if match > 1 else ""),
+            "Dark": level.reason,
+            "Pixels": describe_window(crop, factor, factor, measurement),
+            "Erased": erased.reason,
+            **mosaic_note(pattern),
+            **noise_note(noise_of(image)),
+        },
+        valid,
+        _saturation(image, erased),
+        {
+            "calibration": str(folder.resolve()),
+            "image": source_record(image),
+            "dark": dark_record(level),
+            "image_binning": match,
+            "crop": None if crop is None else slices_record(crop.slices((shape[0], shape[1]))),
+            "binning": factor,
+            "erased": erased.reason,
+            "mosaic": pattern,
+        },
+        bool(calibration.provenance.get("simulated")) or image.is_simulated,
+        Reduction(match, level.image, crop, factor),
+        noise_of(image),
+    )
+
+
+def require_distance(z_um: float) -> None:
+    """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
+    if not 0 < z_um < np.inf:
+        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
+
+
+def refocused(job: Job, z_um: float) -> Job:
+    """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
+
+    Where the calibration has the depth the job is returned as it is. Where depths, or the distance from
+    diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
+    reconstruction takes the PSF as it is, or the nearest one.
+
+    Raises
+    ------
+    BenchError
+        When ``z_um`` is no distance.
+    """
+    require_distance(z_um)
+    calibration = job.calibration
+    z = calibration.source_positions_um[:, 2]
+    if not bool((z > 0).all()):
+        return _as_measured(job, z_um, "at what depth it was measured is not known")
+    if calibration.geometry.diffuser_distance_mm is None:
+        if np.isclose(z, z_um).any():
+            return job
+        return _as_measured(
+            job, z_um, "the diffuser's distance from the sensor is not known; the nearest is taken"
+        )
+    calibration, made = at_depth(calibration, z_um)
+    if made is None:
+        return job
+    return replace(
+        job,
+        calibration=calibration,
+        notes={**job.notes, "PSF": f"refocused to {z_um / 1e3:g} mm: {made}"},
+        provenance={
+            **job.provenance,
+            "refocused": {
+                "z_um": made.z_um,
+                "from_z_um": list(made.from_z_um),
+                "displacement_error_um": made.displacement_error_um,
+                "expected_similarity": made.expected_similarity,
+            },
+        },
+    )
+
+
+def _as_measured(job: Job, z_um: float, why: str) -> Job:
+    """Return the job with a note that its PSF was not refocused."""
+    said = f"not refocused to {z_um / 1e3:g} mm: {why}"
+    read = job.notes.get("PSF")
+    return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})
+
+
+def find_calibration(folder: Path) -> Path:
+    """Return the calibration folder that ``folder`` is, or the one that it holds.
+
+    Raises
+    ------
+    FileError
+        When there is none, or more than one.
+    """
+    if not folder.is_dir():
+        found = "is no folder" if folder.exists() else "does not exist"
+        raise FileError(folder, f"{found}; a calibration or a run folder is expected.")
+    if is_calibration(folder):
+        return folder
+    # In the folder, in a run in it, or in that run's calibration folder (a demo's).
+    patterns = ("*/calibration.json", "*/*/calibration.json")
+    inside = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
+    if len(inside) != 1:
+        found = (
+            f"{len(inside)} calibrations ({', '.join(p.name for p in inside)})"
+            if inside
+            else "no calibration"
+        )
+        raise FileError(folder, f"holds {found}; exactly one is expected.")
+    return inside[0]
+
+
+def _dark(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
+    if choice == "auto":
+        return dark_from_corners(psf, image)
+    if isinstance(choice, Path):
+        return dark_from_file(read_image(choice), image)
+    return dark_from_counts(choice)
+
+
+def _calibrated_dark(
+    choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int
+) -> tuple[FloatImage, Dark]:
+    """Return the image on the calibration's pixels, and what to subtract there; the PSFs need nothing."""
+    pixels = bin_image(image.pixels, match)
+    if isinstance(choice, Path):
+        dark = dark_from_file(read_image(choice), image)
+        return pixels, replace(dark, image=bin_image(np.asarray(dark.image), match))
+    if choice != "auto":
+        return pixels, dark_from_counts(choice)
+    if calibration.background is not None:
+        background = np.moveaxis(calibration.background, 0, -1)
+        return pixels, Dark(
+            background[..., 0] if background.shape[-1] == 1 else background,
+            0.0,
+            f"the calibration's background (mean {float(background.mean()):.1f} counts)",
+        )
+    darkest = darkest_block(image.pixels)
+    return pixels, Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
+
+
+def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:
+    height, width = image.pixels.shape[:2]
+    factor = height // shape[0]
+    if factor < 1 or (height // factor, width // factor) != tuple(shape):
+        raise FileError(
+            image.path,
+            f"is {image.describe()}, but the PSFs of {folder} are {shape[0]} x {shape[1]}: "
+            "no whole binning brings one to the other.",
+            "Photograph with the region of interest and binning of the calibration.",
+        )
+    return int(factor)
+
+
+def _reduced_calibration(calibration: Calibration, crop: Crop | None, factor: int) -> Calibration:
+    if crop is None and factor == 1:
+        return calibration
+    psfs = np.stack(
+        [np.moveaxis(reduce(np.moveaxis(psf, 0, -1), 0.0, crop, factor), -1, 0) for psf in calibration.psfs]
+    )
+    pitch = calibration.geometry.pixel_pitch_um
+    geometry = replace(calibration.geometry, pixel_pitch_um=None if pitch is None else pitch * factor)
+    return replace(calibration, psfs=psfs, background=None, geometry=geometry)
+
+
+def _calibration_of(psf: FloatImage, file: ImageFile) -> Calibration:
+    channels = np.moveaxis(psf, -1, 0) if psf.ndim == 3 else psf[None]
+    return Calibration(
+        np.ascontiguousarray(channels[None]), np.full((1, 3), np.nan), provenance={"psf": str(file.path)}
+    )
+
+
+def _reduced_valid(erased: Erased, crop: Crop | None, factor: int) -> npt.NDArray[np.bool_] | None:
+    """Return the mask on the measurement's pixels; refused where it leaves nothing."""
+    if erased.valid is None:
+        return None
+    valid = reduce_valid(erased.valid, crop, factor)
+    if not valid.any():
+        raise BenchError(
+            f"After erasing {erased.reason} and binning {factor} x {factor} no pixel is left: a binned pixel "
+            "needs all of its pixels. Erase less or bin less."
+        )
+    return valid
+
+
+def _window(crop: Crop | None, image: ImageFile) -> tuple[int, int]:
+    height, width = image.pixels.shape[:2]
+    if crop is None:
+        return height, width
+    crop.slices((height, width))
+    return crop.height, crop.width
+
+
+def _refuse_constant(image: ImageFile) -> None:
+    lowest, highest = float(image.pixels.min()), float(image.pixels.max())
+    if lowest == highest:
+        raise FileError(
+            image.path, f"the image is constant (every pixel is {highest:g}).", "Was the scene lit?"
+        )
+
+
+def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
+    count = saturated_pixels(image.pixels)
+    if not count or erased.valid is not None:
+        return ()
+    share = f"{count / image.pixels.size:.2%}"
+    return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)

@@ -1,0 +1,88 @@
+"""A reconstruction that is kept while it runs, and gone on with: the folder that fits a request."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+from instrument.files.checkpoint import CheckpointFolder, digest
+from instrument.files.errors import BenchError
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from recon.solvers.stopping import StopReason
+
+_FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
+_SEEN_IN_JOB = ("image", "psf", "psfs", "calibration", "dark", "crop", "binning", "erasures", "mosaic")
+_WHEN_TO_STOP = ("iterations", "time_s", "tolerance", "stop_at_noise")
+_WITHOUT_BEARING = ("allow_saturated", "allow_mixed_depth", "memory_gib", "scratch", "settings")
+
+
+def require_kept(request: PictureRequest | VolumeRequest) -> None:
+    """Refuse to keep what has no iterations, or what is chosen only while it is solved.
+
+    Raises
+    ------
+    BenchError
+    """
+    if isinstance(request, PictureRequest) and request.method == "wiener":
+        raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
+    if request.settings.wishes is not None:
+        raise BenchError(
+            "--choose is about everything that --model auto chooses, which it does not with --checkpoint. "
+            "Leave one of the two out."
+        )
+
+
+def checkpoint_for(
+    folder: Path | None, job: Job, request: PictureRequest | VolumeRequest
+) -> CheckpointFolder | None:
+    """Return the folder that was asked for, checked against what is to be reconstructed.
+
+    What only says when to stop may differ from the earlier run.
+
+    Raises
+    ------
+    BenchError
+        As :func:`require_kept`.
+    FileError
+        When the folder keeps something else.
+    """
+    if folder is None:
+        return None
+    require_kept(request)
+    given = asdict(request)
+    given |= given["settings"]
+    apart = {*_SEEN_IN_JOB, *_WHEN_TO_STOP, *_WITHOUT_BEARING}
+    problem = {
+        "program": f"diffuserbench {version('diffuserbench')}",
+        "measurement": digest(job.measurement),
+        "psfs": digest(job.calibration.psfs),
+        "psf positions": digest(job.calibration.source_positions_um),
+        "valid pixels": digest(job.valid),
+        **{name: value for name, value in given.items() if name not in apart},
+        # As it will be used: the photograph's metadata may have told it.
+        "noise": str(job.binned_noise(request.settings.noise)),
+    }
+    return CheckpointFolder(folder, problem)
+
+
+def settle_checkpoint(
+    keeper: CheckpointFolder | None, reasons: Sequence[StopReason | None]
+) -> dict[str, str]:
+    """Remove a checkpoint whose work has come to its end; return what is to be told of it, by headings.
+
+    To be called once the result is written: until then the checkpoint is all that there is of it.
+    """
+    told: dict[str, str] = {}
+    if keeper is None:
+        return told
+    if keeper.resumed_from:
+        told["Went on"] = f"from iteration {keeper.resumed_from} in {keeper.folder}"
+    if all(reason in _FINISHED for reason in reasons):
+        keeper.remove()
+        told["Checkpoint"] = "removed: the work has come to its end"
+    else:
+        told["Checkpoint"] = f"{keeper.folder}: the same again, with more time, goes on from it"
+    return told

@@ -1,0 +1,294 @@
+"""From image files to what a reconstruction needs: matched, dark-subtracted, cropped, binned.
+
+Every choice that is made here for the user comes back in words, so that it can be shown and kept.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import ImageFile
+
+FloatImage = npt.NDArray[np.float32]
+
+AUTO_PIXELS = 500_000
+"""Automatic binning goes on until the image has at most this many pixels."""
+LEAST_BINNED = 8
+"""Pixels along each side that binning must leave: fewer hold no pattern to decode."""
+SATURATED_LIGHT_LIMIT = 0.01
+"""A PSF with a larger share of its light in saturated pixels is refused: its true shape is unknown."""
+
+# Full scale of 8 to 16 bit sensors, right-aligned and left-aligned in 16 bit.
+_FULL_SCALES = (255, 1023, 4095, 16383, 65535, 65472, 65520, 65532)
+_PATCH = 10
+_MARGIN = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """A window of an image, in pixels; ``top`` and ``left`` None mean that it is centred."""
+
+    top: int | None
+    left: int | None
+    height: int
+    width: int
+
+    @classmethod
+    def parse(cls, text: str) -> Crop:
+        """Read ``"TOP,LEFT,HEIGHT,WIDTH"`` or ``"HEIGHTxWIDTH"``.
+
+        Raises
+        ------
+        BenchError
+        """
+        if match := re.fullmatch(r"\s*(\d+)\s*[x×]\s*(\d+)\s*", text):
+            window = cls(None, None, int(match[1]), int(match[2]))
+        elif match := re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", text):
+            window = cls(int(match[1]), int(match[2]), int(match[3]), int(match[4]))
+        else:
+            raise BenchError(
+                f"--crop {text!r} is not understood; write TOP,LEFT,HEIGHT,WIDTH in pixels, "
+                "e.g. 100,200,600,800, or HEIGHTxWIDTH for a centred window, e.g. 600x800."
+            )
+        if window.height == 0 or window.width == 0:
+            raise BenchError(f"--crop {text!r} is an empty window.")
+        return window
+
+    def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Return the window as slices of an image; refused where it leaves the image.
+
+        Raises
+        ------
+        BenchError
+        """
+        top = (shape[0] - self.height) // 2 if self.top is None else self.top
+        left = (shape[1] - self.width) // 2 if self.left is None else self.left
+        if top < 0 or left < 0 or top + self.height > shape[0] or left + self.width > shape[1]:
+            raise BenchError(
+                f"--crop asks for {self.height} x {self.width} pixels from ({top}, {left}), "
+                f"but the image has {shape[0]} x {shape[1]}."
+            )
+        return slice(top, top + self.height), slice(left, left + self.width)
+
+
+@dataclass(frozen=True, slots=True)
+class Dark:
+    """What is subtracted from image and PSF, and where it came from.
+
+    ``image`` and ``psf`` are counts: a number, or an array of the whole frame's shape.
+    """
+
+    image: float | FloatImage
+    psf: float | FloatImage
+    reason: str
+
+
+def check_pair(
+    psf: ImageFile, image: ImageFile, *, allow_mixed_depth: bool = False, mosaic: bool = False
+) -> None:
+    """Refuse a PSF and an image that cannot belong together.
+
+    ``mosaic``: the image is a colour sensor's raw frame, so that a PSF in colour may belong to it.
+
+    Raises
+    ------
+    FileError
+        When shape, channels or bit depth differ.
+    """
+    psf_shape, shape = psf.pixels.shape[:2], image.pixels.shape[:2]
+    if psf_shape != shape:
+        turned = " One of them may be rotated." if psf_shape == shape[::-1] else ""
+        raise FileError(
+            psf.path,
+            f"the PSF is {psf.describe()}, but the image {image.path} is {image.describe()}: "
+            f"both must have one shape.{turned}",
+            "Take both with the same camera, region of interest and binning.",
+        )
+    if psf.is_colour and not (image.is_colour or mosaic):
+        raise FileError(
+            psf.path,
+            f"the PSF is colour, but the image {image.path} is grey.",
+            "Give a grey PSF, or the image in colour.",
+        )
+    depths = psf.pixels.dtype, image.pixels.dtype
+    if depths[0] != depths[1] and all(d.kind == "u" for d in depths) and not allow_mixed_depth:
+        raise FileError(
+            psf.path,
+            f"the PSF has {8 * depths[0].itemsize} bit, but the image {image.path} has "
+            f"{8 * depths[1].itemsize} bit: one of them has probably been converted.",
+            "Use the raw files of both, or --mixed-depth if it is meant so.",
+        )
+
+
+def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ...]:
+    """Refuse a PSF that nothing can be reconstructed with; return warnings in sentences.
+
+    Raises
+    ------
+    FileError
+        When it is constant or too much of its light lies in saturated pixels.
+    """
+    pixels = psf.pixels
+    lowest, highest = float(pixels.min()), float(pixels.max())
+    if lowest == highest:
+        what = "empty (all zero)" if highest == 0 else f"constant (every pixel is {highest:g})"
+        raise FileError(psf.path, f"the PSF is {what}.", "Was the point source on?")
+    count = saturated_pixels(pixels)
+    if not count:
+        return ()
+    total = float(pixels.sum(dtype=np.float64)) - lowest * pixels.size
+    share = count * (highest - lowest) / total
+    found = f"{count} pixels of the PSF are saturated (at {highest:g}) and hold {share:.1%} of its light"
+    if share > SATURATED_LIGHT_LIMIT and not allow_saturated:
+        raise FileError(
+            psf.path,
+            f"{found}; up to {SATURATED_LIGHT_LIMIT:.0%} is allowed.",
+            "Take it again with a shorter exposure, or use --allow-saturated.",
+        )
+    return (f"{found}.",)
+
+
+def saturated_pixels(pixels: npt.NDArray[Any]) -> int:
+    """Return how many pixels are at the sensor's full scale, as far as an integer image can tell.
+
+    Counted are pixels at the image's maximum when that is the full scale of an 8, 10, 12, 14 or 16 bit
+    sensor (also left-aligned in 16 bit) and is reached more than once.
+    """
+    if pixels.dtype.kind != "u" or int(pixels.max()) not in _FULL_SCALES:
+        return 0
+    count = int(np.count_nonzero(pixels == pixels.max()))
+    return count if count > 1 else 0
+
+
+# Dark ----------------------------------------------------------------------------------------------
+def dark_from_counts(counts: float) -> Dark:
+    """Return a constant offset for both."""
+    return Dark(counts, counts, f"{counts:g} counts, as given")
+
+
+def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
+    """Return a dark frame for both.
+
+    Raises
+    ------
+    FileError
+        When its shape, channels or bit depth differ from the image's.
+    """
+    if dark.pixels.shape[:2] != image.pixels.shape[:2] or (dark.is_colour and not image.is_colour):
+        raise FileError(
+            dark.path,
+            f"the dark frame is {dark.describe()}, but the image {image.path} is {image.describe()}.",
+            "Take it with the same camera, region of interest and binning.",
+        )
+    depths = dark.pixels.dtype, image.pixels.dtype
+    if depths[0] != depths[1] and all(d.kind == "u" for d in depths):
+        raise FileError(
+            dark.path,
+            f"the dark frame has {8 * depths[0].itemsize} bit, but the image {image.path} has "
+            f"{8 * depths[1].itemsize} bit: their counts are not the same.",
+            "Use the raw file of the dark frame.",
+        )
+    frame = dark.pixels.astype(np.float32)
+    return Dark(frame, frame, f"the frame {dark.path} (mean {float(frame.mean()):.1f} counts)")
+
+
+def dark_from_corners(psf: ImageFile, image: ImageFile) -> Dark:
+    """Estimate a constant offset where no dark frame is at hand.
+
+    The PSF's darkest corner tells it (mean of 10 x 10 pixels, 5 from the border: light rarely reaches there);
+    the image, whose corners are lit, has the same offset when both are integers of one depth, that is, raw
+    frames of one camera. Otherwise the image's offset is the mean of its darkest 10 x 10 pixels. It is never
+    more than those, so that nothing is pushed below zero by an offset that the image does not have.
+    """
+    corner, name = _darkest_corner(psf.pixels)
+    darkest = darkest_block(image.pixels)
+    if psf.pixels.dtype.kind == "u" and psf.pixels.dtype == image.pixels.dtype:
+        if corner <= darkest:
+            reason = f"{corner:.1f} counts from both: mean of the PSF's {name} corner"
+            return Dark(corner, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
+        why = "the image's darkest 10 x 10 pixels, darker than the PSF's corners"
+    else:
+        why = "the image's darkest 10 x 10 pixels"
+    reason = f"{darkest:.4g} from the image ({why}), {corner:.4g} from the PSF (its {name} corner)"
+    return Dark(darkest, corner, f"{reason} (estimated; --dark FILE or COUNTS to give it)")
+
+
+def _darkest_corner(pixels: npt.NDArray[Any]) -> tuple[float, str]:
+    height, width = pixels.shape[:2]
+    margin = min(_MARGIN, height // 4, width // 4)
+    side = max(1, min(_PATCH, height // 4, width // 4))
+    near, far = slice(margin, margin + side), slice(-margin - side, -margin or None)
+    corners = {
+        "upper left": pixels[near, near],
+        "upper right": pixels[near, far],
+        "lower left": pixels[far, near],
+        "lower right": pixels[far, far],
+    }
+    means = {name: float(corner.mean(dtype=np.float64)) for name, corner in corners.items()}
+    name = min(means, key=means.__getitem__)
+    return means[name], name
+
+
+def darkest_block(pixels: npt.NDArray[Any]) -> float:
+    """Return the mean of an image's darkest block of 10 x 10 pixels (smaller in a smaller image)."""
+    grey = pixels.mean(axis=-1, dtype=np.float32) if pixels.ndim == 3 else pixels
+    return float(bin_image(grey, max(1, min(_PATCH, *grey.shape))).min())
+
+
+# Size ------------------------------------------------------------------------------------------------
+def auto_binning(shape: tuple[int, int]) -> int:
+    """Return the smallest binning that leaves at most ``AUTO_PIXELS`` pixels."""
+    factor = 1
+    while (shape[0] // factor) * (shape[1] // factor) > AUTO_PIXELS:
+        factor += 1
+    return factor
+
+
+def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
+    """Return the mean of ``factor`` x ``factor`` pixels, float32; a rest at the right and bottom is left out.
+
+    Raises
+    ------
+    BenchError
+        When the image is smaller than one binned pixel.
+    """
+    if factor < 1 or factor > min(image.shape[:2]):
+        raise BenchError(f"--bin {factor}: the image has {image.shape[0]} x {image.shape[1]} pixels.")
+    if factor == 1:
+        return image.astype(np.float32)
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    blocks = image[: height * factor, : width * factor].reshape(
+        height, factor, width, factor, *image.shape[2:]
+    )
+    binned: FloatImage = blocks.mean(axis=(1, 3), dtype=np.float32)
+    return binned
+
+
+def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:
+    """Subtract the dark level, cut the window out, bin; float32, negative values kept.
+
+    Raises
+    ------
+    BenchError
+        When binning leaves less than :data:`LEAST_BINNED` pixels along a side.
+    """
+    if isinstance(dark, np.ndarray) and dark.ndim < pixels.ndim:
+        dark = dark[..., None]
+    image: FloatImage = np.subtract(pixels, dark, dtype=np.float32)
+    if crop is not None:
+        image = image[crop.slices(image.shape[:2])]
+    binned = bin_image(image, binning)
+    if binning > 1 and min(binned.shape[:2]) < LEAST_BINNED:
+        most = max(min(image.shape[:2]) // LEAST_BINNED, 1)
+        raise BenchError(
+            f"--bin {binning} leaves {binned.shape[0]} x {binned.shape[1]} of {image.shape[0]} x "
+            f"{image.shape[1]} pixels; a picture takes {LEAST_BINNED} or more along each side. "
+            f"Take --bin {most}{' or less' if most > 1 else ''}."
+        )
+    return binned

@@ -1,0 +1,149 @@
+"""Writing a reconstruction: the numbers, a picture to look at, and how it came about."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import check_writable, write_text
+from instrument.files.errors import FileError
+from instrument.files.images import write_image
+from instrument.files.plain_json import plain
+from instrument.files.volume_zarr import is_zarr_name
+from instrument.reconstruction.job import Job
+from recon.reconstruction.result import Reconstruction
+
+WHITE_PERCENTILE = 99.9
+"""The preview's white; brighter pixels are shown white too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The files of one reconstruction: float32 TIFF, 8-bit preview, settings and history, optional figure.
+
+    A volume may be an OME-Zarr folder instead of a TIFF.
+    """
+
+    image: Path
+    preview: Path
+    record: Path
+    figure: Path | None = None
+
+    @classmethod
+    def named(cls, out: Path, figure: Path | None = None, *, volume: bool = False) -> Outputs:
+        """Return the files that go with ``out``, whose suffix must be ``.tif`` (volumes: or ``.ome.zarr``).
+
+        Raises
+        ------
+        FileError
+        """
+        if volume and is_zarr_name(out):
+            stem = out.name.lower().removesuffix(".zarr").removesuffix(".ome")
+            stem = out.name[: len(stem)]
+            if not stem:
+                raise FileError(out, "has no name before its suffix.", "Call it volume.ome.zarr, say.")
+            return cls(out, out.with_name(f"{stem}.png"), out.with_name(f"{stem}.json"))
+        if out.suffix.lower() not in (".tif", ".tiff"):
+            raise FileError(
+                out,
+                "a volume is written as OME-TIFF or OME-Zarr: the name must end in .tif or .ome.zarr."
+                if volume
+                else "a reconstruction is written as float32 TIFF: the name must end in .tif.",
+                "A preview .png and a .json with the settings are written beside it.",
+            )
+        if figure is not None and figure.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise FileError(figure, "a figure is written as .png, .pdf or .svg.")
+        outputs = cls(out, out.with_suffix(".png"), out.with_suffix(".json"), figure)
+        if figure in outputs.files()[:3]:
+            raise FileError(out.with_suffix(".png"), "is the preview; give the figure another name.")
+        return outputs
+
+    def files(self) -> tuple[Path, ...]:
+        """Return every file that will be written."""
+        return tuple(p for p in (self.image, self.preview, self.record, self.figure) if p is not None)
+
+    def check(self, n_pixels: int, *, overwrite: bool = False) -> None:
+        """Refuse places that cannot be written, or are taken, before the work.
+
+        Raises
+        ------
+        FileError
+        """
+        for path in self.files():
+            folder = is_zarr_name(path)
+            # The place of a folder is as good as that of a file in it that is not there yet.
+            check_writable(
+                path.with_name(f".{path.name}.draft") if folder else path, 8 * n_pixels + 1_000_000
+            )
+            if folder and path.exists() and not (path / "zarr.json").is_file():
+                raise FileError(
+                    path, "is there and is no Zarr folder; it was left as it is.", "Name another."
+                )
+            if path.exists() and not overwrite:
+                raise FileError(path, "exists already and was left as it is.", "Use --force to overwrite it.")
+
+
+def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, rotate_deg: int = 0) -> None:
+    """Write image, preview and record, each whole or not at all.
+
+    ``rotate_deg``, a multiple of 90, turns the written picture counter-clockwise.
+
+    Raises
+    ------
+    FileError, OSError
+        When a file cannot be written (a full disk), naming it.
+    """
+    image = np.rot90(result.image, rotate_deg // 90)
+    write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
+    pixels, white = preview(image)
+    write_image(outputs.preview, pixels)
+    record = reconstruction_record(result, job) | {
+        "rotated_deg": rotate_deg,
+        "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
+    }
+    write_text(outputs.record, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+def preview(image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float]:
+    """Return 8-bit pixels, linear from zero to the white level, and that level in the image's units."""
+    white = white_level(image)
+    return np.clip(image * (255.0 / white) + 0.5, 0, 255).astype(np.uint8), white
+
+
+def white_level(image: npt.NDArray[np.floating]) -> float:
+    """Return the value that a preview shows as white: nearly the brightest, and above zero."""
+    white = float(np.percentile(image, WHITE_PERCENTILE))
+    if white <= 0:
+        white = float(image.max()) if image.max() > 0 else 1.0
+    return white
+
+
+def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
+    """Return all that is known of a reconstruction but its pixels, JSON-compatible."""
+    record = {
+        "program": f"diffuserbench {version('diffuserbench')}",
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "simulated": job.simulated,
+        "inputs": job.provenance,
+        "method": result.method,
+        "prior": result.prior,
+        "tau": result.tau,
+        "noise_norm": result.noise_norm,
+        "stop_reason": None if result.stop_reason is None else str(result.stop_reason),
+        "iterations": len(result.history),
+        "seconds": result.seconds,
+        "warnings": [*job.warnings, *result.warnings],
+        "verdict": None if result.verdict is None else result.verdict.as_json(),
+        "grid": asdict(result.grid),
+        "provenance": result.provenance,
+        "history": [asdict(entry) for entry in result.history],
+    }
+    written: dict[str, Any] = plain(record)
+    return written

@@ -1,0 +1,256 @@
+"""A reconstruction read back: its pixels or voxels, and in words how it came about."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.errors import FileError
+from instrument.files.images import read_image
+from instrument.files.volume_source import VolumeSource, open_volume
+from instrument.files.volume_zarr import is_zarr_name
+from recon.solvers.stopping import IterationRecord
+from recon.verdict.verdict import Region
+
+
+@dataclass(frozen=True, slots=True)
+class StoredResult:
+    """A reconstruction on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The image's or volume's file or folder.
+    image : ndarray, float32, (height, width) or (height, width, 3), or None
+        The picture; None for a volume.
+    volume : VolumeSource or None
+        The volume; None for a picture. Close it in the end.
+    record : mapping
+        What was written beside it; empty for results from elsewhere.
+    """
+
+    path: Path
+    image: npt.NDArray[np.float32] | None
+    volume: VolumeSource | None
+    record: Mapping[str, Any]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any of its input is known to come from the simulated bench."""
+        return bool(self.record.get("simulated"))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What may be wrong with it, in sentences: the verdict first, where it is not favourable."""
+        verdict = self.verdict if self._region in (Region.NEAR, Region.OUTSIDE) else ()
+        return (*verdict, *(str(text) for text in self.record.get("warnings", ())))
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """Whether to trust it, in sentences; empty where it was not judged."""
+        return tuple(str(text) for text in (self.record.get("verdict") or {}).get("sentences", ()))
+
+    @property
+    def _region(self) -> str:
+        return str((self.record.get("verdict") or {}).get("region", Region.UNKNOWN))
+
+    @property
+    def histories(self) -> tuple[tuple[IterationRecord, ...], ...]:
+        """The iterations, one history a channel; empty where there were none, or nothing is known."""
+        raw = self.record.get("histories", [self.record.get("history", [])])
+        return tuple(tuple(_iteration(entry) for entry in history) for history in raw if history)
+
+    @property
+    def noise_norm(self) -> float | None:
+        """Expected norm of the noise, in the units of the histories' residuals."""
+        value = self.record.get("noise_norm")
+        return None if value is None else float(value)
+
+    @property
+    def pitch_um(self) -> float | None:
+        """Pixel pitch of a picture in the object's plane, micrometres; None where not known."""
+        value = self._grid("object_pitch_um") if self.volume is None else None
+        return None if value is None else float(value)
+
+    @property
+    def planes_um(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]] | None:
+        """Depth and lateral pitch of each plane of a volume, micrometres; None where not known."""
+        z_um, pitch_um = self._grid("z_um"), self._grid("pitch_um")
+        if self.volume is None or not isinstance(z_um, list) or not isinstance(pitch_um, list):
+            return None
+        if len(z_um) != self.volume.shape[0] or len(pitch_um) != len(z_um):
+            return None
+        return np.array(z_um, float), np.array(pitch_um, float)
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return what is known of it as names and values, to be shown; verdict and model first."""
+        record = self.record
+        origin = record.get("provenance", {})
+        facts: list[tuple[str, str]] = []
+        if self.verdict:
+            facts.append(("Verdict", " ".join(self.verdict)))
+        chosen = self._chosen()
+        facts += chosen
+        if record and "Model" not in dict(chosen):
+            model = record.get("model") or origin.get("model") or "convolution"
+            reason = record.get("model_reason") or origin.get("model_reason") or "one PSF for the whole field"
+            facts.append(("Model", f"{model}: {reason}"))
+        if record:
+            method = record.get("method")
+            weight = "" if record.get("tau") is None else f", tau {record['tau']:.3g}"
+            name = f"{method}, prior" if method else "prior"
+            facts.append(("Method", f"{name} {record.get('prior')}{weight}"))
+            facts.append(("Stopped", self._stopped()))
+        facts.append(("Size", self._size()))
+        inputs = record.get("inputs", {})
+        for name, key in (("Photograph", "image"), ("PSF", "psf"), ("Calibration", "calibration")):
+            if value := inputs.get(key):
+                facts.append((name, str(value["path"]) if isinstance(value, Mapping) else str(value)))
+        if dark := inputs.get("dark"):
+            facts.append(("Dark", str(dark.get("from"))))
+        if erased := inputs.get("erased"):
+            facts.append(("Erased", str(erased)))
+        if "binning" in inputs:
+            facts.append(("Averaged", f"{inputs['binning']} x {inputs['binning']} pixels"))
+        if memory := origin.get("memory"):
+            facts.append(("Memory", str(memory)))
+        if record:
+            facts.append(("Made", f"{record.get('utc', '')} by {record.get('program', '')}"))
+        return facts
+
+    def _chosen(self) -> list[tuple[str, str]]:
+        """Return what the program chose and why, one entry a choice."""
+        decisions = (self.record.get("provenance", {}).get("auto") or {}).get("decisions", ())
+        return [
+            (
+                str(d["name"]).capitalize(),
+                f"{d['value']}: {d['why']}{' (as asked)' if d.get('overruled') else ''}",
+            )
+            for d in decisions
+        ]
+
+    def close(self) -> None:
+        """Close a volume's files."""
+        if self.volume is not None:
+            self.volume.close()
+
+    def _grid(self, key: str) -> Any:
+        return self.record.get("grid", {}).get(key)
+
+    def _stopped(self) -> str:
+        reasons = self.record.get("stop_reasons") or [self.record.get("stop_reason")]
+        count = max((len(history) for history in self.histories), default=0)
+        seconds = f"{self.record.get('seconds', 0.0):.1f} s"
+        if not count:
+            return f"solved in one step, {seconds}"
+        return f"after {count} iterations, {seconds}: {reasons[0]}"
+
+    def _size(self) -> str:
+        if self.volume is None:
+            assert self.image is not None
+            text = " x ".join(map(str, self.image.shape)) + " pixels"
+            return text if self.pitch_um is None else f"{text} of {_length(self.pitch_um)}"
+        text = " x ".join(map(str, self.volume.shape)) + " voxels (planes, rows, columns)"
+        if self.volume.n_channels > 1:
+            text += f", {self.volume.n_channels} channels"
+        if (planes := self.planes_um) is not None:
+            z_um = planes[0]
+            text += f"; {_length(z_um[0])} to {_length(z_um[-1])} from the diffuser"
+        return text
+
+
+def open_result(path: Path | str) -> StoredResult:
+    """Open a picture or volume, by its own file or by the JSON record or preview beside it.
+
+    A volume's voxels are read when they are looked at. An image or volume from elsewhere opens too; nothing
+    is known of it then.
+
+    Raises
+    ------
+    FileError
+        When it is none, or its record is damaged.
+    """
+    path = _data_file(Path(path))
+    record = _record_of(path)
+    if is_zarr_name(path) or path.is_dir() or _is_volume(path, record):
+        return StoredResult(path, None, open_volume(path), record)
+    pixels = read_image(path).pixels
+    return StoredResult(path, np.asarray(pixels, np.float32), None, record)
+
+
+def record_file(path: Path) -> Path:
+    """Return the JSON file that goes with a picture or volume."""
+    stem = path.name
+    for suffix in (".ome.zarr", ".zarr", path.suffix):
+        if suffix and stem.lower().endswith(suffix.lower()):
+            stem = stem[: -len(suffix)]
+            break
+    return path.with_name(f"{stem}.json")
+
+
+def _data_file(path: Path) -> Path:
+    """Return the picture or volume that a record or a preview goes with; any other path as it is."""
+    if not path.exists():
+        raise FileError(path, "there is no such file.")
+    if path.suffix.lower() not in (".json", ".png"):
+        return path
+    stem = path.with_suffix("")
+    beside = [
+        stem.with_name(stem.name + suffix) for suffix in (".tif", ".tiff", ".ome.zarr", ".zarr", ".npy")
+    ]
+    found = next((candidate for candidate in beside if candidate.exists()), None)
+    if found is not None:
+        return found
+    if path.suffix.lower() == ".json":
+        raise FileError(path, "no .tif or .ome.zarr of that name lies beside this record.")
+    return path
+
+
+def _record_of(path: Path) -> dict[str, Any]:
+    beside = record_file(path)
+    if not beside.is_file():
+        return {}
+    try:
+        record = json.loads(beside.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FileError(beside, f"cannot be read as JSON: {error}.") from error
+    # Another program's JSON, or that of another kind of file of ours, is no record of this one.
+    return record if isinstance(record, dict) and "grid" in record else {}
+
+
+def _is_volume(path: Path, record: Mapping[str, Any]) -> bool:
+    if record:
+        return len(record["grid"].get("shape", ())) == 3
+    if path.suffix.lower() in (".tif", ".tiff"):
+        import tifffile
+
+        try:
+            with tifffile.TiffFile(path) as tiff:
+                series = tiff.series[0]
+                return len(series.shape) == 4 or (len(series.shape) == 3 and "S" not in series.axes)
+        except (OSError, IndexError, tifffile.TiffFileError):
+            return False  # reading it as an image then says what is wrong
+    if path.suffix.lower() == ".npy":
+        try:
+            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+        except (OSError, ValueError, EOFError):
+            return False
+        return len(shape) == 4 or (len(shape) == 3 and shape[-1] not in (1, 3, 4))
+    return False
+
+
+def _iteration(entry: Mapping[str, Any]) -> IterationRecord:
+    """Return a written record; what JSON cannot hold (NaN) was written as null."""
+    known = {f.name for f in fields(IterationRecord)}
+    values: dict[str, Any] = {k: np.nan if v is None else v for k, v in entry.items() if k in known}
+    return IterationRecord(**values)
+
+
+def _length(um: float) -> str:
+    return f"{um:.3g} um" if um < 1000 else f"{um / 1000:.4g} mm"

@@ -1,0 +1,398 @@
+"""A recording's reconstruction from request to files: prepare or take up again, solve, finish."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.files.plain_json import plain
+from instrument.files.volume_zarr import is_zarr_name
+from instrument.reconstruction.job import Job, Reduction
+from instrument.reconstruction.preparation import Crop
+from instrument.reconstruction.request import PictureRequest, Settings
+from instrument.reconstruction.video_block import BlockReport, CancelledError
+from instrument.reconstruction.video_job import VideoJob, VideoPlan
+from instrument.reconstruction.video_mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
+from instrument.reconstruction.video_output import VideoPictures, create_output
+from instrument.reconstruction.video_source import has_light, require_video
+from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from instrument.runs.run import Run
+from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
+from recon.streams.video import BLOCK, COLD_ITERATIONS, PRIORS, WARM_ITERATIONS, VideoCamera, video_camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoRequest:
+    """What a video is reconstructed from and how.
+
+    Attributes
+    ----------
+    run : Path
+        A recording (any run with frames).
+    out : Path
+        ``NAME.ome.zarr``; ``NAME.mp4`` and ``NAME.json`` go beside it.
+    psf, calibration : Path or None
+        One of the two.
+    z_um : float or None
+    settings : Settings
+        As for a picture; ``iterations`` are those of a block's first frame. Stopping by time or tolerance
+        would make pictures depend on the machine: they do not apply.
+    warm_iterations : int
+        Of the frames after a block's first.
+    block : int or None
+        Frames a block; None: 32, with a prior over time 16.
+    over_time : "tv", "lowrank" or None
+        A prior that joins the frames of a block (:mod:`recon.streams.joint`); then every frame has the
+        ``iterations``, 60 by default.
+    rotate_deg : int
+    fps : float or None
+        Of the film; None: the recording's own rate, else 25.
+    film : bool
+        Whether to write the MP4.
+    """
+
+    run: Path
+    out: Path
+    psf: Path | None = None
+    calibration: Path | None = None
+    z_um: float | None = None
+    settings: Settings = field(default_factory=Settings)
+    warm_iterations: int = WARM_ITERATIONS
+    block: int | None = None
+    over_time: OverTimeName | None = None
+    rotate_deg: int = 0
+    fps: float | None = None
+    film: bool = True
+
+    @property
+    def film_path(self) -> Path:
+        """The MP4."""
+        return self._beside(".mp4")
+
+    @property
+    def record_path(self) -> Path:
+        """The JSON with settings and origin."""
+        return self._beside(".json")
+
+    def _beside(self, suffix: str) -> Path:
+        stem = self.out.name.lower().removesuffix(".zarr").removesuffix(".ome")
+        return self.out.with_name(self.out.name[: len(stem)] + suffix)
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedVideo:
+    """A job ready to be worked on.
+
+    Attributes
+    ----------
+    job : VideoJob
+    request : VideoRequest
+    notes : dict of str to str
+        What was read and chosen, to be shown.
+    warnings : tuple of str
+    resumed : bool
+        Whether part of it was done before.
+    """
+
+    job: VideoJob
+    request: VideoRequest
+    notes: dict[str, str]
+    warnings: tuple[str, ...]
+    resumed: bool
+
+    @property
+    def left(self) -> list[int]:
+        """Blocks still to be solved."""
+        done = self.job.done()
+        return [number for number in range(len(self.job.blocks)) if number not in done]
+
+
+def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVideo:
+    """Read the recording's first frame and the PSF, settle everything, and make the job or find it begun.
+
+    Parameters
+    ----------
+    request : VideoRequest
+    force : bool
+        Begin anew where there is an output already.
+
+    Raises
+    ------
+    FileError, BenchError, InputError
+        When something cannot be used, or the output holds another video.
+    """
+    _check(request)
+    request.settings.require(z_um=request.z_um)
+    run = Run.open(request.run)
+    require_video(run)
+    frames = tuple(sorted(run.records))
+    picture = _first_picture(request, run, frames[0])
+    assert picture.reduction is not None
+    settings = request.settings
+    camera = video_camera(
+        picture.measurement,
+        picture.calibration,
+        z_um=request.z_um,
+        prior=settings.prior or "tv",
+        tau=settings.tau,
+        noise=picture.binned_noise(settings.noise),
+        erasures=None if picture.valid is None else ~picture.valid,
+    )
+    reduction = picture.reduction
+    if reduction.crop is not None:  # settled, so that a window is the same for every frame
+        rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
+        crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+        reduction = replace(reduction, crop=crop)
+    if request.over_time is not None and not camera.flat:
+        raise BenchError("--over-time takes grey recordings.")
+    usual = COLD_ITERATIONS if request.over_time is None else JOINT_ITERATIONS
+    plan = VideoPlan(
+        run=str(run.path.resolve()),
+        frames=frames,
+        n_frames=run.n_frames,
+        block=request.block or (BLOCK if request.over_time is None else JOINT_BLOCK),
+        cold_iterations=settings.iterations or usual,
+        warm_iterations=request.warm_iterations,
+        over_time=request.over_time,
+        rotate_deg=request.rotate_deg,
+        picture_shape=picture.measurement.shape,
+        settings=_settings(request, picture, camera, reduction),
+    )
+    job, resumed = _job(request, plan, force)
+    if job is None:
+        _create(request, run, plan, picture)
+        job = VideoJob.create(request.out, plan, camera, reduction)
+    saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
+    warnings = list(picture.warnings)
+    if saturated:
+        warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
+    if not has_light(picture.measurement, camera.deviation):
+        warnings.append("The first frame holds nothing but noise: was the scene lit?")
+    if missing := run.n_frames - len(frames):
+        warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
+    notes = {**picture.notes, "Image": f"{run.path}: {len(frames)} frames"}
+    return PreparedVideo(job, request, notes, tuple(warnings), resumed)
+
+
+def solve_video(
+    prepared: PreparedVideo,
+    told: Callable[[BlockReport], object],
+    cancel: threading.Event,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> bool:
+    """Solve what is left: in this process, on ``workers`` processes, or on a scheduler's cluster.
+
+    Returns
+    -------
+    bool
+        False when cancelled; what is on the disk stays, and the same request goes on with the rest.
+
+    Raises
+    ------
+    BenchError
+        When there is no Dask or no scheduler.
+    FileError, OSError
+        When a frame cannot be read or a picture written.
+    """
+    job, output = prepared.job, prepared.request.out.resolve()
+    folder = job.folder.resolve()
+    try:
+        if workers is None and scheduler is None:
+            in_process(folder, output, prepared.left, told, cancel)
+        else:
+            with cluster(workers=workers, scheduler=scheduler) as client:
+                on_cluster(client, folder, output, prepared.left, told, cancel)
+    except CancelledError:
+        return False
+    return True
+
+
+def finish_video(prepared: PreparedVideo) -> list[Path]:
+    """Write film and record, and remove the job; returns what there is now.
+
+    Raises
+    ------
+    FileError, OSError
+    """
+    request, plan = prepared.request, prepared.job.plan
+    pictures = VideoPictures(request.out)
+    written = [request.out]
+    if request.film:
+        chosen = np.unique(np.linspace(0, len(plan.frames) - 1, SAMPLES).round().astype(int))
+        black, white = levels_of(pictures.read(plan.frames[i]) for i in chosen)
+        fps = request.fps or (1 / pictures.period_s if pictures.period_s else DEFAULT_FPS)
+        shown = (as_shown(pictures.read(index), black, white) for index in plan.frames)
+        write_mp4(request.film_path, shown, fps)
+        written.append(request.film_path)
+    unlit = prepared.job.unlit()
+    record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
+    write_text(request.record_path, json.dumps(record, indent=1, sort_keys=True))
+    prepared.job.remove()
+    return [*written, request.record_path]
+
+
+# Pieces ------------------------------------------------------------------------------------------------
+def _check(request: VideoRequest) -> None:
+    if not is_zarr_name(request.out) or not request.film_path.stem:
+        raise FileError(request.out, "a video is written as OME-Zarr: the name must end in .ome.zarr.")
+    if not request.out.parent.is_dir():
+        raise FileError(request.out, f"its folder {request.out.parent} does not exist.", "Make it first.")
+    given = request.settings
+    if given.time_s is not None or given.tolerance is not None:
+        raise BenchError(
+            "--time and --tolerance do not apply to --video: pictures must not depend on the machine. "
+            "Use --iterations and --warm."
+        )
+    if given.prior not in (None, *PRIORS):
+        raise BenchError(f"--prior {given.prior} is not for videos; choose one of {', '.join(PRIORS)}.")
+    if given.model not in ("auto", "convolution"):
+        raise BenchError(f"--model {given.model} is not for videos: they take one PSF for the whole field.")
+
+
+def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
+    """Prepare the first frame as a photograph would be."""
+    # What is saturated differs from frame to frame; pixels can only be left out of all.
+    erasures = "none" if request.settings.erasures == "saturated" else request.settings.erasures
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder) / f"{run.path.name} frame {index}.npy"
+        np.save(image, run.frame(index))
+        job = PictureRequest(
+            image=image,
+            psf=request.psf,
+            calibration=request.calibration,
+            z_um=request.z_um,
+            settings=replace(request.settings, erasures=erasures, iterations=None),
+        ).prepare()
+    return replace(job, simulated=job.simulated or run.is_simulated)
+
+
+def _binned_shape(run: Run, index: int, factor: int) -> tuple[int, int]:
+    height, width = run.frame(index).shape[:2]
+    return height // factor, width // factor
+
+
+def _settings(
+    request: VideoRequest, picture: Job, camera: VideoCamera, reduction: Reduction
+) -> dict[str, Any]:
+    """Return what the result depends on, JSON-compatible."""
+    provenance = {key: value for key, value in picture.provenance.items() if key != "image"}
+    chosen: dict[str, Any] = plain(
+        {
+            **provenance,
+            "psf_file": None if request.psf is None else str(request.psf.resolve()),
+            "z_um": request.z_um,
+            "prior": request.settings.prior or "tv",
+            "weight": camera.weight,
+            "noise_deviation": camera.deviation,
+            "optics_sha256": _digest(camera, reduction),
+            "simulated": picture.simulated,
+            "software": {"diffuserbench": version("diffuserbench")},
+        }
+    )
+    return chosen
+
+
+def _digest(camera: VideoCamera, reduction: Reduction) -> str:
+    """Return a digest of PSFs, dark level and pixels used: files of the same name may have changed since."""
+    digest = hashlib.sha256()
+    for array in (camera.psfs, camera.image_scale, reduction.dark, camera.valid):
+        values = np.zeros(0) if array is None else np.asarray(array)
+        digest.update(f"{values.shape} {values.dtype}".encode())
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob | None, bool]:
+    """Return the job begun before for the same plan; none with ``force``, which removes what there is."""
+    _require_spared(request)
+    folder = VideoJob.folder_of(request.out)
+    begun = None
+    if not force and (folder / "job.json").exists() and request.out.exists():
+        begun = VideoJob(folder)
+        if VideoPlan.from_json(plan.to_json()) == begun.plan:
+            return begun, True
+    if request.out.exists() and not force:
+        if begun is not None:
+            raise FileError(
+                request.out,
+                f"holds an unfinished video with other settings or frames ({_difference(plan, begun.plan)}).",
+                "Give the same as then to go on with it, or --force to begin anew.",
+            )
+        raise FileError(request.out, "exists.", "Choose another name with --out, or --force to replace it.")
+    beside = (request.film_path, request.record_path) if request.film else (request.record_path,)
+    for other in () if force else beside:
+        if other.exists():
+            raise FileError(
+                other,
+                "exists, and would be replaced by what goes with the video.",
+                "Choose another name with --out, or --force to replace it.",
+            )
+    for old in (folder, request.out):
+        if old.exists():
+            shutil.rmtree(old)
+    return None, False
+
+
+def _require_spared(request: VideoRequest) -> None:
+    """Refuse an output that is, holds or is a part of what is read: ``--force`` would delete measurements.
+
+    A video may lie in the folder of its run; a record beside it tells it from the run's own frames.
+    """
+    out = request.out.resolve()
+    ours = request.record_path.exists() or VideoJob.folder_of(request.out).exists()
+    for read in (request.run, request.psf, request.calibration):
+        if read is None:
+            continue
+        source = read.resolve()
+        part = source in out.parents and out.exists() and not ours
+        if source == out or out in source.parents or part:
+            raise FileError(
+                request.out,
+                f"cannot be replaced by the video: it is read, as {read}.",
+                "Choose another --out.",
+            )
+
+
+def _difference(plan: VideoPlan, begun: VideoPlan) -> str:
+    mine, other = ({**p.__dict__, **p.settings} for p in (VideoPlan.from_json(plan.to_json()), begun))
+    names = [name for name in mine if name != "settings" and mine[name] != other.get(name)]
+    return ", ".join(names) or "settings"
+
+
+def _create(request: VideoRequest, run: Run, plan: VideoPlan, picture: Job) -> None:
+    geometry = picture.calibration.geometry
+    height, width = plan.picture_shape[:2]
+    z = picture.calibration.source_positions_um[:, 2]
+    z_um = request.z_um if request.z_um is not None else (float(z[0]) if np.isfinite(z[0]) else None)
+    pitch = None
+    if geometry.pixel_pitch_um and geometry.diffuser_distance_mm and z_um:
+        pitch = geometry.pixel_pitch_um * z_um / (1000 * geometry.diffuser_distance_mm)
+    turned = request.rotate_deg % 180 != 0
+    shape = (width, height) if turned else (height, width)
+    create_output(
+        request.out,
+        plan.n_frames,
+        (*shape, *plan.picture_shape[2:]),
+        period_s=run.frame_period_s,
+        pitch_um=pitch,
+        attributes={
+            **plan.settings,
+            "run": plan.run,
+            "warm_iterations": None if plan.over_time else plan.warm_iterations,
+            "missing": sorted(set(range(plan.n_frames)) - set(plan.frames)),
+        },
+    )

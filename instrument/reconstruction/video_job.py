@@ -1,0 +1,198 @@
+"""A video's reconstruction as files: what every worker needs, and what is done, beside the output.
+
+``.NAME.job/`` stands beside ``NAME.ome.zarr`` until the video is complete::
+
+    job.json      the recording, the frames, the blocks, every setting
+    camera.npz    PSFs, dark level, noise, the prior's weight: settled once, so that all workers agree
+    done/         a file for each block whose pictures are on the disk: how many of its frames had no light
+
+A worker needs the job's folder and a block's number, nothing else: it reads frames and writes pictures.
+A block that was cut off is computed again from its start, as its pictures hang together; those that are on
+the disk already are left as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import sync_folder, whole_file, write_text
+from instrument.files.errors import FileError
+from instrument.files.plain_json import plain
+from instrument.reconstruction.job import Reduction
+from instrument.reconstruction.preparation import Crop
+from recon.streams.joint import OverTimeName
+from recon.streams.video import VideoCamera, blocks_of
+
+FORMAT = 1
+_JSON, _CAMERA, _DONE = "job.json", "camera.npz", "done"
+
+
+@dataclass(frozen=True)
+class VideoPlan:
+    """What shall be computed, as plain data; two jobs are one when their plans are equal.
+
+    Attributes
+    ----------
+    run : str
+        The recording's folder, absolute.
+    frames : tuple of int
+        The recording's frames that there are, ascending.
+    n_frames : int
+        Frames of the output: the recording's, with its gaps.
+    block : int
+        Frames a block, by number.
+    cold_iterations, warm_iterations : int
+    over_time : str or None
+        A prior over time, with which the frames of a block are solved together (then ``cold_iterations``).
+    rotate_deg : int
+        By how much pictures are turned, counter-clockwise.
+    picture_shape : tuple of int
+        ``(height, width)`` or ``(height, width, 3)``, before turning.
+    settings : dict
+        Everything that was chosen for preparation and prior, JSON-compatible.
+    """
+
+    run: str
+    frames: tuple[int, ...]
+    n_frames: int
+    block: int
+    cold_iterations: int
+    warm_iterations: int
+    over_time: OverTimeName | None
+    rotate_deg: int
+    picture_shape: tuple[int, ...]
+    settings: dict[str, Any]
+
+    def to_json(self) -> str:
+        """Return the plan as text."""
+        return json.dumps({"format": FORMAT, **plain(asdict(self))}, indent=1, sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> VideoPlan:
+        """Read :meth:`to_json`'s text."""
+        values = json.loads(text)
+        if values.pop("format") != FORMAT:
+            raise ValueError("another format")
+        values["frames"], values["picture_shape"] = tuple(values["frames"]), tuple(values["picture_shape"])
+        return cls(**values)
+
+
+class VideoJob:
+    """A job's folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a job that exists; :meth:`create` makes one.
+
+    Raises
+    ------
+    FileError
+        When there is none, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            self.plan = VideoPlan.from_json((folder / _JSON).read_text())
+        except FileNotFoundError:
+            raise FileError(folder, "holds no unfinished video.", "Was it completed meanwhile?") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileError(folder / _JSON, f"is damaged: {error!r}.", "Begin anew with --force.") from error
+
+    @staticmethod
+    def folder_of(output: Path) -> Path:
+        """Return where the job for an output lies."""
+        return output.with_name(f".{output.name.removesuffix('.zarr').removesuffix('.ome')}.job")
+
+    @classmethod
+    def create(cls, output: Path, plan: VideoPlan, camera: VideoCamera, reduction: Reduction) -> VideoJob:
+        """Write a job beside its output; ``job.json``, which makes it one, comes last."""
+        folder = cls.folder_of(output)
+        (folder / _DONE).mkdir(parents=True)
+        arrays: dict[str, Any] = {
+            "psfs": camera.psfs,
+            "deviation": camera.deviation,
+            "image_scale": camera.image_scale,
+            "weight": np.float64(camera.weight),
+            "prior": np.array(camera.prior),
+            "flat": np.array(camera.flat),
+            "dark": np.asarray(reduction.dark, np.float32),
+            "binning": np.array([reduction.first_binning, reduction.binning]),
+            "crop": _crop_array(reduction.crop),
+            "valid": np.zeros(0, bool) if camera.valid is None else camera.valid,
+        }
+        with whole_file(folder / _CAMERA) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
+        write_text(folder / _JSON, plan.to_json())
+        return cls(folder)
+
+    def remove(self) -> None:
+        """Delete the job, whose video is complete."""
+        (self.folder / _JSON).unlink()
+        shutil.rmtree(self.folder)
+
+    # What to do, and what is done ------------------------------------------------------------------
+    @property
+    def blocks(self) -> list[tuple[int, ...]]:
+        """The frames of each block."""
+        return blocks_of(list(self.plan.frames), self.plan.block)
+
+    def done(self) -> set[int]:
+        """Return the numbers of the blocks whose pictures are on the disk."""
+        return {int(path.name) for path in (self.folder / _DONE).iterdir()}
+
+    def is_done(self, block: int) -> bool:
+        """Whether a block's pictures are on the disk."""
+        return (self.folder / _DONE / str(block)).exists()
+
+    def unlit(self) -> int:
+        """Return how many frames of the blocks that are done hold nothing but noise."""
+        return sum(int(path.read_text() or 0) for path in (self.folder / _DONE).iterdir())
+
+    def mark_done(self, block: int, unlit: int = 0) -> None:
+        """Note that a block's pictures are on the disk, and how many of its frames had no light."""
+        (self.folder / _DONE / str(block)).write_text(str(unlit))
+        sync_folder(self.folder / _DONE)
+
+    # What workers need -----------------------------------------------------------------------------
+    @cached_property
+    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+        with np.load(self.folder / _CAMERA) as file:
+            return dict(file)
+
+    @property
+    def camera(self) -> VideoCamera:
+        """What the solver needs."""
+        a = self._arrays
+        valid = a["valid"] if a["valid"].size else None
+        return VideoCamera(
+            a["psfs"], a["deviation"], a["image_scale"], valid,
+            str(a["prior"]), float(a["weight"]), bool(a["flat"]),
+        )  # fmt: skip
+
+    @property
+    def reduction(self) -> Reduction:
+        """From a frame to what the solver takes."""
+        a = self._arrays
+        first, last = (int(n) for n in a["binning"])
+        dark = a["dark"] if a["dark"].ndim else float(a["dark"])
+        crop = Crop(*(int(n) for n in a["crop"])) if a["crop"].size else None
+        return Reduction(first, dark, crop, last)
+
+
+def _crop_array(crop: Crop | None) -> npt.NDArray[np.int64]:
+    """Return a window as (top, left, height, width); empty for none. Callers settle a centred one before."""
+    if crop is None:
+        return np.zeros(0, np.int64)
+    assert crop.top is not None
+    assert crop.left is not None
+    return np.array([crop.top, crop.left, crop.height, crop.width])

@@ -1,0 +1,58 @@
+"""The page of views of a volume: projections, depth in colour, slices, convergence."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from instrument.reconstruction.volume_views import in_colour_of_depth
+from recon.reconstruction.volume_result import VolumeReconstruction
+
+_SLICES = 4
+_WHITE_PERCENTILE = 99.8
+
+
+def volume_figure(result: VolumeReconstruction, *, simulated: bool = False) -> Figure:
+    """Draw a volume: brightest over each axis, depth as colour, slices, and how the solver converged."""
+    volume = result.volume if result.volume.ndim == 3 else result.volume.mean(axis=-1)
+    figure = Figure(figsize=(15, 8), layout="constrained")
+    title = f"{'SIMULATED   ' if simulated else ''}{result.model} model, prior {result.prior}"
+    figure.suptitle(title)
+    axes = figure.subplots(2, 4)
+    front, side, top = (volume.max(axis=a) for a in (0, 2, 1))
+    white = _white(front)
+    axes[0, 0].imshow(front, cmap="gray", vmin=0, vmax=white)
+    axes[0, 0].set(title="brightest over depth", xlabel="x (pixels)", ylabel="y (pixels)")
+    axes[0, 1].imshow(in_colour_of_depth(front, volume.argmax(axis=0), len(volume), white))
+    axes[0, 1].set(title="depth as colour: blue first, red last", xlabel="x (pixels)")
+    axes[0, 2].imshow(top, cmap="magma", aspect="auto", vmin=0, vmax=_white(top), interpolation="nearest")
+    axes[0, 2].set(title="brightest over y", xlabel="x (pixels)", ylabel="depth plane")
+    axes[0, 3].imshow(side.T, cmap="magma", aspect="auto", vmin=0, vmax=_white(side), interpolation="nearest")
+    axes[0, 3].set(title="brightest over x", xlabel="depth plane", ylabel="y (pixels)")
+    planes = np.unique(np.linspace(0, len(volume) - 1, _SLICES + 1).round().astype(int)[1:])
+    strip = np.concatenate([volume[z] for z in planes[: _SLICES - 1]], axis=1)
+    grid = axes[1, 0].get_gridspec()
+    for axis in axes[1, :3]:
+        axis.remove()
+    slices = figure.add_subplot(grid[1, :3])
+    slices.imshow(strip, cmap="gray", vmin=0, vmax=white)
+    slices.set(title="planes " + ", ".join(_depth(result, z) for z in planes[: _SLICES - 1]))
+    slices.axis("off")
+    for channel, history in enumerate(result.histories):
+        iterations = [r.iteration for r in history]
+        axes[1, 3].loglog(iterations, [r.data_residual for r in history], label=f"channel {channel}")
+    axes[1, 3].axhline(result.noise_norm, color="grey", linestyle="--", label="expected noise")
+    axes[1, 3].set(title="data residual (noise = 1 a pixel)", xlabel="iteration")
+    axes[1, 3].legend()
+    return figure
+
+
+def _white(image: npt.NDArray[np.float32]) -> float:
+    level = float(np.percentile(image, _WHITE_PERCENTILE))
+    return level if level > 0 else max(float(image.max()), 1e-30)
+
+
+def _depth(result: VolumeReconstruction, plane: int) -> str:
+    z_um = result.grid.z_um[plane]
+    return f"{plane}" if not np.isfinite(z_um) else f"{plane} (z = {z_um / 1000:.2f} mm)"

@@ -1,0 +1,1 @@
+"""Plans carried out, and the folders that hold what was taken."""

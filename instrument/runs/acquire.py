@@ -1,0 +1,143 @@
+"""From a plan and an open bench to a run: check, make the folder, carry out."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from instrument.bench.bench import Bench
+from instrument.bench.camera_settings import camera_settings
+from instrument.files.errors import FileError
+from instrument.plan import BenchAbilities, Plan, check
+from instrument.runs.run import Run
+from instrument.runs.run_control import RunControl
+from instrument.runs.runner import Progress, Runner
+from instrument.runs.writer import BenchRecord, RunWriter
+
+
+def acquire(
+    bench: Bench,
+    plan: Plan,
+    folder: Path | str | None = None,
+    *,
+    on_progress: Progress | None = None,
+    calibrations: Sequence[str] = (),
+    control: RunControl | None = None,
+) -> Run:
+    """Check a plan, carry it out and return the run.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    plan : Plan
+    folder : path, optional
+        Where the run's folder is made; None means the bench's own data folder.
+    on_progress : callable, optional
+        Called with a :class:`~instrument.runs.runner.RunStatus` after every step.
+    calibrations : sequence of str
+        Identifiers of the calibrations in use, kept with the run.
+    control : RunControl, optional
+        To pause, abort or stop the run from another thread.
+
+    Raises
+    ------
+    PlanError
+        When the plan cannot be carried out; nothing moved and nothing was written.
+    DeviceError, RunError
+        When a device or the disk fails; the bench is safe and the run is marked as failed.
+    """
+    return prepare(
+        bench, plan, folder, on_progress=on_progress, calibrations=calibrations, control=control
+    ).execute()
+
+
+def prepare(
+    bench: Bench,
+    plan: Plan,
+    folder: Path | str | None = None,
+    *,
+    on_progress: Progress | None = None,
+    calibrations: Sequence[str] = (),
+    control: RunControl | None = None,
+) -> Runner:
+    """Check a plan, make the run's folder and return the runner, for those who want to pause or stop it."""
+    if control is not None:
+        control.check()
+    folder = Path(folder) if folder is not None else bench.config.data_folder
+    check(plan, abilities_of(bench, folder))
+    writer = RunWriter.create(
+        folder, label=plan.label, bench=record_of(bench), plan=plan, calibrations=calibrations
+    )
+    runner = Runner(bench, plan, writer, on_progress=on_progress)
+    if control is not None:
+        control.follow(runner)
+    return runner
+
+
+def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
+    """Read once what plans are checked against: the devices' limits, and the free space in ``folder``."""
+    camera, stage, slm = bench.camera, bench.stage, bench.slm
+    return BenchAbilities(
+        frame_shape=camera.frame_shape,
+        frame_dtype=camera.frame_dtype,
+        exposure_ms=camera.exposure_ms,
+        exposure_limits_ms=camera.exposure_limits_ms,
+        gain_limits=camera.gain_limits,
+        stage_axes=stage.axes if stage is not None else (),
+        stage_position=stage.position() if stage is not None else {},
+        stage_homed=stage is None or stage.is_homed,
+        stage_target=(lambda source: bench.stage_target(*source)) if stage is not None else None,
+        can_switch_source=bench.can_switch_source,
+        can_switch_scene=bench.can_switch_scene,
+        n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
+        slm_shape=slm.shape if slm is not None else None,
+        slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
+        free_bytes=free_bytes(folder) if folder is not None else None,
+    )
+
+
+def record_of(bench: Bench) -> BenchRecord:
+    """Return what a run keeps about its bench."""
+    return BenchRecord(
+        config=bench.config.as_dict(),
+        toml=bench.config.text,
+        devices={kind: str(device.identity) for kind, device in bench.devices.items()},
+        simulated=bool(bench.simulated_kinds),
+        pixel_pitch_um=bench.camera.pixel_pitch_um * bench.camera.binning,
+        camera=camera_settings(bench.camera),
+        stage=bench.stage.position() if bench.stage is not None and bench.stage.is_homed else {},
+    )
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the disk that ``folder`` is or will be on.
+
+    Raises
+    ------
+    FileError
+        When nothing can be kept there: its path leads to no disk or through a file, or may not be written to.
+    """
+    there = there_now(folder)
+    if not there.is_dir():
+        raise FileError(folder, f"{there} is a file, not a folder; nothing can be kept there.")
+    if not os.access(there, os.W_OK):
+        raise FileError(folder, f"you may not write to {there}; nothing can be kept there.")
+    return shutil.disk_usage(there).free
+
+
+def there_now(folder: Path) -> Path:
+    """Return what there is of a path already: itself, or the nearest folder above it.
+
+    Raises
+    ------
+    FileError
+        When there is nothing of it, not even its disk.
+    """
+    path = folder.absolute()
+    for there in (path, *path.parents):
+        if there.exists():
+            return there
+    raise FileError(folder, "nothing of this path is there, not even its disk. Is the drive connected?")

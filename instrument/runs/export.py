@@ -1,0 +1,208 @@
+"""Write a run's frames for other programs, one frame in memory at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import tifffile
+
+from instrument.files.atomic import check_writable, whole_file
+from instrument.files.errors import BenchError, FileError
+from instrument.runs.run import Run, RunError
+
+Image = npt.NDArray[Any]
+_BIG_TIFF_BYTES = 3_900_000_000
+
+
+def export(
+    run: Run,
+    target: Path | str,
+    frames: Sequence[int] | None = None,
+    *,
+    frames_per_s: float | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> list[int]:
+    """Write frames of a run to a file, or to a folder of PNG files; the format follows from the name.
+
+    ``.ome.tif`` (OME-TIFF), ``.tif`` (stack), ``.h5`` or ``.hdf5``, ``.npy``, ``.mp4`` (8 bit: full scale
+    becomes 255); a name without suffix, or an existing folder: one PNG a frame, named by its number.
+    Frames that are not there (gaps, steps not done) are left out; the numbers of those written are returned,
+    and kept inside the file where the format allows it.
+
+    Parameters
+    ----------
+    run : Run
+    target : path
+        Must not exist, except as a folder for PNG files.
+    frames : sequence of int, optional
+        Which ones, all of them stored; None means every stored frame.
+    frames_per_s : float, optional
+        Of an MP4; None means the recording's own rate, 10 for a run of a plan.
+    on_frame : callable, optional
+        Called with the number of frames written so far.
+
+    Raises
+    ------
+    FileError
+        When the target exists, cannot be written, or has another suffix.
+    RunError
+        When a frame is not there.
+    """
+    target = Path(target)
+    indices = sorted(run.records) if frames is None else list(frames)
+    if not indices:
+        raise RunError(run.path, "has no such frames to export.")
+    if absent := [index for index in indices if index not in run.records]:
+        raise RunError(run.path, f"frame {absent[0]} is not there ({run.condition}).")
+
+    def images() -> Iterator[Image]:
+        for done, index in enumerate(indices, start=1):
+            yield run.frame(index)
+            if on_frame is not None:
+                on_frame(done)
+
+    name = target.name.lower()
+    if target.is_dir() or not target.suffix:
+        _png(run, target, indices, images())
+        return indices
+    writers: Mapping[str, Callable[[Path], None]] = {
+        ".ome.tif": lambda path: _tiff(run, path, indices, images(), ome=True),
+        ".ome.tiff": lambda path: _tiff(run, path, indices, images(), ome=True),
+        ".tif": lambda path: _tiff(run, path, indices, images(), ome=False),
+        ".tiff": lambda path: _tiff(run, path, indices, images(), ome=False),
+        ".h5": lambda path: _hdf5(run, path, indices, images()),
+        ".hdf5": lambda path: _hdf5(run, path, indices, images()),
+        ".npy": lambda path: _npy(run, path, indices, images()),
+        ".mp4": lambda path: _mp4(run, path, images(), frames_per_s or _rate(run)),
+    }
+    writer = next((write for suffix, write in writers.items() if name.endswith(suffix)), None)
+    if writer is None:
+        raise FileError(
+            target, f"no known format. Choose a name ending in {', '.join(writers)}, or a folder."
+        )
+    if target.exists():
+        raise FileError(target, "exists already and was left as it is.")
+    check_writable(target, 0 if name.endswith(".mp4") else sum(run.records[i].n_bytes for i in indices))
+    with whole_file(target) as temporary:
+        writer(temporary)
+    return indices
+
+
+def _rate(run: Run) -> float:
+    return 1 / run.frame_period_s if run.frame_period_s else 10.0
+
+
+def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, ome: bool) -> None:
+    array = run.array
+    shape = (len(indices), *array.frame_shape)
+    pitch_um = float(run.provenance["pixel_pitch_um"])
+    metadata: dict[str, Any] = {"axes": "TYXS" if array.is_colour else "TYX"}
+    if ome:
+        metadata |= {
+            "Name": run.path.name,
+            "PhysicalSizeX": pitch_um,
+            "PhysicalSizeXUnit": "µm",
+            "PhysicalSizeY": pitch_um,
+            "PhysicalSizeYUnit": "µm",
+            "Plane": {
+                "DeltaT": [
+                    (run.metadata(i).host_time_ns - run.metadata(indices[0]).host_time_ns) / 1e9
+                    for i in indices
+                ],
+                "ExposureTime": [run.metadata(i).exposure_ms / 1e3 for i in indices],
+                "TheT": list(range(len(indices))),
+            },
+        }
+        if run.frame_period_s:
+            metadata |= {"TimeIncrement": run.frame_period_s, "TimeIncrementUnit": "s"}
+    else:
+        metadata["frames"] = json.dumps(indices)
+    with tifffile.TiffWriter(
+        path, bigtiff=array.dtype.itemsize * int(np.prod(shape)) > _BIG_TIFF_BYTES, ome=ome
+    ) as tiff:
+        tiff.write(
+            images,
+            shape=shape,
+            dtype=array.dtype,
+            photometric="rgb" if array.is_colour else "minisblack",
+            resolution=(1e4 / pitch_um, 1e4 / pitch_um),
+            resolutionunit="CENTIMETER",
+            metadata=metadata,
+        )
+
+
+def _hdf5(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:
+    try:
+        import h5py
+    except ImportError:
+        raise BenchError(
+            "HDF5 files need the package h5py, which is not installed. "
+            "Install it (pip install h5py), or export to .ome.tif or .npy."
+        ) from None
+    array = run.array
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset(
+            "frames", (len(indices), *array.frame_shape), array.dtype, chunks=(1, *array.frame_shape)
+        )
+        data.attrs["pixel_pitch_um"] = float(run.provenance["pixel_pitch_um"])
+        data.attrs["axes"] = "t,y,x,c" if array.is_colour else "t,y,x"
+        for place, image in enumerate(images):
+            data[place] = image
+        file.create_dataset("frame_number", data=np.array(indices))
+        file.create_dataset("exposure_ms", data=[run.metadata(i).exposure_ms for i in indices])
+        lines = [json.dumps(run.records[i].to_json(), ensure_ascii=False) for i in indices]
+        file.create_dataset("metadata", data=lines, dtype=h5py.string_dtype())
+        file.attrs["run"] = run.path.name
+        file.attrs["simulated"] = run.is_simulated
+        file.attrs["provenance"] = json.dumps(run.provenance)
+        if run.plan is not None:
+            file.attrs["plan"] = run.plan.to_json()
+
+
+def _npy(run: Run, path: Path, indices: list[int], images: Iterator[Image]) -> None:
+    array = run.array
+    shape = (len(indices), *array.frame_shape)
+    data = np.lib.format.open_memmap(path, mode="w+", dtype=array.dtype, shape=shape)
+    for place, image in enumerate(images):
+        data[place] = image
+    data.flush()
+
+
+def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) -> None:
+    if run.array.dtype == np.float32:
+        raise RunError(run.path, "has averaged frames (float32), which PNG cannot hold. Export to .tif.")
+    folder.mkdir(parents=True, exist_ok=True)
+    digits = len(str(max(indices)))
+    for index, image in zip(indices, images, strict=True):
+        path = folder / f"frame-{index:0{digits}d}.png"
+        if path.exists():
+            raise FileError(path, "exists already and was left as it is.")
+        shown = image[..., ::-1] if image.ndim == 3 else image
+        done, data = cv2.imencode(".png", np.ascontiguousarray(shown))
+        if not done:
+            raise FileError(path, "could not be encoded as PNG.")
+        with whole_file(path) as temporary:
+            temporary.write_bytes(data.tobytes())
+
+
+def _mp4(run: Run, path: Path, images: Iterator[Image], frames_per_s: float) -> None:
+    height, width = run.array.frame_shape[:2]
+    # Coders of video want even sides.
+    height, width = height // 2 * 2, width // 2 * 2
+    bits = next(iter(run.records.values())).metadata.significant_bits
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), frames_per_s, (width, height))
+    if not writer.isOpened():
+        raise FileError(path, "this OpenCV cannot write MP4.", "Export to .tif or PNG instead.")
+    try:
+        for image in images:
+            scaled = np.clip(image[:height, :width].astype(np.float32) * (255 / ((1 << bits) - 1)), 0, 255)
+            shown = np.rint(scaled).astype(np.uint8)
+            writer.write(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR) if shown.ndim == 2 else shown[..., ::-1])
+    finally:
+        writer.release()

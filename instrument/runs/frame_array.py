@@ -1,0 +1,269 @@
+"""The frames of a run as one OME-Zarr 0.5 image: Zarr version 3, one frame a chunk, uncompressed.
+
+The metadata are written here rather than through a Zarr library, because only so can each chunk be synced
+to the disk by itself, and because an uncompressed chunk is the frame's own bytes: no second copy at camera
+speed. Tests read the result back with zarr-python and hold it against the OME-Zarr model library.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import sync_folder
+from instrument.files.errors import FileError
+from instrument.runs.durable import SyncPool, make_folder, write_json
+
+Image = npt.NDArray[Any]
+_LEVEL = "0"
+_DTYPES = ("uint8", "uint16", "float32")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredChunk:
+    """A frame on the disk: its size and CRC-32."""
+
+    n_bytes: int
+    crc32: int
+
+
+class _Draft(NamedTuple):
+    """A chunk that is written, but not yet surely on the disk nor under its name."""
+
+    handle: int
+    path: Path
+    chunk: StoredChunk
+
+
+class FrameArray:
+    """Frames ``0 ... n_frames - 1`` of equal shape in the folder ``path``.
+
+    On the disk the axes are ``t, y, x`` for grey and ``t, c, y, x`` for colour frames (OME-Zarr's order);
+    :meth:`write` takes and :meth:`read` returns ``(height, width)`` or ``(height, width, 3)``.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the OME-Zarr group, e.g. ``frames.ome.zarr``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        described = json.loads((path / _LEVEL / "zarr.json").read_text())
+        shape = tuple(described["shape"])
+        self.n_frames: int = shape[0]
+        self.is_colour = len(shape) == 4
+        self.frame_shape: tuple[int, ...] = (*shape[2:], shape[1]) if self.is_colour else shape[1:]
+        self.dtype = np.dtype(described["data_type"])
+        self._described = described
+
+    @cached_property
+    def _sync(self) -> SyncPool:
+        return SyncPool()
+
+    def close(self) -> None:
+        """End the threads that writing began, if any; reading needs no closing."""
+        if "_sync" in self.__dict__:
+            self._sync.close()
+            del self.__dict__["_sync"]
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        *,
+        n_frames: int,
+        frame_shape: tuple[int, ...],
+        dtype: npt.DTypeLike,
+        pixel_pitch_um: float,
+        name: str,
+    ) -> FrameArray:
+        """Make an array without frames.
+
+        Parameters
+        ----------
+        frame_shape : tuple of int
+            ``(height, width)`` or ``(height, width, 3)``.
+        dtype
+            uint8, uint16 or float32.
+        pixel_pitch_um : float
+            Pitch of the stored pixels on the sensor, micrometres.
+        """
+        data_type = np.dtype(dtype).name
+        if data_type not in _DTYPES:
+            raise TypeError(f"Frames are stored as {', '.join(_DTYPES)}, not {data_type}.")
+        colour = len(frame_shape) == 3
+        shape = [n_frames, *((frame_shape[2], *frame_shape[:2]) if colour else frame_shape)]
+        axes = ["t", "c", "y", "x"] if colour else ["t", "y", "x"]
+        # Under another name until it is whole, so that a crash here leaves no half array behind.
+        draft = path.with_name(f".{path.name}.draft")
+        shutil.rmtree(draft, ignore_errors=True)
+        for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
+            make_folder(folder)
+        write_json(draft / _LEVEL / "zarr.json", _array_metadata(shape, data_type, axes))
+        write_json(draft / "zarr.json", _group_metadata(axes, pixel_pitch_um, name))
+        draft.rename(path)
+        sync_folder(path.parent)
+        return cls(path)
+
+    def write(self, items: Sequence[tuple[int, Image]]) -> list[StoredChunk]:
+        """Store frames and return once all of them are on the disk.
+
+        Several at a time cost less than one by one, as folders are synced once for all.
+
+        Raises
+        ------
+        ValueError
+            When an index or an image does not fit the array; nothing is stored.
+        OSError
+            When the disk is full or not writable. Frames that were there before stay as they were.
+        """
+        for index, image in items:
+            if not 0 <= index < self.n_frames:
+                raise ValueError(f"Frame {index} is outside the array of {self.n_frames} frames.")
+            if image.shape != self.frame_shape or image.dtype != self.dtype:
+                raise ValueError(
+                    f"Frame {index} is {image.dtype} {image.shape}; "
+                    f"the run stores {self.dtype} {self.frame_shape}."
+                )
+        # All of one kind before any of the next, and those at the same time: the file system commits its
+        # journal once for all frames, where frame by frame it would several times for each.
+        drafts: list[_Draft] = []
+        try:
+            for index, image in items:
+                drafts.append(self._write_draft(index, image))
+            self._sync.files(draft.handle for draft in drafts)
+        except BaseException:
+            for draft in drafts:
+                draft.path.unlink(missing_ok=True)
+            raise
+        finally:
+            for draft in drafts:
+                os.close(draft.handle)
+        top = self.path / _LEVEL / "c"
+        folders: dict[Path, None] = {}
+        for (index, _), draft in zip(items, drafts, strict=True):
+            target = self.chunk_path(index)
+            draft.path.replace(target)
+            folders.update(dict.fromkeys(folder for folder in target.parents if folder.is_relative_to(top)))
+        self._sync.folders(folders)
+        return [draft.chunk for draft in drafts]
+
+    def read(self, index: int) -> Image:
+        """Return one frame as it was written.
+
+        Raises
+        ------
+        FileNotFoundError
+            When the frame is not there.
+        FileError
+            When its file has the wrong size.
+        """
+        path = self.chunk_path(index)
+        flat = np.fromfile(path, dtype=self.dtype.newbyteorder("<"))
+        if flat.size != int(np.prod(self.frame_shape)):
+            right = int(np.prod(self.frame_shape)) * self.dtype.itemsize
+            raise FileError(
+                path,
+                f"has {path.stat().st_size} bytes; frame {index} takes {right}: it is damaged.",
+                "diffuserbench verify RUN names every damaged frame.",
+            )
+        flat = flat.astype(self.dtype, copy=False)
+        if self.is_colour:
+            height, width, channels = self.frame_shape
+            return np.moveaxis(flat.reshape(channels, height, width), 0, -1)
+        return flat.reshape(self.frame_shape)
+
+    def resize(self, n_frames: int, *, frame_period_s: float | None = None) -> None:
+        """Change the number of frames that the array says it has, and the time between them if given."""
+        self._described["shape"][0] = n_frames
+        write_json(self.path / _LEVEL / "zarr.json", self._described)
+        self.n_frames = n_frames
+        if frame_period_s is not None:
+            group = json.loads((self.path / "zarr.json").read_text())
+            multiscale = group["attributes"]["ome"]["multiscales"][0]
+            multiscale["axes"][0]["unit"] = "second"
+            multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
+            write_json(self.path / "zarr.json", group)
+
+    def checksum(self, index: int) -> StoredChunk | None:
+        """Return size and CRC-32 of a frame as it is on the disk, None where it is not."""
+        try:
+            data = self.chunk_path(index).read_bytes()
+        except FileNotFoundError:
+            return None
+        return StoredChunk(len(data), zlib.crc32(data))
+
+    def chunk_path(self, index: int) -> Path:
+        """Return the file that holds a frame."""
+        return self.path / _LEVEL / "c" / str(index) / "/".join("0" * len(self.frame_shape))
+
+    def _write_draft(self, index: int, image: Image) -> _Draft:
+        """Write a frame's bytes beside the place they belong to; not synced yet."""
+        planes = np.moveaxis(image, -1, 0) if self.is_colour else image
+        data = np.ascontiguousarray(planes, dtype=self.dtype.newbyteorder("<")).data.cast("B")
+        target = self.chunk_path(index)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path = target.with_name("part")
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        try:
+            written = 0
+            while written < len(data):
+                written += os.write(handle, data[written:])
+        except BaseException:
+            os.close(handle)
+            path.unlink(missing_ok=True)
+            raise
+        return _Draft(handle, path, StoredChunk(len(data), zlib.crc32(data)))
+
+
+def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[str, Any]:
+    return {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": shape,
+        "data_type": data_type,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [1, *shape[1:]]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": "NaN" if data_type == "float32" else 0,
+        "codecs": [
+            {"name": "bytes", **({} if data_type == "uint8" else {"configuration": {"endian": "little"}})}
+        ],
+        "dimension_names": axes,
+        "attributes": {},
+    }
+
+
+def _group_metadata(axes: list[str], pixel_pitch_um: float, name: str) -> dict[str, Any]:
+    kinds: dict[str, dict[str, str]] = {
+        "t": {"type": "time"},  # a plan's steps have no even spacing; a recording gets it at its end
+        "c": {"type": "channel"},
+        "y": {"type": "space", "unit": "micrometer"},
+        "x": {"type": "space", "unit": "micrometer"},
+    }
+    scales = {"t": 1.0, "c": 1.0, "y": pixel_pitch_um, "x": pixel_pitch_um}
+    multiscale = {
+        "name": name,
+        "axes": [{"name": axis, **kinds[axis]} for axis in axes],
+        "datasets": [
+            {
+                "path": _LEVEL,
+                "coordinateTransformations": [{"type": "scale", "scale": [scales[axis] for axis in axes]}],
+            }
+        ],
+    }
+    return {
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": {"ome": {"version": "0.5", "multiscales": [multiscale]}},
+    }

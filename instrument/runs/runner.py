@@ -1,0 +1,361 @@
+"""Carry out a plan on a bench, step by step, into a run.
+
+::
+
+    IDLE --execute--> RUNNING --pause--> PAUSED --resume--> RUNNING
+                         |                  |
+                         +-- last step, abort (between steps), stop (at once), error --> ENDING --> FINISHED
+
+On every way out of RUNNING and PAUSED the bench is made safe (light off, motion stopped, SLM blank if so
+configured) and the run's files are closed, in that order, each tried even when the one before failed.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from pathlib import Path
+
+from drivers.errors import StoppedError
+from instrument.bench.bench import Bench
+from instrument.bench.photograph import Snapshot
+from instrument.bench.safety import StepsFailedError
+from instrument.plan import Plan, Step
+from instrument.runs.finish import end_run
+from instrument.runs.layout import FinishReason
+from instrument.runs.run import Run
+from instrument.runs.step_settings import StepSettings
+from instrument.runs.writer import FrameToStore, RunWriter
+
+_STOP_REPEAT_S = 0.005
+_STOP_WAIT_S = 2.0
+
+
+class RunState(StrEnum):
+    """Where a runner is."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    PAUSED = "paused"
+    ENDING = "ending"
+    """The bench is being made safe and the files are being closed."""
+    FINISHED = "finished"
+
+
+@dataclass(frozen=True, slots=True)
+class RunStatus:
+    """A snapshot of a runner, for a progress bar or a window.
+
+    Attributes
+    ----------
+    done, total : int
+        Steps whose frames are on the disk, and steps of the plan.
+    step : Step or None
+        The step being done, or the last one.
+    done_here : int
+        Steps among ``done`` that this runner did: those of a run that goes on were done before.
+    seconds : float
+        Since the run was started or resumed.
+    seconds_left : float or None
+        Estimated from the steps done so far; None before the first.
+    dropped : int
+        Frames that the camera dropped during exposures of this run.
+    saturated_fraction : float
+        Of the newest frame.
+    reason : FinishReason or None
+        Why it ended, once it has.
+    newest : Snapshot or None
+        The photograph that was stored last.
+    """
+
+    state: RunState
+    done: int
+    total: int
+    done_here: int = 0
+    step: Step | None = None
+    seconds: float = 0.0
+    seconds_left: float | None = None
+    dropped: int = 0
+    saturated_fraction: float = 0.0
+    reason: FinishReason | None = None
+    newest: Snapshot | None = field(default=None, compare=False, repr=False)
+
+
+Progress = Callable[[RunStatus], None]
+FrameWatch = Callable[[Step, Snapshot], bool]
+"""Sees each step's photograph once it is stored; returns whether it touched the bench."""
+
+
+class _EndedEarlyError(Exception):
+    """Carries the reason out of the step loop."""
+
+    def __init__(self, reason: FinishReason) -> None:
+        self.reason = reason
+
+
+class Runner:
+    """Does a plan's steps and stores one frame for each.
+
+    ``execute`` blocks in the thread that calls it; ``pause``, ``resume``, ``abort``, ``stop`` and ``status``
+    may be called from any thread.
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    plan : Plan
+    writer : RunWriter
+        The run; the runner finishes and closes it.
+    todo : sequence of int, optional
+        Indices of the steps to do, in order; None means all.
+    start : Step, optional
+        The bench's state before the first step, for a run that is continued: what the plan leaves as it is
+        then is as it was.
+    on_progress : callable, optional
+        Called with the status after every step and change of state, in the thread that executes.
+    on_frame : callable, optional
+        Called with each step and its photograph once that is stored, in the thread that executes, before the
+        next step begins. It may use the bench, and then returns True: the next step sets everything anew.
+        What it raises ends the run as failed.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        plan: Plan,
+        writer: RunWriter,
+        *,
+        todo: Sequence[int] | None = None,
+        start: Step | None = None,
+        on_progress: Progress | None = None,
+        on_frame: FrameWatch | None = None,
+    ) -> None:
+        self._bench = bench
+        self._plan = plan
+        self._writer = writer
+        self._start = start
+        self._todo = frozenset(range(len(plan)) if todo is None else todo)
+        self.on_progress = on_progress
+        self.on_frame = on_frame
+        self._settings = StepSettings(bench)
+        self._condition = threading.Condition()
+        self._pausing = False
+        self._aborting = False
+        self._stopping = threading.Event()
+        self._finished = threading.Event()
+        self._status = RunStatus(RunState.IDLE, len(plan) - len(self._todo), len(plan))
+        self._started_s = 0.0
+        self._thread: threading.Thread | None = None
+
+    # From any thread -----------------------------------------------------------------------------
+    @property
+    def status(self) -> RunStatus:
+        """Where the run is now."""
+        with self._condition:
+            return self._status
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self._writer.path
+
+    @property
+    def is_pausing(self) -> bool:
+        """Whether the run is paused, or will be before its next step."""
+        with self._condition:
+            return self._pausing
+
+    def pause(self) -> None:
+        """Wait before the next step, light off, until ``resume``."""
+        with self._condition:
+            self._pausing = True
+            self._condition.notify_all()
+
+    def resume(self) -> None:
+        """Go on after ``pause``."""
+        with self._condition:
+            self._pausing = False
+            self._condition.notify_all()
+
+    def abort(self) -> None:
+        """End before the next step."""
+        with self._condition:
+            self._aborting = True
+            self._condition.notify_all()
+
+    def stop(self) -> None:
+        """End at once: light off and motion stopped when this returns, whatever was going on.
+
+        Raises
+        ------
+        StepsFailedError
+            When a device could not be made safe; all were tried.
+        """
+        self._stopping.set()
+        with self._condition:
+            self._condition.notify_all()
+        failure: StepsFailedError | None = None
+        deadline_s = time.monotonic() + _STOP_WAIT_S
+        # Once is not enough: the executing thread may have been about to start a move or an exposure.
+        while True:
+            if self.status.state is not RunState.ENDING:
+                try:
+                    self._bench.stop()
+                except StepsFailedError as error:
+                    failure = error
+            executes_here = self._thread in (None, threading.current_thread())
+            if executes_here or self._finished.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
+                break
+        if failure is not None:
+            raise failure
+
+    # In one thread -------------------------------------------------------------------------------
+    def execute(self) -> Run:
+        """Do the steps; returns the finished run, whose ``reason`` says how it ended.
+
+        Raises
+        ------
+        DeviceError, BenchError
+            What made the run fail; it was marked as failed, and the bench made safe. A note says where the
+            run is.
+        KeyboardInterrupt, SystemExit
+            After the run was marked as aborted and the bench made safe.
+        """
+        if self._thread is not None:
+            raise RuntimeError("A runner executes its plan once; make a new one (or resume the run).")
+        self._thread = threading.current_thread()
+        self._started_s = time.monotonic()
+        self._report(state=RunState.RUNNING)
+        try:
+            self._writer.start(steps=len(self._todo))
+            self._do_steps()
+        except _EndedEarlyError as early:
+            run = self._end(early.reason)
+        except StoppedError as error:
+            if not self._stopping.is_set():
+                self._end(FinishReason.FAILED, error)
+                raise
+            run = self._end(FinishReason.STOPPED)
+        except Exception as error:
+            self._end(FinishReason.STOPPED if self._stopping.is_set() else FinishReason.FAILED, error)
+            raise
+        except BaseException as error:
+            self._end(FinishReason.ABORTED, error)
+            raise
+        else:
+            run = self._end(FinishReason.COMPLETED)
+        finally:
+            if not self._finished.is_set():  # a second Ctrl-C came before the ending had begun
+                self._end(FinishReason.ABORTED, sys.exception())
+        return run
+
+    def _do_steps(self) -> None:
+        part, part_started_s = -1, 0.0
+        for step in self._plan.whole_steps(self._start):
+            if step.index not in self._todo:
+                continue
+            self._between_steps()
+            if step.part != part:
+                part, part_started_s = step.part, time.monotonic() - step.start_after_s
+            self._wait_until(part_started_s + step.start_after_s)
+            self._report(step=step)
+            snapshot = self._take(step)
+            self._writer.write(
+                [FrameToStore(step.index, snapshot.image, snapshot.metadata, snapshot.average)]
+            )
+            self._report_stored(snapshot)
+            if self.on_frame is not None and self.on_frame(step, snapshot):
+                self._settings = StepSettings(self._bench)
+
+    def _take(self, step: Step) -> Snapshot:
+        for setting in self._settings.actions(step):
+            self._raise_if_stopping()
+            setting()
+        self._raise_if_stopping()
+        snapshot = self._bench.snap(step.average)
+        self._raise_if_stopping()  # the light may have gone out during the exposure
+        return snapshot
+
+    def _between_steps(self) -> None:
+        with self._condition:
+            paused = self._pausing
+        if paused and not self._aborting and not self._stopping.is_set():
+            self._settings.darken()
+            self._writer.note("paused")
+            self._report(state=RunState.PAUSED)
+            with self._condition:
+                self._condition.wait_for(
+                    lambda: not self._pausing or self._aborting or self._stopping.is_set()
+                )
+            self._writer.note("resumed")
+            self._report(state=RunState.RUNNING)
+        self._raise_if_stopping()
+        if self._aborting:
+            raise _EndedEarlyError(FinishReason.ABORTED)
+
+    def _wait_until(self, when_s: float) -> None:
+        while (left_s := when_s - time.monotonic()) > 0:
+            self._settings.darken()
+            with self._condition:
+                self._condition.wait_for(
+                    lambda: self._pausing or self._aborting or self._stopping.is_set(), left_s
+                )
+            self._between_steps()
+
+    def _raise_if_stopping(self) -> None:
+        if self._stopping.is_set():
+            raise _EndedEarlyError(FinishReason.STOPPED)
+
+    # The way out ---------------------------------------------------------------------------------
+    def _end(self, reason: FinishReason, error: BaseException | None = None) -> Run:
+        """Make the bench safe, then finish the run; a failure here never hides ``error``."""
+        interruption = self._last_report(state=RunState.ENDING)
+        try:
+            run = end_run(self._bench, self._writer, reason, error)
+        finally:
+            self._finished.set()
+            interruption = self._last_report(state=RunState.FINISHED, reason=reason) or interruption
+        if error is not None:
+            error.add_note(
+                f"{len(run.records)} of {run.n_frames} frames are kept. For the others: "
+                f"diffuserbench resume {run.path}"
+            )
+        if interruption is not None and error is None:
+            raise interruption
+        return run
+
+    def _last_report(self, **changes: object) -> BaseException | None:
+        """Report; a listener that raises cannot keep the run from its end. Returns its interruption."""
+        try:
+            self._report(**changes)
+        except Exception:  # noqa: BLE001 - a listener's failure is not the run's
+            return None
+        except BaseException as interruption:  # noqa: BLE001 - e.g. a listener that passes Ctrl-C on
+            return interruption
+        return None
+
+    # Status --------------------------------------------------------------------------------------
+    def _report_stored(self, snapshot: Snapshot) -> None:
+        now = self.status
+        done_here = now.done_here + 1
+        seconds = time.monotonic() - self._started_s
+        self._report(
+            done=now.done + 1,
+            done_here=done_here,
+            seconds=seconds,
+            seconds_left=seconds / done_here * (len(self._todo) - done_here),
+            dropped=now.dropped + snapshot.metadata.dropped_before,
+            saturated_fraction=snapshot.metadata.saturated_fraction,
+            newest=snapshot,
+        )
+
+    def _report(self, **changes: object) -> None:
+        with self._condition:
+            self._status = replace(self._status, **changes)  # type: ignore[arg-type]
+            status = self._status
+        if self.on_progress is not None:
+            self.on_progress(status)

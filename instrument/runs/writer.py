@@ -1,0 +1,294 @@
+"""Writing a run: the one owner of a run folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.frame import FrameMetadata
+from instrument.files.atomic import sync_folder, write_bytes
+from instrument.plan import Plan
+from instrument.runs.durable import AppendOnlyLog, write_json
+from instrument.runs.folder import dated_name, disk_remedy, free_name, lock_run, plan_with_copies
+from instrument.runs.frame_array import FrameArray
+from instrument.runs.frame_record import FrameRecord, Gap
+from instrument.runs.layout import (
+    BENCH,
+    BENCH_TOML,
+    FORMAT,
+    FRAMES,
+    LOCK,
+    LOG,
+    PLAN,
+    PROVENANCE,
+    STATE,
+    FinishReason,
+)
+from instrument.runs.provenance import provenance
+from instrument.runs.run import Run, RunError
+
+_FIRST_CAPACITY = 256
+"""Frames that a recording's array is made for at first; it doubles as needed."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameToStore:
+    """A frame on its way to the disk."""
+
+    index: int
+    image: npt.NDArray[Any]
+    metadata: FrameMetadata
+    average: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRecord:
+    """What a run keeps about its bench.
+
+    ``config`` is everything as used, ``toml`` the text of the file; ``devices`` who each device says it is;
+    ``camera`` the camera's settings and ``stage`` the stage's position when the run was made.
+    """
+
+    config: Mapping[str, Any]
+    toml: str
+    devices: Mapping[str, str]
+    simulated: bool
+    pixel_pitch_um: float
+    camera: Mapping[str, Any]
+    stage: Mapping[str, float]
+
+
+class RunWriter:
+    """A run folder open for writing, locked against a second writer.
+
+    :meth:`create` or :meth:`reopen` one, :meth:`write` frames, :meth:`finish`. A frame for which ``write``
+    has returned is on the disk with its metadata, and survives ``kill -9`` and a power cut.
+    """
+
+    def __init__(self, path: Path, lock: int) -> None:
+        self.path = path
+        self._lock = lock
+        try:
+            run = Run.open(path)
+            self._state = dict(run.state)
+            self._is_recording = run.plan is None
+            self._n_frames = len(run.plan) if run.plan is not None else 0
+            self._float = run.plan is not None and run.plan.averages
+            self._pixel_pitch_um = float(run.provenance["pixel_pitch_um"])
+            self._array: FrameArray | None = run.array if run.has_frames else None
+            self._log = AppendOnlyLog(path / LOG)
+        except BaseException:
+            os.close(lock)
+            raise
+
+    @classmethod
+    def create(
+        cls,
+        parent: Path | str,
+        *,
+        label: str,
+        bench: BenchRecord,
+        plan: Plan | None = None,
+        calibrations: Sequence[str] = (),
+    ) -> RunWriter:
+        """Make a new run folder in ``parent``, named by date, time and label.
+
+        The folder appears under its name only when it is whole.
+
+        Raises
+        ------
+        RunError
+            When the folder cannot be written to.
+        """
+        parent = Path(parent)
+        now = datetime.now(UTC)
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            path = free_name(parent, dated_name(label))
+            draft = parent / f".{path.name}.draft"
+            draft.mkdir()
+            try:
+                if plan is not None:
+                    write_bytes(draft / PLAN, plan_with_copies(plan, draft).to_json().encode())
+                write_json(draft / BENCH, bench.config)
+                write_bytes(draft / BENCH_TOML, bench.toml.encode())
+                origin = {
+                    **provenance(),
+                    "simulated": bench.simulated,
+                    "devices": dict(bench.devices),
+                    "pixel_pitch_um": bench.pixel_pitch_um,
+                    "camera": dict(bench.camera),
+                    "stage": dict(bench.stage),
+                    "calibrations": list(calibrations),
+                }
+                write_json(draft / PROVENANCE, origin)
+                state = {
+                    "format": FORMAT,
+                    "label": label,
+                    "simulated": bench.simulated,
+                    "state": "running",
+                    "started_utc": now.isoformat(),
+                    "pid": os.getpid(),
+                }
+                write_json(draft / STATE, state)
+                write_bytes(draft / LOG, b"")
+                write_bytes(draft / LOCK, b"")
+                lock = lock_run(draft)
+                draft.rename(path)
+            except BaseException:
+                shutil.rmtree(draft, ignore_errors=True)
+                raise
+            sync_folder(parent)
+        except OSError as error:
+            raise RunError(
+                parent, f"no run can be kept there: {error.strerror}.", disk_remedy(error)
+            ) from error
+        return cls(path, lock)
+
+    @classmethod
+    def reopen(cls, path: Path | str) -> RunWriter:
+        """Open a run folder to continue it.
+
+        Raises
+        ------
+        RunError
+            When it is no run, or some program writes to it now.
+        """
+        path = Run.open(path).path
+        try:
+            writer = cls(path, lock_run(path))
+            for leftover in path.glob(".*"):  # of a write that a crash cut off
+                if leftover.is_file():
+                    leftover.unlink()
+        except OSError as error:
+            raise RunError(path, f"cannot be continued: {error.strerror}.", disk_remedy(error)) from error
+        return writer
+
+    def start(self, **fields: Any) -> None:
+        """Note that frames are coming, now or again; ``fields`` go into the log."""
+        self.note("started", **fields)
+        self._set_state(state="running", reason=None, error="", pid=os.getpid())
+
+    # Writing -------------------------------------------------------------------------------------
+    def write(self, frames: Sequence[FrameToStore]) -> None:
+        """Store frames with their metadata, and return once all of it is on the disk.
+
+        Raises
+        ------
+        RunError
+            When the disk is full or not writable, or a frame does not fit the run. What was on the disk
+            before stays.
+        """
+        if not frames:
+            return
+        try:
+            array = self._array or self._make_array(frames)
+            if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
+                array.resize(max(last + 1, 2 * array.n_frames))
+            images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
+            stored = array.write(images)
+            self._log.append(
+                FrameRecord(frame.index, chunk.n_bytes, chunk.crc32, frame.average, frame.metadata).to_json()
+                for frame, chunk in zip(frames, stored, strict=True)
+            )
+        except OSError as error:
+            first = frames[0].index
+            raise RunError(
+                self.path, f"frame {first} could not be stored: {error.strerror}.", disk_remedy(error)
+            ) from error
+        except ValueError as error:
+            raise RunError(self.path, f"does not take a frame: {error}") from error
+
+    def note(self, kind: str, **fields: Any) -> None:
+        """Append an event to the log; ``utc`` is added."""
+        self._append({"kind": kind, "utc": datetime.now(UTC).isoformat(), **fields})
+
+    def gap(self, gap: Gap) -> None:
+        """Append a gap of a recording to the log."""
+        self._append(gap.to_json())
+
+    def trim(self) -> None:
+        """Give a recording's array the length and the frame period that the log tells."""
+        run = Run.open(self.path)
+        if self._array is None or run.plan is not None:
+            return
+        self._array.resize(run.n_frames, frame_period_s=run.frame_period_s)
+
+    def finish(self, reason: FinishReason, error: str = "") -> Run:
+        """Say how the run ended, close its files, and return it for reading."""
+        try:
+            self.trim()
+            self.note("finished", reason=reason.value, error=error)
+            self._set_state(
+                state="finished",
+                reason=reason.value,
+                error=error,
+                finished_utc=datetime.now(UTC).isoformat(),
+            )
+        except OSError as failure:
+            raise RunError(
+                self.path, f"its array could not be trimmed: {failure.strerror}.", disk_remedy(failure)
+            ) from failure
+        finally:
+            self.close()
+        return Run.open(self.path)
+
+    def close(self) -> None:
+        """Close the run's files and release its lock, without finishing it; closing twice does nothing."""
+        self._log.close()
+        if self._array is not None:
+            self._array.close()
+        if self._lock >= 0:
+            lock, self._lock = self._lock, -1
+            os.close(lock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Inside --------------------------------------------------------------------------------------
+    def _make_array(self, frames: Sequence[FrameToStore]) -> FrameArray:
+        first = frames[0]
+        n_frames = max(_FIRST_CAPACITY, frames[-1].index + 1) if self._is_recording else self._n_frames
+        self._array = FrameArray.create(
+            self.path / FRAMES,
+            n_frames=n_frames,
+            frame_shape=first.image.shape,
+            dtype=np.float32 if self._float else first.image.dtype,
+            pixel_pitch_um=self._pixel_pitch_um,
+            name=str(self._state["label"]),
+        )
+        return self._array
+
+    def _append(self, record: Mapping[str, Any]) -> None:
+        try:
+            self._log.append([record])
+        except OSError as error:
+            raise RunError(
+                self.path, f"its log could not be written: {error.strerror}.", disk_remedy(error)
+            ) from error
+
+    def _set_state(self, **changes: Any) -> None:
+        try:
+            write_json(self.path / STATE, self._state | changes)
+        except OSError as error:
+            raise RunError(
+                self.path, f"its state could not be written: {error.strerror}.", disk_remedy(error)
+            ) from error
+        self._state.update(changes)

@@ -1,0 +1,198 @@
+"""The one place for FFTs: real transforms over the last axes into preallocated arrays.
+
+Transforms keep the precision of their input (float32 to complex64, float64 to complex128) and use the number
+of threads set in :mod:`recon.base.threads`. Backend: rocket-fft, ducc0's BSD-licensed FFT inside numba, which
+unlike ``scipy.fft`` writes into arrays that the caller owns (twice as fast on large arrays, where fresh
+memory costs as much as the transform).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.threads import get_threads, in_blocks, set_threads
+
+__all__ = [
+    "complex_dtype",
+    "dct",
+    "ensure_compiled",
+    "fast_length",
+    "fast_shape",
+    "get_threads",
+    "idct",
+    "irfft",
+    "irfft_strip",
+    "multiply",
+    "rfft",
+    "rfft_strip",
+    "set_threads",
+    "spectrum_shape",
+]
+
+RealArray = npt.NDArray[Any]
+ComplexArray = npt.NDArray[Any]
+
+
+@cache
+def fast_length(length: int, *, real: bool = False) -> int:
+    """Return the smallest length of at least ``length`` that transforms fast.
+
+    ``real``: for the last axis of a real transform. It is even then as well, so that the half spectrum has a
+    Nyquist element of its own.
+    """
+    from scipy.fft import next_fast_len
+
+    n = int(next_fast_len(length, real))
+    while real and n % 2:
+        n = int(next_fast_len(n + 1, real))
+    return n
+
+
+def fast_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    """Return the smallest fast shape of at least ``shape`` for a real transform over all its axes."""
+    return (*(fast_length(n) for n in shape[:-1]), fast_length(shape[-1], real=True))
+
+
+def spectrum_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    """Return the shape of the half spectrum of a real array of ``shape``."""
+    return (*shape[:-1], shape[-1] // 2 + 1)
+
+
+def complex_dtype(dtype: npt.DTypeLike) -> np.dtype[Any]:
+    """Return the complex dtype of the same precision."""
+    return np.result_type(dtype, np.complex64)
+
+
+def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> ComplexArray:
+    """Forward real transform over the last ``axes`` axes.
+
+    Parameters
+    ----------
+    x : ndarray, float32 or float64
+    axes : int
+        Number of trailing axes to transform.
+    out : ndarray, optional
+        C-contiguous complex array of ``spectrum_shape(x.shape)`` and equal precision to write into.
+
+    Returns
+    -------
+    ndarray
+        Half spectrum, not scaled (as ``scipy.fft.rfftn``).
+    """
+    x = np.ascontiguousarray(x)
+    if out is None:
+        out = np.empty(spectrum_shape(x.shape), complex_dtype(x.dtype))
+    _check(out, spectrum_shape(x.shape), complex_dtype(x.dtype))
+    _kernels().forward(_batched(x, axes), _batched(out, axes), _axes(axes), get_threads())
+    return out
+
+
+def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = None) -> RealArray:
+    """Inverse of :func:`rfft`, scaled by the reciprocal number of elements.
+
+    Parameters
+    ----------
+    X : ndarray, complex64 or complex128
+        Half spectrum. Its contents are overwritten.
+    last : int
+        Length of the result's last axis.
+    axes : int
+        Number of trailing axes to transform.
+    out : ndarray, optional
+        C-contiguous real array of equal precision to write into.
+    """
+    if not X.flags.c_contiguous:
+        raise ValueError("The spectrum must be C-contiguous: it is transformed in place.")
+    shape = (*X.shape[:-1], last)
+    dtype = X.real.dtype
+    if out is None:
+        out = np.empty(shape, dtype)
+    _check(out, shape, dtype)
+    scale = 1.0 / float(np.prod(shape[-axes:], dtype=float))
+    _kernels().inverse(_batched(X, axes), _batched(out, axes), _axes(axes), scale, get_threads())
+    return out
+
+
+def rfft_strip(x: RealArray, start: int, out: ComplexArray) -> ComplexArray:
+    """Forward transform of images that are zero but for a strip of rows, a quarter cheaper when half are.
+
+    Parameters
+    ----------
+    x : ndarray, (n, rows, width)
+        The rows that are not zero.
+    start : int
+        Place of the first of them.
+    out : ndarray, complex, (n, height, width // 2 + 1)
+    """
+    _kernels().forward_strip(np.ascontiguousarray(x), out, start, get_threads())
+    return out
+
+
+def irfft_strip(X: ComplexArray, start: int, out: RealArray) -> RealArray:
+    """Rows ``start`` to ``start + rows`` of the inverse transform, into ``out`` (n, rows, width).
+
+    ``X`` (n, height, width // 2 + 1) is overwritten.
+    """
+    scale = 1.0 / (float(X.shape[1]) * out.shape[2])
+    _kernels().inverse_strip(X, out, start, scale, get_threads())
+    return out
+
+
+def multiply(X: ComplexArray, H: ComplexArray, *, conjugate: bool = False) -> None:
+    """Multiply ``X`` (n, height, width) in place by ``H`` (n or 1, height, width) or its conjugate."""
+    kernel = _kernels().multiply
+    in_blocks(lambda a, b: kernel(X, H, conjugate, a, b), X.shape[0] * X.shape[1], grain=64)
+
+
+@cache
+def ensure_compiled(dtype: np.dtype[Any]) -> None:
+    """Transform a few numbers of a precision in every way, so that no later call waits for the compiler."""
+    x = np.ones((1, 2, 2), dtype)
+    X = rfft(x)
+    multiply(X, X)
+    irfft(X, 2)
+    irfft_strip(rfft_strip(x, 0, X), 0, x)
+
+
+def dct(x: RealArray, out: RealArray) -> RealArray:
+    """Orthonormal cosine transform (type 2) of an image (height, width), written into ``out``."""
+    return _cosine(x, out, 2)
+
+
+def idct(X: RealArray, out: RealArray) -> RealArray:
+    """Inverse of :func:`dct`."""
+    return _cosine(X, out, 3)
+
+
+def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
+    _check(out, x.shape, x.dtype)
+    _kernels().cosine(x, out, np.array([0, 1]), kind, 0.5 / float(np.sqrt(x.size)), get_threads())
+    return out
+
+
+def _check(out: npt.NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
+        raise ValueError(f"out must be C-contiguous {dtype} {shape}, not {out.dtype} {out.shape}.")
+
+
+def _batched(x: npt.NDArray[Any], axes: int) -> npt.NDArray[Any]:
+    """View as (batch, *transformed axes), so that few numba specialisations serve all shapes."""
+    return x.reshape(-1, *x.shape[x.ndim - axes :])
+
+
+@cache
+def _axes(axes: int) -> npt.NDArray[np.int64]:
+    return np.arange(1, axes + 1)
+
+
+@cache
+def _kernels() -> Any:
+    """Import numba on first use: it costs half a second that most commands need not pay."""
+    from recon.base import _fft_kernels
+
+    return _fft_kernels

@@ -1,0 +1,1 @@
+"""Cameras as operators, and which camera a calibration gives."""

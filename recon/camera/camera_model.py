@@ -1,0 +1,196 @@
+"""Which camera model a calibration asks for, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.checks import select_psf
+from recon.camera.field_registration import shown
+from recon.camera.local_convolution import FieldOfPsfs
+from recon.camera.low_rank import principal_psfs
+from recon.camera.registration import moved
+from recon.camera.registration_cache import remembered_field
+from recon.errors import InputError
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+ModelName = Literal["auto", "convolution", "local", "lowrank"]
+MODELS: tuple[ModelName, ...] = ("auto", "convolution", "local", "lowrank")
+
+TOLERATED = 0.05
+"""Relative PSF error over the field below which one PSF a depth will do."""
+SAME_DEPTH = 1e-3
+"""Sources whose z differ by no more, relatively, were calibrated at one depth."""
+SAME_PLACE_UM = 1.0
+"""Sources nearer to one another in x and y were calibrated at one place."""
+LOW_RANK_ERROR = 0.03
+"""Relative PSF error that the low-rank model is built to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """How much of the PSFs and of the field a reconstruction models.
+
+    Attributes
+    ----------
+    psf_window : (int, int) or None
+        Height and width of the central part of the PSFs; None: all of them.
+    acceptance_px : float or None
+        Only object pixels this near to the axis are modelled, where PSFs vary over the field; None: all.
+    left_out : Calibration or None
+        PSFs of depths that are not modelled: what is left of the data is searched for light from there.
+    """
+
+    psf_window: tuple[int, int] | None = None
+    acceptance_px: float | None = None
+    left_out: Calibration | None = None
+
+
+@dataclass(frozen=True)
+class Depths:
+    """A calibration sorted by depth.
+
+    Attributes
+    ----------
+    z_um : ndarray, (n_z,)
+        Nearest last or first as the calibration has it; NaN where not known.
+    central : ndarray, float32, (n_z, n_channels, height, width)
+        The PSF nearest to the axis at each depth; where none is near, what the others show of it.
+    fields : list of FieldOfPsfs
+        All PSFs of each depth, registered to the central one.
+    warnings : tuple of str
+        Which PSFs could not be registered by their images, and were by their sources' places; depths
+        without one near the axis.
+    """
+
+    z_um: npt.NDArray[np.float64]
+    central: npt.NDArray[np.float32]
+    fields: list[FieldOfPsfs]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def varies(self) -> bool:
+        """Whether any depth was calibrated at more than one place."""
+        return any(len(f.points) > 1 for f in self.fields)
+
+    @cached_property
+    def field_error(self) -> float:
+        """Root mean square difference of the registered PSFs from the central one, relative to it."""
+        differences = norms = 0.0
+        for central, field in zip(self.central, self.fields, strict=True):
+            for psf, (rows, columns) in zip(field.psfs, field.points, strict=True):
+                # There and back between pixels as the registered one came, so that interpolation is no error.
+                seen = moved(moved(central, rows, columns), -rows, -columns)
+                there = shown(psf.shape[1:], rows, columns)
+                differences += float(np.sum((psf - seen)[:, there].astype(np.float64) ** 2))
+                norms += float(np.sum(seen[:, there].astype(np.float64) ** 2))
+        return float(np.sqrt(differences / norms)) if norms > 0 else 0.0
+
+    def within(self, window: tuple[int, int]) -> Depths:
+        """Return the depths with PSFs cut to a central window (height, width)."""
+        cut = tuple(
+            slice(n // 2 - m // 2, n // 2 - m // 2 + m)
+            for n, m in zip(self.central.shape[2:], window, strict=True)
+        )
+        fields = [FieldOfPsfs(f.psfs[..., cut[0], cut[1]], f.points) for f in self.fields]
+        return replace(self, central=self.central[..., cut[0], cut[1]], fields=fields)
+
+    def divided(self, gains: npt.NDArray[np.float32]) -> Depths:
+        """Return the depths with every depth's PSFs divided by a number, (n_z,)."""
+        if (gains == 1).all():
+            return self
+        fields = [FieldOfPsfs(f.psfs / g, f.points) for f, g in zip(self.fields, gains, strict=True)]
+        return replace(self, central=self.central / gains[:, None, None, None], fields=fields)
+
+
+def sort_by_depth(calibration: Calibration) -> Depths:
+    """Group a calibration's PSFs by depth and register those of a depth to its central one.
+
+    PSFs whose depths are not known are taken for one depth each, in their order; those of one depth may
+    differ by ``SAME_DEPTH`` (see :func:`members_of_depths`).
+    """
+    psfs, positions = calibration.psfs, calibration.source_positions_um
+    if len(psfs) == 0:
+        raise InputError("The calibration holds no PSF: a volume needs at least one depth.")
+    members = members_of_depths(positions)
+    z_um = np.array([float(np.mean(positions[group, 2])) for group in members])
+    central, fields, warnings = [], [], []
+    for group in members:
+        on_axis, field, trouble = remembered_field(calibration, group)
+        central.append(on_axis)
+        fields.append(field)
+        warnings += trouble
+    return Depths(z_um, np.stack(central), fields, tuple(dict.fromkeys(warnings)))
+
+
+def members_of_depths(positions_um: npt.NDArray[np.float64]) -> list[npt.NDArray[np.intp]]:
+    """Group sources (n, 3) by depth: index arrays, in the order in which the depths first appear.
+
+    A stage does not come back to exactly the same z. Sources belong to one depth when they lie within
+    ``SAME_DEPTH`` of the group's least z, relative to it, each at another place of the field: two at the same
+    place were meant as two depths, however fine the steps.
+    """
+    z = positions_um[:, 2]
+    if not np.isfinite(z).all():
+        return [np.array([k]) for k in range(len(z))]
+    groups: list[list[int]] = []
+    for k in np.argsort(z, kind="stable"):
+        group = groups[-1] if groups else []
+        if group and z[k] - z[group[0]] <= SAME_DEPTH * abs(z[group[0]]):
+            apart = np.abs(positions_um[group, :2] - positions_um[k, :2]).max(axis=1)
+            # NaN stands for a place that is not known: not certainly another one.
+            if (apart > SAME_PLACE_UM).all():
+                group.append(int(k))
+                continue
+        groups.append([int(k)])
+    return [np.sort(np.array(g)) for g in sorted(groups, key=min)]
+
+
+def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
+    """Return the part of a calibration at the depth nearest to ``z_um`` (in 1/z, as PSFs change).
+
+    Raises
+    ------
+    InputError
+        When there are several depths and none is asked for, or they are not known.
+    """
+    groups = members_of_depths(calibration.source_positions_um)
+    if len(groups) > 1:
+        _, chosen = select_psf(calibration, z_um)
+        z = calibration.source_positions_um[:, 2]
+        groups = [g for g in groups if chosen in z[g]]
+    group = groups[0]
+    return replace(
+        calibration,
+        psfs=calibration.psfs[group],
+        source_positions_um=calibration.source_positions_um[group],
+    )
+
+
+def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
+    """Return the model to use and the reason in words, without comparing what the models cost."""
+    if wanted not in MODELS:
+        raise InputError(f"The model {wanted!r} is not known. Choose one of {', '.join(MODELS)}.")
+    if wanted in ("local", "lowrank") and not depths.varies:
+        raise InputError(
+            f"The {wanted} model needs PSFs from several places of the field; this calibration has one "
+            "a depth. Calibrate on a grid, or use the convolution model."
+        )
+    if wanted != "auto":
+        return wanted, "as asked"
+    if not depths.varies:
+        return "convolution", "one PSF a depth was calibrated"
+    error = depths.field_error
+    if error <= TOLERATED:
+        return "convolution", f"PSFs differ by {error:.1%} over the field, no more than {TOLERATED:.0%}"
+    densest = max(depths.fields, key=lambda f: len(f.points))
+    rank = len(principal_psfs(densest, error=LOW_RANK_ERROR).components)
+    # A whole-frame convolution costs about as much as all cells of the local model together.
+    if rank <= 3 and rank < len(densest.points):
+        return "lowrank", f"PSFs differ by {error:.1%} over the field; {rank} components tell all but 3 %"
+    return "local", f"PSFs differ by {error:.1%} over the field, and it would take {rank} components"

@@ -1,0 +1,1 @@
+"""Scenes with known truth, charts of error against cost, stability maps."""

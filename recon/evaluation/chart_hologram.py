@@ -1,0 +1,228 @@
+"""Time against quality of holograms: every expansion, loss, method and number of frames for one picture.
+
+A run is scored at several counts of iterations on the way, with the time that the optimiser had spent by
+then. The score is of what an eye would see (low-passed, on the alias-free grid, all frames together),
+whatever was optimised; expansions do not compete with each other, for each shows another field of view.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.holography.display import Display
+from recon.holography.judge import compare
+from recon.holography.mask import random_mask
+from recon.holography.model import HologramModel
+from recon.holography.optimise import Budget, HologramRecord, HologramStop, Method, compute_hologram
+from recon.holography.target import Loss, LossKind, Target, foveal_weights
+
+Array = npt.NDArray[Any]
+
+COUNTS = (1, 3, 5, 10, 20, 40, 80, 160)
+"""Iterations at which a run is scored."""
+LOSSES: tuple[LossKind, ...] = ("none", "frequency", "spatial")
+
+
+@dataclass(frozen=True, slots=True)
+class HologramSetting:
+    """One way to compute a hologram.
+
+    Attributes
+    ----------
+    expansion : int
+        Étendue expansion q.
+    method : str
+        As :func:`recon.holography.compute_hologram`.
+    loss : str
+        The one-step method has none; ``"frequency"`` stands for that.
+    frames : int
+        Shown one after the other.
+    """
+
+    expansion: int
+    method: Method = "lbfgs"
+    loss: LossKind = "frequency"
+    frames: int = 1
+
+    @property
+    def family(self) -> str:
+        """Loss and method."""
+        if self.method == "one_step":
+            return "one-step"
+        loss = "no constraint" if self.loss == "none" else f"{self.loss} loss"
+        return f"{loss}, Nesterov" if self.method == "nesterov" else loss
+
+    @property
+    def name(self) -> str:
+        """Say it briefly."""
+        frames = "" if self.frames == 1 else f", {self.frames} frames"
+        return f"{self.expansion}x {self.family}{frames}"
+
+    @property
+    def group(self) -> str:
+        """Settings of one expansion compete."""
+        return f"{self.expansion}x"
+
+
+@dataclass(frozen=True)
+class HologramProblem:
+    """A picture and the displays that shall show it.
+
+    Attributes
+    ----------
+    displays : tuple of Display
+        One an expansion.
+    targets : tuple of tuple of Target
+        For each display, one a plane.
+    frames : tuple of int
+    weights : ndarray
+        Of the spatial loss.
+    seed : int
+        Of the random start.
+    """
+
+    displays: tuple[Display, ...]
+    targets: tuple[tuple[Target, ...], ...]
+    frames: tuple[int, ...] = (1, 2, 3)
+    weights: Array = field(default_factory=lambda: foveal_weights((256, 256)))
+    seed: int = 0
+    kind: KindName = "hologram"
+
+    def __post_init__(self) -> None:
+        factors = [d.expansion for d in self.displays]
+        if len(set(factors)) != len(factors) or len(self.targets) != len(factors) or not factors:
+            raise InputError("A chart of holograms needs displays of different expansions, with targets.")
+
+    @property
+    def pixels(self) -> tuple[int, ...]:
+        """Of the SLM."""
+        return self.displays[0].slm_shape
+
+    def settings(self) -> tuple[HologramSetting, ...]:
+        """Return every setting, the quick ones first."""
+        found: list[HologramSetting] = []
+        for display in self.displays:
+            q = display.expansion
+            for frames in self.frames:
+                found.append(HologramSetting(q, "one_step", "frequency", frames))
+                found += [HologramSetting(q, "lbfgs", loss, frames) for loss in LOSSES]
+            found += [HologramSetting(q, "nesterov", loss) for loss in LOSSES]
+        return tuple(sorted(found, key=_cost))
+
+    def run(
+        self,
+        setting: HologramSetting,
+        *,
+        limit_s: float | None = None,
+        aside: Aside = nothing_aside,
+        counts: Sequence[int] = COUNTS,
+    ) -> Curve:
+        """Compute one hologram and score it on the way.
+
+        Raises
+        ------
+        InputError
+            When the setting does not apply to the problem.
+        """
+        if setting not in self.settings():
+            raise InputError(f"The setting '{setting.name}' does not apply to this problem.")
+        place = [d.expansion for d in self.displays].index(setting.expansion)
+        display, targets = self.displays[place], self.targets[place]
+        loss = Loss(setting.loss, self.weights if setting.loss == "spatial" else None)
+        model = HologramModel(display, targets, loss, frames=setting.frames)
+        points: list[Point] = []
+        # The optimiser's clock starts after its first evaluation; here all of its time counts.
+        first_s = 0.0
+        if setting.method != "one_step":
+            slm = np.ones((setting.frames, *display.slm_shape), model.dtype)
+            began = time.perf_counter()
+            model.evaluate(slm)
+            first_s = time.perf_counter() - began
+
+        def score(record: HologramRecord, slm: Array) -> None:
+            with aside():
+                points.append(_point(setting, model, replace(record, seconds=first_s + record.seconds), slm))
+
+        def note(record: HologramRecord, slm: Array) -> None:
+            if record.iteration in counts:
+                score(record, slm)
+
+        found = compute_hologram(
+            model,
+            method=setting.method,
+            budget=Budget(counts[-1], time_s=limit_s, tolerance=0.0),
+            seed=self.seed,
+            callback=note,
+        )
+        last = found.history[-1]
+        stuck = found.stop_reason is HologramStop.CONVERGED and last.iteration not in counts
+        if found.stop_reason is HologramStop.ONE_STEP or stuck:
+            score(last, found.slm)
+        return Curve(tuple(points), found.stop_reason is not HologramStop.TIME)
+
+    def warm_up(self, setting: HologramSetting) -> None:
+        """Compute a small hologram in two iterations."""
+        k = round(setting.expansion**0.5)
+        display = Display((16, 16), random_mask((16 * k, 16 * k)))
+        image = np.random.default_rng(0).random((64, 64))
+        HologramProblem((display,), ((Target(image),),), self.frames).run(setting, counts=(2,))
+
+    def fingerprint(self) -> str:
+        """Digest displays, targets and the rest."""
+        digest = hashlib.sha256(f"{self.frames} {self.seed}".encode())
+        for display, targets in zip(self.displays, self.targets, strict=True):
+            fixed = (display.slm_pitch_um, display.wavelength_nm, display.focal_mm, display.mask_fill)
+            digest.update(f"{display.slm_shape} {fixed} {display.dc}".encode())
+            digest.update(np.ascontiguousarray(display.mask.response(display.wavelength_nm)).tobytes())
+            digest.update(np.ascontiguousarray(display.mask.levels).tobytes())
+            if display.displacement is not None:
+                digest.update(np.ascontiguousarray(display.displacement).tobytes())
+            for target in targets:
+                digest.update(f"{target.z_mm} {target.white}".encode())
+                digest.update(np.ascontiguousarray(target.image).tobytes())
+        digest.update(np.ascontiguousarray(self.weights).tobytes())
+        return digest.hexdigest()[:16]
+
+
+def _cost(setting: HologramSetting) -> float:
+    """Rough order of time."""
+    method = {"one_step": 0.01, "lbfgs": 1.0, "nesterov": 1.2}[setting.method]
+    loss = {"frequency": 1.0, "none": 1.3, "spatial": 1.4}[setting.loss]
+    return method * loss * setting.frames * setting.expansion
+
+
+def _point(setting: HologramSetting, model: HologramModel, record: HologramRecord, slm: Array) -> Point:
+    """Score what is seen, the mean of all planes."""
+    planes = range(len(model.targets))
+    scores = [
+        compare(
+            np.asarray(model.seen(slm, p), float) / model.peaks[p],
+            np.asarray(model.wanted(p), float) / model.peaks[p],
+            1.0,
+        )
+        for p in planes
+    ]
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(s, name) for s in scores]))
+
+    return Point(
+        setting.name,
+        record.iteration,
+        record.seconds,
+        psnr_db=mean("psnr_db"),
+        ssim=mean("ssim"),
+        middle_psnr_db=mean("crop_psnr_db"),
+        middle_ssim=mean("crop_ssim"),
+        family=setting.family,
+        group=setting.group,
+    )

@@ -1,0 +1,191 @@
+"""Scores of a reconstruction: by its truth where there is one, and by pixels that were held out.
+
+5 % of the pixels are erased, reconstructed from the rest and predicted, in blocks of the coarsest binning, so
+that the error is of the same light and in the same units whatever a setting's binning is. What the prediction
+may be wrong in without the picture being so is taken out first, fitted to the pixels that were used: its
+brightness, and slow waves over the frame (a PSF's own background, stray light). With that the score ranks as
+the true error does far better: runs that are not bright yet, and models without a background, are no worse
+for it (docs/benchmarks/charts.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.camera.background import BackgroundRemoval
+from recon.camera.local_convolution import field_of
+from recon.evaluation.chart_settings import Setting, binnings_of
+from recon.evaluation.scene_score import score
+from recon.evaluation.scored import Point
+from recon.reconstruction.channel import BACKGROUND_FREQUENCIES, ChannelProblem
+from recon.reconstruction.preparation import channel_noise, data_of
+from recon.reconstruction.reduced import binned, blocks, enlarged, reduced_calibration
+from recon.reconstruction.volume import prepare_volume
+from recon.types import Calibration
+
+if TYPE_CHECKING:
+    from recon.evaluation.chart_reconstruction import ChartProblem
+
+Array = npt.NDArray[Any]
+
+HELD_SHARE = 0.05
+PARTS = 12
+"""Of the held-out pixels, scored apart: how much they differ tells how much the score scatters."""
+_PIXELS_A_WAVE = 4
+"""Blocks along an axis for each slow wave that is fitted, at least."""
+
+
+class Judge:
+    """Holds pixels out, and scores what was found from the rest."""
+
+    def __init__(self, problem: ChartProblem, setting: Setting, seed: int) -> None:
+        self.problem, self.setting = problem, setting
+        factor = setting.binning
+        shape = problem.measurement.shape
+        kept = np.ones(shape, bool) if problem.erasures is None else ~problem.erasures
+        # Blocks of the coarsest binning, on its grid, so that every setting predicts the same light.
+        binnings = binnings_of(problem)
+        block = binnings[-1]
+        self._together = block // factor
+        spans = [_common_blocks(n, binnings) for n in shape]
+        chosen = np.random.default_rng(seed).random([count for _, count in spans]) < HELD_SHARE
+        held = np.zeros(shape, bool)
+        held[tuple(slice(first, first + count * block) for first, count in spans)] = np.repeat(
+            np.repeat(chosen, block, 0), block, 1
+        )
+        self.measurement = binned(problem.measurement, factor)
+        self.calibration = reduced_calibration(problem.calibration, factor, None)
+        self.held = binned((held & kept).astype(np.float32), factor) > 0.5
+        self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
+        self.erasures = self.held | ~self.kept
+        data, valid, _ = data_of(problem.measurement, None, None if kept.all() else ~kept)
+        pixel_noise = channel_noise(data[0], valid[0], problem.noise)
+        self.noise = pixel_noise / factor
+        self._block_noise = pixel_noise / block
+        starts = [
+            blocks(n, self._together)[1] // 2 - (whole // 2 - first) // block
+            for n, whole, (first, _) in zip(self.held.shape, shape, spans, strict=True)
+        ]
+        self._common = tuple(
+            slice(start, start + count) for start, (_, count) in zip(starts, spans, strict=True)
+        )
+        self._scored = self._blocks(self.held & self.kept) > 0.5
+        used = self._blocks(~self.erasures) > 1 - 1e-6
+        self._waves, self._block_waves = _slow_waves(~self.erasures), _slow_waves(used)
+        self._camera: ChannelProblem | None = None
+
+    def _blocks(self, image: Array) -> Array:
+        """Average over the coarsest binning's blocks, those that every binning has."""
+        return np.asarray(binned(np.asarray(image, np.float32), self._together)[self._common])
+
+    @property
+    def central(self) -> Calibration:
+        """The PSF nearest to the axis alone."""
+        positions = self.calibration.source_positions_um
+        nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
+        return replace(
+            self.calibration,
+            psfs=self.calibration.psfs[nearest : nearest + 1],
+            source_positions_um=positions[nearest : nearest + 1],
+        )
+
+    def point(self, found: Array, iterations: int, seconds: float) -> Point:
+        """Score a picture or volume of the full field."""
+        planes = found[None] if found.ndim == 2 else found
+        predicted = self._predict(planes)
+        fine = _misfit(self.measurement, predicted, self._waves) / self.noise
+        used, held = fine[~self.erasures], fine[self.held & self.kept]
+        seen, shown = self._blocks(self.measurement), self._blocks(predicted)
+        error = _misfit(seen, shown, self._block_waves)[self._scored] / self._block_noise
+        count = min(PARTS, held.size)
+        point = Point(
+            self.setting.name,
+            iterations,
+            seconds,
+            float(np.sqrt(np.mean(used**2))),
+            float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
+            family=self.setting.family,
+            binning=self.setting.binning,
+            held_out_parts=tuple(float(np.mean(held[k::count] ** 2)) for k in range(count)),
+        )
+        if self.problem.truth is None:
+            return point
+        seen = self._on_sensor(planes)
+        shown = enlarged(seen, self.setting.binning, self.problem.measurement.shape)
+        truth = self.problem.truth
+        marks = score(shown if self.problem.volume else shown[0], truth, volume=self.problem.volume)
+        return replace(point, psnr_db=marks.psnr_db, ssim=marks.ssim, nrmse=marks.nrmse)
+
+    def _on_sensor(self, planes: Array) -> Array:
+        height, width = self.measurement.shape
+        (_, (row, column)) = field_of((height, width), self.calibration.psfs.shape[2:])
+        top, left = row - height // 2, column - width // 2
+        return planes[:, top : top + height, left : left + width]
+
+    def _predict(self, planes: Array) -> Array:
+        """Return the measurement that the setting's own model makes of what was found."""
+        camera = self._problem()
+        full = tuple(
+            s + p - 1 for s, p in zip(self.measurement.shape, self.calibration.psfs.shape[2:], strict=True)
+        )
+        window = (slice(0, full[0]), slice(0, full[1]))
+        placed = camera.start(planes, window)
+        predicted: Array = camera.camera.forward(placed)[0]
+        if self.setting.background:
+            predicted = predicted + camera.background(placed)
+        return predicted * np.float32(self.noise)
+
+    def _problem(self) -> ChannelProblem:
+        if self._camera is None:
+            scaled = prepare_volume(
+                self.measurement,
+                self.central if self.setting.method != "volume" else self.calibration,
+                None,
+                self.erasures,
+                self.noise,
+            )
+            self._camera = ChannelProblem(
+                scaled,
+                0,
+                self.setting.model,
+                smooth=self.setting.background,
+                prior="nonnegative",
+                weights=np.ones((len(scaled.depths.z_um), 3)),
+            )
+        return self._camera
+
+
+def _slow_waves(used: npt.NDArray[np.bool_]) -> BackgroundRemoval:
+    """Return what takes slow waves out of an image (height, width), fitted where it was used."""
+    rows, columns = (
+        max(1, min(most, count // _PIXELS_A_WAVE))
+        for most, count in zip(BACKGROUND_FREQUENCIES, used.shape, strict=True)
+    )
+    return BackgroundRemoval((1, *used.shape), (rows, columns), used, dtype=np.float64)
+
+
+def _misfit(seen: Array, shown: Array, waves: BackgroundRemoval) -> npt.NDArray[np.float64]:
+    """Return what a prediction misses at its best brightness, slow waves aside."""
+    image, prediction = (np.asarray(a, np.float64)[None] for a in (seen, shown))
+    shape = waves.forward(prediction)
+    power = float(np.vdot(shape, shape))
+    # A prediction that is nothing but slow waves has no brightness of its own to be fitted.
+    tells = power > 1e-12 * float(np.vdot(prediction, prediction))
+    gain = max(float(np.vdot(shape, waves.forward(image))) / power, 0.0) if tells else 1.0
+    rest = image - gain * prediction
+    return np.asarray((rest - waves.background(rest))[0])
+
+
+def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:
+    """First pixel and number of the coarsest binning's blocks that all binnings have when binned on."""
+    block = binnings[-1]
+    before, behind = n, n
+    for factor in binnings:
+        _, count = blocks(blocks(n, factor)[1], block // factor)
+        before, behind = min(before, count // 2), min(behind, count - count // 2)
+    return n // 2 - before * block, before + behind

@@ -1,0 +1,242 @@
+"""What the photographs of given calibrations buy on a given frame: parts of each, scored on held-out pixels.
+
+Each calibration takes part as it is and thinned: the PSF on the axis alone, every second point of a grid,
+every second depth. All predict the same held-out pixels of one photograph, so that their scores compare.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.camera.camera_model import ModelName, members_of_depths
+from recon.camera.interpolation import grid_axes
+from recon.errors import InputError
+from recon.evaluation.chart_calibration import ITERATIONS
+from recon.evaluation.chart_judge import Judge
+from recon.evaluation.chart_reconstruction import SCORES, ChartProblem, run_setting
+from recon.evaluation.chart_settings import Setting
+from recon.evaluation.scene import make_scene
+from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.reconstruction.channel import VolumePrior
+from recon.reconstruction.volume import reconstruct_volume
+from recon.solvers.stopping import StopReason
+
+_SCENES: dict[VolumePrior, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
+"""What a photograph is of is for its owner to say: both fronts are drawn."""
+
+
+@dataclass(frozen=True)
+class OwnCalibration:
+    """A calibration, and the photograph that it is tried on.
+
+    Attributes
+    ----------
+    label : str
+        Different for each.
+    problem : ChartProblem
+        The same photograph for all; the calibration of this one.
+    photographs : float
+        How many were taken for each of its PSFs; of a blind one: for all of them together, over their number.
+    whole : bool
+        Whether it can only be had as a whole: a blind one.
+    """
+
+    label: str
+    problem: ChartProblem
+    photographs: float = 1.0
+    whole: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSetting:
+    """A part of a calibration.
+
+    Attributes
+    ----------
+    label, part : str
+    members : tuple of int
+        Its PSFs.
+    images : int
+        Photographs.
+    model : str
+    """
+
+    label: str
+    part: str
+    members: tuple[int, ...]
+    images: int
+    model: ModelName
+
+    @property
+    def name(self) -> str:
+        """Say it briefly."""
+        return f"{self.label}, {self.part}"
+
+
+@dataclass(frozen=True)
+class OwnCalibrationsProblem:
+    """Calibrations that compete on one photograph."""
+
+    calibrations: tuple[OwnCalibration, ...]
+    kind: KindName = "calibration"
+
+    def __post_init__(self) -> None:
+        labels = [c.label for c in self.calibrations]
+        if len(set(labels)) != len(labels):
+            raise InputError(f"Each calibration needs a name of its own; found {', '.join(labels)}.")
+        first = self.calibrations[0]
+        for other in self.calibrations[1:]:
+            if other.problem.measurement.shape != first.problem.measurement.shape:
+                shapes = (" x ".join(map(str, c.problem.measurement.shape)) for c in (first, other))
+                raise InputError(
+                    "Calibrations are compared on the same pixels: the photograph has {2} with {0}, and {3} "
+                    "with {1}. Take such as were made with one binning and window.".format(
+                        first.label, other.label, *shapes
+                    )
+                )
+
+    @property
+    def pixels(self) -> tuple[int, ...]:
+        """Of the photograph."""
+        return self.calibrations[0].problem.measurement.shape
+
+    def settings(self) -> tuple[OwnSetting, ...]:
+        """Return every calibration and its parts, few photographs first."""
+        found = [s for c in self.calibrations for s in _parts(c)]
+        return tuple(sorted(found, key=lambda s: s.images))
+
+    def run(
+        self, setting: OwnSetting, *, limit_s: float | None = None, aside: Aside = nothing_aside
+    ) -> Curve:
+        """Reconstruct with either prior, and score.
+
+        Raises
+        ------
+        InputError
+            When the setting is of another problem, or its PSFs cannot be used together.
+        """
+        if setting not in self.settings():
+            raise InputError(f"The setting '{setting.name}' does not apply to these calibrations.")
+        own = next(c for c in self.calibrations if c.label == setting.label)
+        members = list(setting.members)
+        calibration = own.problem.calibration
+        problem = replace(
+            self.calibrations[0].problem,
+            volume=True,
+            calibration=replace(
+                calibration,
+                psfs=calibration.psfs[members],
+                source_positions_um=calibration.source_positions_um[members],
+            ),
+        )
+        points: list[Point] = []
+        spent = 0.0
+        for prior, group in _SCENES.items():
+            judge = Judge(problem, Setting("volume", setting.model, prior, background=True), 0)
+            found = reconstruct_volume(
+                judge.measurement,
+                judge.calibration,
+                prior=prior,
+                model=setting.model,
+                estimate_background=True,
+                erasures=judge.erasures,
+                noise=judge.noise,
+                field="full",
+                iterations=ITERATIONS,
+                time_s=None if limit_s is None else max(limit_s - spent, 1e-3),
+                judged=False,
+            )
+            if StopReason.TIME in found.stop_reasons:
+                return Curve(tuple(points), finished=False)
+            spent += found.seconds
+            with aside():
+                point = judge.point(found.volume, len(found.histories[0]), found.seconds)
+            points.append(
+                replace(point, setting=setting.name, images=setting.images, family=setting.label, group=group)
+            )
+        return Curve(tuple(points), finished=True)
+
+    def warm_up(self, setting: OwnSetting) -> None:
+        """Reconstruct a small scene of the same sort."""
+        scene = make_scene("beads", size=16, grid=3, depths=2)
+        small = ChartProblem(scene.measurement, scene.calibration, volume=True)
+        for prior in _SCENES:
+            run_setting(small, Setting("volume", setting.model, prior, background=True), counts=(1,))
+
+    def fingerprint(self) -> str:
+        """Digest photographs, calibrations and the names that results are kept by."""
+        names = [s.name for s in self.settings()]
+        digest = hashlib.sha256(f"own calibrations {SCORES} {names}".encode())
+        for c in self.calibrations:
+            digest.update(f"{c.label} {c.photographs} {c.whole} {c.problem.fingerprint()}".encode())
+        return digest.hexdigest()[:16]
+
+
+def _parts(own: OwnCalibration) -> list[OwnSetting]:
+    """Return a calibration as a whole, and thinned over field and depth."""
+    positions = own.problem.calibration.source_positions_um
+    depths = members_of_depths(positions)
+    parts: dict[tuple[int, ...], str] = {}
+    middle = len(depths) // 2
+    thinned = [depths, depths[::2], depths[middle : middle + 1]]
+    choosers = (_all, _every_second, _central)
+    for chosen in thinned[:1] if own.whole else thinned:
+        for chooser in choosers[:1] if own.whole else choosers:
+            members = tuple(sorted(int(m) for group in chosen for m in chooser(positions, group)))
+            if members not in parts:
+                parts[members] = _words(len(members), _which(chosen, depths, positions))
+    return [
+        OwnSetting(
+            own.label,
+            words,
+            members,
+            round(own.photographs * len(members)),
+            "local" if any(np.isin(group, members).sum() > 1 for group in depths) else "convolution",
+        )
+        for members, words in parts.items()
+    ]
+
+
+def _words(psfs: int, where: str) -> str:
+    return f"{psfs} PSF" + ("s" if psfs > 1 else "") + where
+
+
+def _which(
+    chosen: list[npt.NDArray[np.intp]],
+    depths: list[npt.NDArray[np.intp]],
+    positions: npt.NDArray[np.float64],
+) -> str:
+    """Say at which of several depths; of a single one its number too: z may be unknown, or the steps fine."""
+    if len(depths) == 1:
+        return ""
+    if len(chosen) > 1:
+        return f" at {len(chosen)} of {len(depths)} depths"
+    number = next(n for n, group in enumerate(depths, 1) if group is chosen[0])
+    z_mm = float(positions[chosen[0], 2].mean()) / 1e3
+    return f" at depth {number} of {len(depths)}" + (f" (z {z_mm:.4g} mm)" if np.isfinite(z_mm) else "")
+
+
+def _all(_positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    return group
+
+
+def _central(positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
+    return group[[int(np.argmin(off_axis))]]
+
+
+def _every_second(positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return every second point of a grid of 5 x 5 or more, with its corners; else all."""
+    places = positions[group][:, 1::-1]
+    if len(group) < 25 or not np.isfinite(places).all():
+        return group
+    grid = grid_axes(places)
+    if grid is None or any(len(axis) < 5 or len(axis) % 2 == 0 for axis in grid[:2]):
+        return group
+    rows, columns, order = grid
+    table = group[order].reshape(len(rows), len(columns))
+    return table[::2, ::2].ravel()

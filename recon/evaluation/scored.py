@@ -1,0 +1,257 @@
+"""Scored settings: points, what they cost and how good they are, and the fronts that nothing beats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+NAN = float("nan")
+Aside = Callable[[], AbstractContextManager[object]]
+"""Opens a context in which memory is taken that is not the setting's own: scoring."""
+
+
+def nothing_aside() -> AbstractContextManager[object]:
+    """Be an :data:`Aside` for those who do not measure memory."""
+    return nullcontext()
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """Something that a point has a number of.
+
+    Attributes
+    ----------
+    key : str
+        The attribute of :class:`Point`.
+    words : str
+        With the unit.
+    more_is_better : bool
+    logarithmic : bool
+        Whether it is drawn so.
+    """
+
+    key: str
+    words: str
+    more_is_better: bool = False
+    logarithmic: bool = False
+
+
+SECONDS = Axis("seconds", "time of the solver (s)", logarithmic=True)
+MEMORY = Axis("peak_mib", "memory beyond the input's, at the peak (MiB)", logarithmic=True)
+IMAGES = Axis("images", "photographs taken for the calibration", logarithmic=True)
+SSIM = Axis("ssim", "SSIM", more_is_better=True)
+NRMSE = Axis("nrmse", "NRMSE")
+HELD_OUT = Axis("held_out", "error on held-out pixels (noise = 1)", logarithmic=True)
+RESIDUAL = Axis("residual", "residual (noise = 1)", logarithmic=True)
+
+KindName = Literal["reconstruction", "hologram", "calibration"]
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What is charted.
+
+    Attributes
+    ----------
+    name : str
+    costs : tuple of Axis
+        The first is the one that fronts are made of.
+    scores : tuple of Axis
+        The first that is known of any point is the one that fronts are made of.
+    """
+
+    name: KindName
+    costs: tuple[Axis, ...]
+    scores: tuple[Axis, ...]
+
+    def score_of(self, points: Iterable[Point]) -> Axis:
+        """Return the first score that some point has."""
+        points = list(points)
+        return next((s for s in self.scores if any(is_known(p, s.key) for p in points)), self.scores[0])
+
+
+KINDS: dict[str, Kind] = {
+    k.name: k
+    for k in (
+        Kind(
+            "reconstruction",
+            (SECONDS, MEMORY),
+            (
+                Axis("psnr_db", "PSNR (dB)", more_is_better=True),
+                SSIM,
+                NRMSE,
+                HELD_OUT,
+                RESIDUAL,
+            ),
+        ),
+        Kind(
+            "hologram",
+            (SECONDS, MEMORY),
+            (
+                Axis("psnr_db", "PSNR of the seen image (dB)", more_is_better=True),
+                Axis("middle_psnr_db", "PSNR of its middle quarter (dB)", more_is_better=True),
+                SSIM,
+                Axis("middle_ssim", "SSIM of the middle quarter", more_is_better=True),
+            ),
+        ),
+        Kind(
+            "calibration",
+            (IMAGES, SECONDS, MEMORY),
+            (
+                Axis("psnr_db", "PSNR of the reconstruction (dB)", more_is_better=True),
+                SSIM,
+                NRMSE,
+                HELD_OUT,
+                RESIDUAL,
+            ),
+        ),
+    )
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One score of one setting; NaN is what was not measured or makes no sense.
+
+    Attributes
+    ----------
+    setting : str
+        Its name.
+    iterations : int
+        0 for one-shot methods.
+    seconds : float
+        Wall time of the solver up to here.
+    residual : float
+        Norm of the residual over that of the noise, on the pixels that were used, as ``held_out``.
+    held_out : float
+        Root mean square error of the predicted held-out blocks' means, in units of these means' noise,
+        as :mod:`recon.evaluation.chart_judge` has it; the blocks are those of the coarsest binning.
+    psnr_db, ssim, nrmse : float
+        Against the truth.
+    peak_mib : float
+        Memory at the run's peak beyond what the process took before it.
+    middle_psnr_db, middle_ssim : float
+        Of the middle quarter of a hologram's field.
+    images : float
+        Photographs that a calibration took.
+    family : str
+        Settings of one family share a colour.
+    group : str
+        Only settings of one group compete.
+    binning : float
+        Of the pixels that were computed with.
+    held_out_parts : tuple of float
+        Mean squares of the errors on held-out pixels, each by itself and not in blocks, apart for parts of
+        them that all settings of one binning share.
+    """
+
+    setting: str
+    iterations: int
+    seconds: float
+    residual: float = NAN
+    held_out: float = NAN
+    psnr_db: float = NAN
+    ssim: float = NAN
+    nrmse: float = NAN
+    peak_mib: float = NAN
+    middle_psnr_db: float = NAN
+    middle_ssim: float = NAN
+    images: float = NAN
+    family: str = ""
+    group: str = ""
+    binning: float = NAN
+    held_out_parts: tuple[float, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it with None for what is not known."""
+        return {k: None if v != v else v for k, v in asdict(self).items()}
+
+
+def is_known(point: Point, key: str) -> bool:
+    """Whether a point has a number (and not NaN) there."""
+    value = getattr(point, key)
+    return bool(value == value)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One setting's scores.
+
+    Attributes
+    ----------
+    points : tuple of Point
+    finished : bool
+        False where the time limit cut the run off: given longer, it would go on.
+    """
+
+    points: tuple[Point, ...]
+    finished: bool
+
+
+class Named(Protocol):
+    """A setting, as far as those know it who do not run it."""
+
+    @property
+    def name(self) -> str:
+        """Different for each setting of a problem."""
+        ...
+
+
+class Problem(Protocol):
+    """Something that settings compete on. It is sent to other processes: it can be pickled."""
+
+    @property
+    def kind(self) -> KindName:
+        """Which scores it has."""
+        ...
+
+    @property
+    def pixels(self) -> tuple[int, ...]:
+        """Of what is computed, for titles."""
+        ...
+
+    def settings(self) -> Sequence[Named]:
+        """Return every applicable setting, the quick ones first."""
+        ...
+
+    def run(self, setting: Any, *, limit_s: float | None, aside: Aside) -> Curve:
+        """Run one of its settings, scoring ``aside``."""
+        ...
+
+    def warm_up(self, setting: Any) -> None:
+        """Run a setting once in small, so that what it needs is loaded and compiled."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Return a digest of all that scores depend on."""
+        ...
+
+
+def pareto(points: Iterable[Point], score: Axis | str, cost: Axis = SECONDS) -> list[Point]:
+    """Return the points that no other is both cheaper and better than, the cheapest first, without groups.
+
+    Points that lack one of the two numbers do not compete.
+    """
+    if isinstance(score, str):
+        score = next(s for kind in KINDS.values() for s in kind.scores if s.key == score)
+    sign = 1.0 if score.more_is_better else -1.0
+    known = [p for p in points if is_known(p, score.key) and is_known(p, cost.key)]
+    front: list[Point] = []
+    best = -np.inf
+    for point in sorted(known, key=lambda p: (getattr(p, cost.key), -sign * getattr(p, score.key))):
+        value = sign * getattr(point, score.key)
+        if value > best:
+            front.append(point)
+            best = value
+    return front
+
+
+def fronts(points: Sequence[Point], kind: Kind) -> dict[str, list[Point]]:
+    """Return each group's front, of the kind's first cost and the first score that is known."""
+    score = kind.score_of(points)
+    groups = dict.fromkeys(p.group for p in points)
+    return {g: pareto([p for p in points if p.group == g], score, kind.costs[0]) for g in groups}

@@ -1,0 +1,1 @@
+"""One way from a measurement to a picture."""

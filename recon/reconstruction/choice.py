@@ -1,0 +1,174 @@
+"""What was chosen, in words and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from recon.camera.camera_model import ModelName
+from recon.reconstruction.preparation import Precision
+
+Name = Literal[
+    "model", "planes", "between", "field", "binning", "channels", "background", "iterations", "precision"
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """What one step up or down would be.
+
+    Attributes
+    ----------
+    value : str
+    time : float
+        Time of the whole reconstruction relative to that with what was chosen.
+    error_db : float
+        Estimated change of the picture's signal-to-error ratio by this step, decibels: above 0 is better. NaN
+        where nothing is known.
+    """
+
+    value: str
+    time: float
+    error_db: float
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        change = "error not known" if self.error_db != self.error_db else f"{self.error_db:+.1f} dB"
+        return f"{self.value}: {self.time:.2g} x the time, {change}"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One choice.
+
+    Attributes
+    ----------
+    name : str
+    value : str
+    why : str
+        With the numbers that decided.
+    error_db : float
+        Estimated loss by this choice against the largest model on offer, decibels, 0 or below.
+    up, down : Option or None
+        The next larger and the next smaller choice; None at the end of the scale.
+    overruled : bool
+        Whether the caller chose.
+    numbers : mapping of str to float
+        What ``why`` says, to compute with.
+    """
+
+    name: Name
+    value: str
+    why: str
+    error_db: float = 0.0
+    up: Option | None = None
+    down: Option | None = None
+    overruled: bool = False
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Everything that was chosen for one measurement and one calibration.
+
+    Attributes
+    ----------
+    model : str
+        ``"convolution"``, ``"lowrank"`` or ``"local"``.
+    planes : tuple of int
+        Depths that take part, as indices into the calibration's, in its order.
+    n_planes : int
+        Depths that the calibration has.
+    between : tuple of int
+        Planes added half way between depths ``k`` and ``k + 1``; the result has their light on these.
+    binning : int
+        Pixels to average along each axis.
+    merged : bool
+        Whether colour channels are reconstructed as one.
+    background : bool
+        Whether a smooth background is estimated as well.
+    precision : "float32" or "float64"
+    psf_window : (int, int)
+        Central part of the PSFs that holds their light: the object extends half of it beyond the sensor.
+    acceptance_px : float or None
+        Distance from the axis, in object pixels, beyond which the sensor accepts nothing; None: no limit
+        within the field.
+    decisions : tuple of Decision
+    seconds : float
+        Wall time that choosing took.
+    """
+
+    model: ModelName
+    planes: tuple[int, ...]
+    n_planes: int
+    between: tuple[int, ...]
+    binning: int
+    merged: bool
+    background: bool
+    precision: Precision
+    psf_window: tuple[int, int]
+    acceptance_px: float | None
+    tolerance: float
+    """Change an iteration at which to stop."""
+    decisions: tuple[Decision, ...]
+    seconds: float
+
+    def lines(self) -> list[str]:
+        """Return what was chosen and why, one or more lines a choice."""
+        text = []
+        for d in self.decisions:
+            text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}")
+            text += [
+                f"{'':<12}  one step {way}: {option}"
+                for way, option in (("up", d.up), ("down", d.down))
+                if option is not None
+            ]
+        return text
+
+    def brief(self) -> list[str]:
+        """Return what was chosen, one line a choice, without the steps up and down."""
+        return [
+            f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}"
+            for d in self.decisions
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it, JSON-compatible (numbers that are not known are None)."""
+
+        def option(o: Option | None) -> dict[str, Any] | None:
+            if o is None:
+                return None
+            return {"value": o.value, "time": _known(o.time), "error_db": _known(o.error_db)}
+
+        return {
+            "model": self.model,
+            "planes": list(self.planes),
+            "n_planes": self.n_planes,
+            "planes_between": list(self.between),
+            "binning": self.binning,
+            "channels_merged": self.merged,
+            "background": self.background,
+            "precision": self.precision,
+            "psf_window": list(self.psf_window),
+            "acceptance_px": self.acceptance_px,
+            "tolerance": self.tolerance,
+            "seconds": self.seconds,
+            "decisions": [
+                {
+                    "name": d.name,
+                    "value": d.value,
+                    "why": d.why,
+                    "error_db": _known(d.error_db),
+                    "one_step_up": option(d.up),
+                    "one_step_down": option(d.down),
+                    "overruled": d.overruled,
+                    "numbers": {k: _known(v) for k, v in d.numbers.items()},
+                }
+                for d in self.decisions
+            ],
+        }
+
+
+def _known(value: float) -> float | None:
+    return float(value) if value == value and abs(value) != float("inf") else None

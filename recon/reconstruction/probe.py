@@ -1,0 +1,236 @@
+"""What the data and the PSFs tell before the work, measured in little time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.analysis.correlation import autocorrelate
+from recon.base.noise import estimate_deviation
+from recon.camera.camera_model import Depths, ModelName
+from recon.camera.spatially_varying import SpatiallyVarying
+from recon.reconstruction.channel import ChannelProblem, Scaled, VolumePrior
+from recon.reconstruction.reduced import Colours
+from recon.solvers import StoppingRules
+
+Array = npt.NDArray[Any]
+
+COARSE_PX = 96
+"""Longest side that the coarse pass works on, pixels, about. Depths are told apart by a pixel's shift at the
+pattern's edge: on fewer pixels all depths look alike."""
+COARSE_ITERATIONS = 40
+VARYING_ITERATIONS = 20
+"""The same with PSFs that vary over the field, whose solver goes further in one."""
+CHANNEL_NOISE = 1.1
+"""Misfit, in units of the noise, up to which colour channels are taken to be proportional."""
+CHANNEL_PSF = 0.05
+"""The same of their PSFs, relative to them."""
+ACCEPTED = 0.005
+"""Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
+LIGHT_LOST = 2e-4
+"""Share of a PSF's light that may lie outside the window it is cut to, along each axis."""
+
+
+@dataclass(frozen=True)
+class CoarsePass:
+    """A quick reconstruction.
+
+    Attributes
+    ----------
+    misfit : float
+        Root mean square of the residual in units of the noise.
+    light : ndarray, (n_channels, n_z)
+        Share of every plane in the channel's light.
+    seconds : float
+        Processor time of an iteration.
+    smooth_share : float
+        Mean of the smooth background relative to that of the data; 0 where none was estimated.
+    objective : float
+        Half the squared misfit and the prior, summed over the channels.
+    """
+
+    misfit: float
+    light: npt.NDArray[np.float64]
+    seconds: float
+    smooth_share: float
+    objective: float
+
+
+def coarse_passes(
+    channels: list[Scaled],
+    prior: VolumePrior,
+    *,
+    background: bool,
+    model: ModelName = "convolution",
+    iterations: int = COARSE_ITERATIONS,
+) -> CoarsePass:
+    """Reconstruct every channel in few iterations; misfits are their root mean square, shares their mean."""
+    passes = [coarse_pass(c, model, prior, background=background, iterations=iterations) for c in channels]
+    return CoarsePass(
+        float(np.sqrt(np.mean([p.misfit**2 for p in passes]))),
+        np.concatenate([p.light for p in passes]),
+        sum(p.seconds for p in passes),
+        float(np.mean([p.smooth_share for p in passes])),
+        sum(p.objective for p in passes),
+    )
+
+
+def coarse_pass(
+    scaled: Scaled, model: ModelName, prior: VolumePrior, *, background: bool, iterations: int
+) -> CoarsePass:
+    """Reconstruct the first channel in few iterations."""
+    n_z = len(scaled.depths.z_um)
+    run = ChannelProblem(
+        scaled,
+        0,
+        model,
+        smooth=background,
+        prior=prior,
+        weights=np.ones((n_z, 3)) * ([0.0, 1.0, 1.0] if n_z == 1 else [1.0, 1.0, 1.0]),
+        drop_empty=False,
+    )
+    try:
+        solver, _ = run.solver(None, None)
+        began = time.process_time()
+        outcome = solver.run(StoppingRules(iterations=iterations, tolerance=0.0))
+        seconds = (time.process_time() - began) / iterations
+        smooth = run.background(outcome.solution) if background else None
+        residual = run.residual(outcome.solution, smooth)
+        volume = np.abs(np.asarray(outcome.solution[0], np.float64))
+    finally:
+        run.close()
+    per_plane = volume.sum(axis=(1, 2)) * scaled.depths.central[:, 0].sum(axis=(1, 2), dtype=np.float64)
+    valid = scaled.valid[0]
+    misfit = float(np.sqrt(np.mean(residual[valid].astype(np.float64) ** 2)))
+    share = per_plane / max(float(per_plane.sum()), 1e-30)
+    light = float(scaled.data[0][valid].mean(dtype=np.float64))
+    smooth_share = 0.0 if smooth is None or light <= 0 else float(smooth[valid].mean()) / light
+    return CoarsePass(misfit, share[None], seconds, smooth_share, outcome.history[-1].objective)
+
+
+@dataclass(frozen=True)
+class CameraCost:
+    """What one forward and adjoint of the coarse copy's camera cost.
+
+    Attributes
+    ----------
+    seconds : float
+        Processor time.
+    fft_pixels : int
+        Pixels transformed: the same at any time, to choose by. 0 for one convolution.
+    """
+
+    seconds: float
+    fft_pixels: int
+
+
+def camera_cost(scaled: Scaled, model: ModelName) -> CameraCost:
+    """Measure a forward and an adjoint of the coarse copy's camera."""
+    run = ChannelProblem(
+        scaled, 0, model, smooth=False, prior="nonnegative", weights=np.ones((len(scaled.depths.z_um), 3))
+    )
+    try:
+        camera = run.camera
+        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
+        began = time.process_time()
+        camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
+        seconds = max(time.process_time() - began, 1e-6)
+        return CameraCost(seconds, camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0)
+    finally:
+        run.close()
+
+
+def colours(data: Array, noise: Array, valid: Array, psfs: Array) -> Colours | None:
+    """Fit channels that are proportional to one another; None where there is one channel.
+
+    Parameters
+    ----------
+    data : ndarray, (n_channels, height, width)
+        Counts.
+    noise : ndarray, (n_channels,)
+        Its deviation.
+    valid : ndarray of bool, as ``data``
+    psfs : ndarray, (n_sources, 1 or n_channels, height, width)
+    """
+    if len(data) == 1:
+        return None
+    mask = valid.all(axis=0)
+    flat = data[:, mask].astype(np.float64) / noise[:, None]
+    scene, misfit = _proportional(flat)
+    scene = scene * noise
+    if psfs.shape[1] == 1:
+        psf, psf_misfit = np.ones(len(data)), 0.0
+    else:
+        light = np.moveaxis(psfs, 1, 0).reshape(psfs.shape[1], -1).astype(np.float64)
+        psf, rest = _proportional(light)
+        spread = float(np.sqrt(np.mean((psf[:, None] * (psf @ light / (psf @ psf))) ** 2)))
+        # Noise of the photographs of the source is no difference between them.
+        shot = float(np.mean([estimate_deviation(p) for p in psfs[0]]))
+        psf_misfit = float(np.sqrt(max(rest**2 - shot**2, 0.0))) / max(spread, 1e-30)
+    weights = scene / noise.astype(np.float64) ** 2
+    weights = weights / float(weights @ scene)
+    return Colours(scene / scene.mean(), psf / psf.mean(), weights * scene.mean(), misfit, psf_misfit)
+
+
+def _proportional(rows: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
+    """Best factors of one pattern, and the root mean square that they leave, per degree of freedom."""
+    values, vectors = np.linalg.eigh(rows @ rows.T)
+    factors = vectors[:, -1] * np.sign(vectors[:, -1].sum())
+    left = max(float(values[:-1].sum()), 0.0)
+    return factors, float(np.sqrt(left / (rows.shape[1] * (len(rows) - 1))))
+
+
+def resolution_px(psf: Array) -> float:
+    """Full width of a PSF's autocorrelation half way down to the base that it stands on, pixels."""
+    correlation = autocorrelate(psf)
+    widths = []
+    for axis in (0, 1):
+        profile = correlation.profile(axis)
+        quarter = len(profile) // 4
+        # Farther out the images hardly overlap.
+        base = float(np.median(profile[quarter : len(profile) - quarter]))
+        widths.append(2 * correlation.half_width(axis, 0.5 * (1 + base)))
+    return float(np.sqrt(widths[0] * widths[1]))
+
+
+def psf_window(depths: Depths) -> tuple[int, int]:
+    """Height and width of the central window that holds the light of all PSFs."""
+    light: npt.NDArray[Any] = np.zeros(depths.central.shape[2:])
+    for field in depths.fields:
+        light = np.maximum(light, field.psfs.max(axis=(0, 1)))
+    light = np.where(light > 0.02 * light.max(), light, 0)
+    sizes = []
+    for axis, n in enumerate(light.shape):
+        profile = light.sum(axis=1 - axis)
+        half = 1
+        inside = np.abs(np.arange(n) - n // 2)
+        while half < n // 2 and profile[inside > half].sum() > LIGHT_LOST * profile.sum():
+            half += 1
+        sizes.append(min(2 * half + 1, n))
+    return sizes[0], sizes[1]
+
+
+def acceptance_px(depths: Depths, level: float = ACCEPTED) -> float | None:
+    """Distance from the axis, pixels, at which PSFs are down to ``level`` of the central one's light.
+
+    From a Gaussian fitted to the light of the registered PSFs at the places they were calibrated at; None
+    where they do not fall off within reach.
+    """
+    places, ratios = [], []
+    for central, field in zip(depths.central, depths.fields, strict=True):
+        unit = float(central.sum())
+        for psf, point in zip(field.psfs, field.points, strict=True):
+            if unit > 0 and np.hypot(*point) > 1:
+                places.append(float(point[0] ** 2 + point[1] ** 2))
+                ratios.append(float(np.clip(psf.sum() / unit, 1e-3, 2.0)))
+    if len(places) < 4:
+        return None
+    r2, fall = np.asarray(places), -np.log(np.asarray(ratios))
+    slope = float(r2 @ fall) / float(r2 @ r2)
+    if slope <= 0:
+        return None
+    return float(np.sqrt(-np.log(level) / slope))

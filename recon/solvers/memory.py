@@ -1,0 +1,212 @@
+"""How much memory a volume takes, said before it is taken; and where it goes when there is not enough."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.threads import get_threads
+from recon.camera.planes import GROUPS
+from recon.errors import InputError
+
+GIB = 2**30
+VOLUMES = {"tv": 6, "l1": 2}
+"""Volumes that each solver keeps: X, g and four states; z and the transfer functions."""
+KEPT_FREE = 0.1
+"""Share of the available memory that is left to everybody else."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What a reconstruction will take, in bytes.
+
+    Attributes
+    ----------
+    state : int
+        The solver's volumes: what may go to disk.
+    traffic : int
+        How much of the state an iteration reads and writes: the price of having it on disk.
+    work : int
+        Planes, PSFs and the result: what must be in memory.
+    available : int
+        Memory that the machine can give now.
+    """
+
+    state: int
+    work: int
+    available: int
+    traffic: int = 0
+
+    @property
+    def room(self) -> int:
+        """What is left for the state in memory."""
+        return max(int((1 - KEPT_FREE) * self.available) - self.work, 0)
+
+    @property
+    def total(self) -> int:
+        """All of it."""
+        return self.state + self.work
+
+    @property
+    def fits(self) -> bool:
+        """Whether everything fits into memory, with a margin."""
+        return self.total <= (1 - KEPT_FREE) * self.available
+
+    def __str__(self) -> str:
+        """Say it in words."""
+        return (
+            f"{self.total / GIB:.2f} GiB ({self.state / GIB:.2f} GiB solver state, {self.work / GIB:.2f} GiB "
+            f"PSFs, planes and result) of {self.available / GIB:.2f} GiB available"
+        )
+
+
+def plan(
+    kind: str,
+    domain_shape: tuple[int, ...],
+    psf_values: int,
+    result_values: int,
+    *,
+    itemsize: int = 4,
+    available: int | None = None,
+) -> MemoryPlan:
+    """Work out what a solver will need.
+
+    Parameters
+    ----------
+    kind : str
+        A key of :data:`VOLUMES`.
+    domain_shape : tuple of int
+        ``(1, n_z, grid_height, grid_width)``: channels are reconstructed one after the other.
+    psf_values, result_values : int
+        Numbers kept of the PSFs and of the result.
+    itemsize : int
+        Bytes a number.
+    available : int, optional
+        Bytes; default what the operating system says.
+    """
+    _, n_z, height, width = domain_shape
+    spectrum = n_z * height * (width // 2 + 1) * 2 * itemsize
+    real = n_z * height * width * itemsize
+    volumes = 2 * spectrum + 4 * real if kind == "tv" else spectrum + real
+    plane = height * (width // 2 + 1) * 2 * itemsize
+    work = (psf_values + result_values) * itemsize + plane * (GROUPS + 6 * get_threads() + 8)
+    # TV: the spectra X (twice read and written) and g (twice read), four states read and written. l1: z read
+    # and written, the transfer functions read.
+    traffic = 6 * spectrum + 8 * real if kind == "tv" else spectrum + 2 * real
+    return MemoryPlan(volumes, work, available_bytes() if available is None else available, traffic)
+
+
+def available_bytes() -> int:
+    """Memory that this process may still take: what is free, within its control group's limit."""
+    free = []
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        for line in meminfo.read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                free.append(int(line.split()[1]) * 1024)
+    group = Path("/sys/fs/cgroup")
+    limit, used = group / "memory.max", group / "memory.current"
+    if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
+        free.append(int(limit.read_text()) - int(used.read_text()))
+    return min(free, default=2**62)
+
+
+class Storage:
+    """Where a solver's volumes live: in memory, or as files in a scratch folder that the system pages.
+
+    Solvers pass over their volumes plane by plane, so that files are read and written in runs of whole depth
+    planes, and at any time only the planes in work need memory.
+
+    Parameters
+    ----------
+    scratch : path, optional
+        Folder for the files (a fast disk); :meth:`close` removes them. Default: memory.
+    room : int
+        Bytes that may lie in memory all the same: the first volumes that fit.
+    """
+
+    def __init__(self, scratch: Path | str | None = None, room: int = 0) -> None:
+        self._room = room
+        self.on_disk = 0
+        self._folder: Path | None = None
+        if scratch is not None:
+            self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
+            self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._count = 0
+
+    def close(self) -> None:
+        """Remove the files. Arrays in them must not be used any more."""
+        if self._folder is not None:
+            self._remove()
+
+    def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """Return an array of zeros.
+
+        Raises
+        ------
+        InputError
+            When the scratch folder's disk has no room for it.
+        """
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if self._folder is None or size <= self._room:
+            self._room -= size
+            return np.zeros(shape, dtype)
+        free = shutil.disk_usage(self._folder).free
+        if size > free:
+            raise InputError(
+                f"The scratch folder {self._folder.parent} has {free / GIB:.2f} GiB free; "
+                f"{size / GIB:.2f} GiB more are needed. Name a folder on another disk."
+            )
+        self._count += 1
+        self.on_disk += size
+        path = self._folder / f"{self._count}.dat"
+        array = np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
+        if hasattr(
+            os, "posix_fallocate"
+        ):  # a file without its blocks kills the process when the disk is full
+            with path.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+        return array
+
+
+def scratch_for(plan: MemoryPlan, scratch: Path | str | None) -> Path | str:
+    """Return the scratch folder for a plan that does not fit into memory.
+
+    Raises
+    ------
+    InputError
+        When there is none, or not even the part that must be in memory fits.
+    """
+    if plan.work > (1 - KEPT_FREE) * plan.available:
+        raise InputError(f"This volume needs {plan}. Bin the images or take fewer depths.")
+    if scratch is None:
+        raise InputError(
+            f"This volume needs {plan}. Bin the images, take fewer depths, use the l1 prior (two volumes "
+            "instead of six), or name a scratch folder (--scratch) on a fast disk for the solver's state; "
+            f"an iteration then reads and writes {plan.traffic / GIB:.2f} GiB there at most."
+        )
+    if lies_in_memory(Path(scratch)):
+        raise InputError(f"The scratch folder {scratch} lies in memory itself (tmpfs). Name one on a disk.")
+    return scratch
+
+
+def lies_in_memory(folder: Path) -> bool:
+    """Tell whether a folder's file system is kept in memory."""
+    mounts = Path("/proc/mounts")
+    if not mounts.exists():
+        return False
+    place = folder.resolve()
+    found = ("", "")
+    for line in mounts.read_text().splitlines():
+        _, mount, kind, *_ = line.split()
+        if place.is_relative_to(mount) and len(mount) >= len(found[0]):
+            found = (mount, kind)
+    return found[1] in ("tmpfs", "ramfs")
