@@ -1,0 +1,189 @@
+"""What a reconstruction can be asked for, declared once (see :mod:`recon.base.declare`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy.typing as npt
+
+from recon.base.declare import option
+from recon.base.namespace import DEVICES, Device
+from recon.camera.camera_model import MODELS, ModelName
+from recon.priors import Prior
+from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.preparation import PRECISIONS, Field, Precision
+
+_MAIN, _STOP, _CHOICE, _COMPUTE, _RARE = "Scene", "When to stop", "Camera model", "Computing", "Rarely needed"
+
+
+def _priors() -> tuple[str, ...]:
+    from recon.reconstruction.picture import PRIORS
+
+    return tuple(PRIORS)
+
+
+def _solvers() -> tuple[str, ...]:
+    from recon.solvers.methods import method_names
+
+    return ("auto", *method_names())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionOptions:
+    """How to reconstruct; the defaults need no tuning. ``Options`` for short in :mod:`recon`."""
+
+    prior: str | Prior | None = option(
+        None,
+        help="What the scene is like.",
+        default_words="tv; none for wiener",
+        choices=_priors,
+        group=_MAIN,
+    )
+    tau: float | None = option(
+        None,
+        help="Weight of the prior, relative to max |A^H b|: the same number works at any exposure and size.",
+        default_words="from the noise",
+        least=0,
+        below=float("inf"),
+        metavar="X",
+        group=_MAIN,
+    )
+    z_um: float | None = option(
+        None,
+        help="Distance of the scene; a PSF is refocused to it.",
+        unit="um",
+        shown_unit="mm",
+        shown_factor=1000.0,
+        above=0,
+        flags=("--z-mm",),
+        label="Distance",
+        group=_MAIN,
+    )
+    solver: str = option(
+        "auto",
+        help="Algorithm.",
+        choices=_solvers,
+        flags=("--solver", "--method", "-m"),
+        group=_MAIN,
+    )
+    iterations: int | None = option(
+        None,
+        help="At most so many iterations.",
+        default_words="200, or none with a time limit",
+        least=1,
+        flags=("--iterations", "-n"),
+        metavar="N",
+        group=_STOP,
+    )
+    time_s: float | None = option(
+        None,
+        help="At most so many seconds.",
+        unit="s",
+        above=0,
+        flags=("--time",),
+        metavar="S",
+        group=_STOP,
+    )
+    tolerance: float | None = option(
+        None,
+        help="Stop when the relative change an iteration falls below it (and residuals below ten times it). "
+        "0: never.",
+        default_words="the solver's own",
+        least=0,
+        metavar="X",
+        group=_STOP,
+    )
+    stop_at_noise: bool = option(
+        False, help="Stop as soon as the residual is down to the expected noise.", group=_STOP
+    )
+    model: ModelName = option(
+        "auto",
+        help="Camera model; local, lowrank: PSFs from several places of the field. auto: the smallest model, "
+        "depths, field, binning and colours that explain the data.",
+        choices=MODELS,
+        group=_CHOICE,
+    )
+    choose: Wishes | None = option(
+        None,
+        help="Overrule one of auto's choices (repeatable): model=, planes=all|0-3,7, between=on|off, "
+        "field=all, binning=N, channels=all|merged, background=on|off, precision=float32|float64.",
+        metavar="NAME=VALUE",
+        group=_CHOICE,
+    )
+    estimate_background: bool | None = option(
+        None,
+        help="Estimate a smooth background as well.",
+        default_words="auto decides; other models: for volumes",
+        flags=("--background/--no-background",),
+        label="Smooth background",
+        group=_CHOICE,
+    )
+    positive_background: bool = option(
+        False,
+        help="A background that is nowhere negative; up to three more runs.",
+        group=_RARE,
+    )
+    axis_weights: npt.ArrayLike | None = option(
+        None,
+        help="Weights of the z, y and x differences of TV, (3,) or (n_z, 3).",
+        default_words="by the voxels' shape",
+        flags=("",),
+        group=_RARE,
+    )
+    field: Field = option(
+        "sensor",
+        help="Return the part opposite to the sensor, or everything that can reach it.",
+        choices=("sensor", "full"),
+        flags=("",),
+        group=_RARE,
+    )
+    drop_empty: bool = option(
+        True,
+        help="With l1: leave out depth planes that stay empty, and certify it.",
+        flags=("",),
+        group=_RARE,
+    )
+    device: Device = option("cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE)
+    precision: Literal["auto"] | Precision = option(
+        "auto",
+        help="Of the arithmetic. auto: float32, unless the model auto finds that it would show. float64 "
+        "takes twice the memory and up to twice the time.",
+        choices=("auto", *PRECISIONS),
+        group=_COMPUTE,
+    )
+    memory_gib: float | None = option(
+        None,
+        help="Memory that may be taken.",
+        default_words="what is free",
+        unit="GiB",
+        above=0,
+        flags=("--memory",),
+        metavar="GIB",
+        group=_COMPUTE,
+        recorded=False,
+    )
+    scratch: Path | None = option(
+        None,
+        help="Where to keep what does not fit into memory, on a fast disk.",
+        metavar="FOLDER",
+        group=_COMPUTE,
+        recorded=False,
+    )
+    judged: bool = option(
+        True,
+        help="Say whether the result can be trusted.",
+        flags=("",),
+        group=_RARE,
+        recorded=False,
+    )
+
+    def __post_init__(self) -> None:
+        """Raise InputError that names all mistakes at once."""
+        from recon.base.declare import require
+
+        require(self)
+
+
+Options = ReconstructionOptions

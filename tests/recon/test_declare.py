@@ -1,0 +1,47 @@
+"""Options declared once: mistakes, records, expressions, overrides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from recon.base.declare import changed, expression, mistakes, option, options_of, record, with_overrides
+from recon.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Some:
+    count: int | None = option(None, help="How many.", least=1)
+    kind: str = option("plain", help="Which.", choices=lambda: ("plain", "fancy"))
+    z_um: float | None = option(None, help="Where.", unit="um", shown_unit="mm", shown_factor=1000.0, above=0)
+    here: bool = option(True, help="Only here.", recorded=False)
+
+
+def test_all_mistakes_are_named_at_once() -> None:
+    found = mistakes(Some(count=0, kind="fancie", z_um=float("nan")))
+    assert found == [
+        "count must be a whole number, 1 or more, not 0.",
+        "kind must be one of plain, fancy, not 'fancie'; 'fancy'?",
+        "z_um must be a number, above 0 (um), not nan.",
+    ]
+    assert mistakes(Some(count=2, kind="fancy", z_um=1)) == []
+    assert mistakes(Some(count=True)) != []
+
+
+def test_what_differs_from_the_defaults_is_recorded_and_said() -> None:
+    given = Some(count=3, here=False)
+    assert record(given) == {"count": 3, "kind": "plain", "z_um": None}
+    assert expression(given) == "Some(count=3, here=False)"
+    assert [o.name for o, _ in changed(given)] == ["count", "here"]
+    assert eval(expression(given), {"Some": Some}) == given
+
+
+def test_labels_have_the_unit_that_people_read() -> None:
+    assert [o.label for o in options_of(Some)] == ["Count", "Kind", "Z (mm)", "Here"]
+
+
+def test_an_unknown_override_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(InputError, match="has no option 'cuont'. Did you mean 'count'"):
+        with_overrides(Some(), {"cuont": 1})
+    assert with_overrides(Some(), {"count": 1}) == Some(count=1)
