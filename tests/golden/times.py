@@ -77,10 +77,7 @@ def main() -> None:
         parser.error("--against is needed: a commit or a folder that has tests/golden")
     slower: list[str] = []
     with other_checkout(asked.against) as other:
-        print(
-            f"processor time here, of {asked.against}, ratio: "
-            f"medians of {asked.rounds} turns; *: above {LIMIT}"
-        )
+        print(f"processor time here, at {asked.against}, ratio; medians of {asked.rounds} turns; * > {LIMIT}")
         if asked.cases is None or asked.cases:
             slower += compare_cases(other, asked.cases, asked.rounds, asked.seconds)
         for name in BENCHMARKS if asked.benchmarks is None else asked.benchmarks:
