@@ -59,7 +59,7 @@ def differences(found: dict[str, Any], kept: dict[str, Any], tolerance: float) -
         if isinstance(here, np.ndarray):
             said += _apart(name, here, there, tolerance)
         elif isinstance(here, float) and isinstance(there, float):
-            if abs(here - there) > 10 * tolerance * abs(there) + 1e-12:
+            if abs(here - there) > min(10 * tolerance, 2e-3) * abs(there) + 1e-12:
                 said.append(f"{name}: {here!r}, stored {there!r}")
         elif here != there:
             said.append(f"{name}: {here!r}, stored {there!r}")
