@@ -143,10 +143,11 @@ class LiveReconstructionPanel(Panel):
         path = self.session.config.path
         calibration = "calibration" if self.loaded is None else str(self.loaded.path)
         return (
-            "from instrument.bench.bench import open_bench\n\n"
+            "from instrument.bench.bench import open_bench\n"
+            "from instrument.live.live import live_view\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    settings = dict(z_um={self.z_um!r}, budget_ms={self.budget.value!r})\n"
-            f"    with bench.live({calibration!r}, **settings) as live:\n"
+            f"    with live_view(bench, {calibration!r}, **settings) as live:\n"
             "        for result in live:\n"
             "            print(result.picture.quality, result.latency_ms)\n"
         )
