@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.hologram_capture import capture_hologram
+from calibration_routines.display.hologram_photograph import capture_hologram
 from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
 from drivers.simulated.display_world import DisplayWorld
 from instrument.bench.bench import Bench

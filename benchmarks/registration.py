@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines import PointSweep, expose_sweep
-from calibration_routines.psf.background import block_mean
+from calibration_routines.psf.psf_quality import block_mean
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config

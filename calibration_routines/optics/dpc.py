@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError, RunEndedError
-from calibration_routines.psf.auto_exposure import AutoExposure, auto_expose, hot_pixels
-from calibration_routines.psf.axial_analysis import DarkModel, replace_hot
+from calibration_routines.psf.analysis import DarkModel, replace_hot
+from calibration_routines.psf.exposure import AutoExposure, auto_expose, hot_pixels
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
 from instrument.files.atomic import whole_file, write_text

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError, RunEndedError
-from calibration_routines.psf.auto_exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
-from calibration_routines.psf.axial_analysis import DarkModel, channels_first, replace_hot
-from calibration_routines.psf.background import block_mean
+from calibration_routines.psf.analysis import DarkModel, channels_first, replace_hot
+from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
+from calibration_routines.psf.psf_quality import block_mean
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, Part, Plan
 from instrument.runs.acquire import acquire

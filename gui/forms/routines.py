@@ -17,7 +17,7 @@ from calibration_routines.optics.optics_procedures import (
     DpcProcedure,
     PhotographProcedure,
 )
-from calibration_routines.psf.plan_procedures import PlanProcedure
+from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import (
     AxialRequest,

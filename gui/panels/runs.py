@@ -27,8 +27,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
-from calibration_routines.psf.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.psf.sweep import FOLDER
 from calibration_routines.psf.sweep_record import is_sweep
 from gui.forms.as_python import script

@@ -9,9 +9,9 @@ import typer
 from rich.console import Console
 
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
-from calibration_routines.psf.plan_procedures import finish_simple
+from calibration_routines.plan_procedures import finish_simple
 from calibration_routines.psf.sweep import FOLDER
-from calibration_routines.psf.sweep_words import event_lines
+from calibration_routines.psf.sweep_procedure import event_lines
 from instrument.bench.bench import Bench
 from instrument.cli.app import BenchOption, command_app, examples, open_and_say
 from instrument.cli.progress import one_task, progress_bar

@@ -9,8 +9,8 @@ import pytest
 
 from calibration_routines.display.display_procedures import AlignmentProcedure
 from calibration_routines.optics.optics_procedures import BeadProcedure
+from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook
-from calibration_routines.psf.plan_procedures import PlanProcedure
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.psf.auto_exposure import (
+from calibration_routines.psf.exposure import (
     AutoExposure,
     ExposureOutcome,
     auto_expose,

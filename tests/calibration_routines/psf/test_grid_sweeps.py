@@ -26,9 +26,8 @@ from calibration_routines import (
     photograph,
     watch_resumed,
 )
-from calibration_routines.display.stage_fit import fit_stage
-from calibration_routines.psf.drift import judge_drift
-from calibration_routines.psf.feature_size import feature_size_px, optical_binning
+from calibration_routines.psf.analysis import feature_size_px, optical_binning
+from calibration_routines.psf.stage_fit import fit_stage, judge_drift
 from calibration_routines.psf.sweep_record import read_retakes
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench

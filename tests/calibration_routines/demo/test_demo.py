@@ -19,8 +19,8 @@ import pytest
 
 from calibration_routines import SweepCalibration, SweepExposures
 from calibration_routines.demo.demo import Advance, DemoResult, run_demo
+from calibration_routines.demo.demo_picture import compare, scene_field
 from calibration_routines.demo.demo_settings import DemoSettings, read_picture
-from calibration_routines.optics.comparison import compare, scene_field
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench
 from instrument.cli import main

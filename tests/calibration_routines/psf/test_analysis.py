@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.psf.axial_analysis import DarkModel, PlaneFrames, analyse_sweep, binned, replace_hot
+from calibration_routines.psf.analysis import DarkModel, PlaneFrames, analyse_sweep, binned, replace_hot
 from recon.types import Geometry
 
 FULL = 4095
