@@ -1,20 +1,32 @@
 """The table of commands.
 
-A new command is one row here and one module that holds a ``typer.Typer`` called ``app``.
+A new command is one row here and one :class:`~instrument.cli.app.App`: ``app`` of its module, or
+``module:name``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from instrument.cli.app import App
 
 
 class Command(NamedTuple):
-    """A row of the table; ``module`` is imported only when the command is used."""
+    """A row of the table; ``place`` is imported only when the command is used."""
 
     group: str
     help: str
-    module: str
+    place: str
+
+    def load(self) -> App:
+        """Import the command's application."""
+        import importlib
+
+        module, _, name = self.place.partition(":")
+        app: App = getattr(importlib.import_module(module), name or "app")
+        return app
 
 
 BENCH = "The bench"
@@ -35,11 +47,11 @@ COMMANDS: Mapping[str, Command] = {
     "calibrate": Command(
         BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "instrument.cli.calibrate"
     ),
-    "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
+    "snap": Command(BENCH, "take a photograph", "instrument.cli.capture:snap_app"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
     "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.run_plan"),
     "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.resume"),
-    "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.record"),
+    "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.capture:record_app"),
     "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.list_runs"),
     "show": Command(
         ACQUISITION, "say what is in a run; or show a hologram on the SLM", "instrument.cli.show_pattern"
