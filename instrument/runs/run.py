@@ -95,6 +95,9 @@ class Run:
                 gaps.append(Gap.from_json(line))
             else:
                 events.append(line)
+        RUN_STATE.tell_unknown(
+            path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
+        )
         self.gaps = tuple(gaps)
         self.events = tuple(events)
 
