@@ -40,7 +40,7 @@ def compare(
 
     from instrument.files.atomic import write_text
     from instrument.files.calibration_file import load_calibration
-    from instrument.files.plain_json import plain
+    from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
     from recon.analysis.compare import compare as compare_calibrations
 

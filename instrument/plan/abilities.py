@@ -11,10 +11,10 @@ import numpy as np
 
 from drivers.stage import StageAxis
 from instrument.files.errors import FileError
+from instrument.files.slm_image import read_slm_levels
 from instrument.plan.errors import PlanError
 from instrument.plan.model import Plan, Step
 from instrument.plan.positions import SourcePosition
-from instrument.plan.slm_images import read_slm_image
 
 SPARE_BYTES = 256 * 2**20
 """Disk space that a run leaves free."""
@@ -229,7 +229,7 @@ def _slm_image_problems(path: Path, abilities: BenchAbilities) -> Iterable[str]:
     if abilities.slm_shape is None:
         return
     try:
-        shape = read_slm_image(path).shape
+        shape = read_slm_levels(path).shape
     except FileError as error:
         yield str(error)
         return

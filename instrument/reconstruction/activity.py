@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import BenchError, FileError
-from instrument.files.plain_json import plain
+from instrument.files.record import plain
 from instrument.reconstruction.video_mp4 import DEFAULT_FPS, levels_of, write_mp4
 from instrument.reconstruction.video_output import VideoPictures, create_output
 from recon.streams.baseline import Motion, aligned, baseline, change, fading, motion
