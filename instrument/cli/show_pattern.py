@@ -25,6 +25,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
 from instrument.files.slm_image import levels_phase, read_slm_image
+from recon.holography import HologramOptions
 
 app = App()
 
@@ -183,7 +184,9 @@ def _capture(
         io,
         fields,
         display,
-        prepare_target(read_image(files.target).pixels, display, envelope=envelope_of_pattern(facts)),
+        prepare_target(
+            read_image(files.target).pixels, display, HologramOptions(envelope=envelope_of_pattern(facts))
+        ),
         average=average,
         refine=refine,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
