@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.reconstruct_options import BinningOption, CalibrationOption, DistanceOption, PsfOption
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volume_zarr import is_zarr_name
@@ -18,7 +18,7 @@ from instrument.reconstruction.video_output import VideoPictures
 from instrument.reconstruction.words import parse_binning
 from instrument.runs.layout import STATE
 
-app = command_app()
+app = App()
 
 WARM_ITERATIONS = 6
 """Of a recording reconstructed on the way: with a video's usual 4, a quarter of simulated neurons is lost."""

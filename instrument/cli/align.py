@@ -9,11 +9,11 @@ import typer
 
 from calibration_routines.display.display_procedures import AlignmentProcedure, refuse_existing
 from calibration_routines.display.mask_alignment import AlignmentSettings
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.sweeping import Told
 from instrument.files.errors import BenchError
 
-app = command_app("Align the holographic display.")
+app = App("Align the holographic display.")
 
 
 @app.callback()

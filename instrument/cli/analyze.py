@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.progress import one_task
 from instrument.files.errors import BenchError, FileError
 from recon.types import Calibration
 
-app = command_app()
+app = App()
 _PAGES = (".pdf", ".png", ".svg")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
+from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.etendue import parse_size
 from instrument.cli.progress import progress_bar
 from instrument.cli.reconstruct_options import (
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from instrument.reconstruction.job import Job
     from recon.evaluation.scored import Named, Point, Problem
 
-app = command_app()
+app = App()
 
 _LEAST_S = 1.0
 """For settings, where photographs took all of the budget: so that each call comes further."""

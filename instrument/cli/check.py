@@ -18,9 +18,9 @@ from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError
-from instrument.cli.app import BenchOption, command_app, examples, load_and_say
+from instrument.cli.app import App, BenchOption, examples, load_and_say
 
-app = command_app()
+app = App()
 
 
 @app.command(epilog=examples("diffuserbench check", "diffuserbench check --bench benches/microscope.toml"))

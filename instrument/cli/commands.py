@@ -1,20 +1,32 @@
 """The table of commands.
 
-A new command is one row here and one module that holds a ``typer.Typer`` called ``app``.
+A new command is one row here and one :class:`~instrument.cli.app.App`: ``app`` of its module, or
+``module:name``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from instrument.cli.app import App
 
 
 class Command(NamedTuple):
-    """A row of the table; ``module`` is imported only when the command is used."""
+    """A row of the table; ``place`` is imported only when the command is used."""
 
     group: str
     help: str
-    module: str
+    place: str
+
+    def load(self) -> App:
+        """Import the command's application."""
+        import importlib
+
+        module, _, name = self.place.partition(":")
+        app: App = getattr(importlib.import_module(module), name or "app")
+        return app
 
 
 BENCH = "The bench"

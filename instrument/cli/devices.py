@@ -10,9 +10,9 @@ import typer
 
 from drivers.registry.discovery import BUSES, FoundDevice
 from drivers.registry.listing import Listing, list_devices
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import typer
 
 from drivers.registry.registry import KINDS, driver_names, registration_mistakes
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 
-app = command_app()
+app = App()
 
 
 @app.command(epilog=examples("diffuserbench drivers"))

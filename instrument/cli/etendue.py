@@ -9,11 +9,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.files.errors import BenchError
 from recon.holography import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.cli.progress import one_task, progress_bar
 from instrument.files.errors import BenchError
 from instrument.files.plane_steps import uneven_steps
@@ -17,7 +17,7 @@ from instrument.reconstruction.stored_result import open_result
 from instrument.runs.export import export as export_run
 from instrument.runs.run import Run
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples, load_and_say
+from instrument.cli.app import App, examples, load_and_say
 from instrument.files.errors import BenchError
 
-app = command_app()
+app = App()
 
 _MODULES = ("PySide6", "shiboken6", "pyqtgraph")
 

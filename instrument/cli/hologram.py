@@ -11,7 +11,7 @@ import numpy.typing as npt
 import typer
 
 from instrument.bench.display_setup import bench_display, slm_size
-from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
+from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.hologram_output import tell
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.display.hologram_file import HologramFiles
@@ -29,7 +29,7 @@ from instrument.files.images import Pixels, read_image, read_stack
 from recon.holography import Budget, Display, HologramRecord, HologramStop, Target
 from recon.holography.optimise import Method
 
-app = command_app()
+app = App()
 
 RGB_NM = (638.0, 520.0, 450.0)
 

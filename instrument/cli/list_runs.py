@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from instrument.bench.config_file import load_config
-from instrument.cli.app import BenchOption, command_app, examples
+from instrument.cli.app import App, BenchOption, examples
 from instrument.files.errors import FileError
 from instrument.runs.catalogue import run_paths, summary
 
-app = command_app()
+app = App()
 
 
 @app.command(name="list", epilog=examples("diffuserbench list", "diffuserbench list /data/monday"))

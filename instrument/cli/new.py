@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
 
-app = command_app()
+app = App()
 
 
 @app.command(

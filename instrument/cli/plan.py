@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import duration, size
@@ -19,7 +19,7 @@ from instrument.plan.file import load_plan, save_plan
 from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
 from instrument.runs.acquire import abilities_of
 
-app = command_app("Look at a plan before anything moves, or write one to start from.")
+app = App("Look at a plan before anything moves, or write one to start from.")
 
 
 @app.command(

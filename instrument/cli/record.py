@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
+from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.keys import keys
 from instrument.cli.progress import progress_bar
 from instrument.files.formatting import duration, size
@@ -15,7 +15,7 @@ from instrument.runs.recorder import RecordingStatus
 from instrument.runs.recording import prepare_recording
 from instrument.runs.run import Run
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.files.errors import BenchError
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -13,7 +13,7 @@ from calibration_routines.plan_procedures import finish_simple
 from calibration_routines.psf.sweep import FOLDER
 from calibration_routines.psf.sweep_procedure import event_lines
 from instrument.bench.bench import Bench
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.progress import one_task, progress_bar
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.cli.sweeping import describe_result, print_lines
@@ -22,7 +22,7 @@ from instrument.runs.resume import prepare_resume
 from instrument.runs.run import Run
 from instrument.runs.writer import RunWriter
 
-app = command_app()
+app = App()
 
 
 @app.command(name="resume", epilog=examples("diffuserbench resume runs/2026-11-21_14-03-22_axial-sweep"))

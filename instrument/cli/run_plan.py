@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.running import carry_out, home_if_needed
 from instrument.plan import check
 from instrument.plan.file import load_plan
 from instrument.runs.acquire import abilities_of, prepare
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.files.formatting import size
 from instrument.runs.run import Run
 from instrument.runs.run_picture import contact_sheet
 
-app = command_app()
+app = App()
 
 
 @app.command(epilog=examples("diffuserbench show runs/2026-11-21_14-03-22_axial-sweep"))

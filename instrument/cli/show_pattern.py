@@ -18,7 +18,7 @@ from calibration_routines.display.hologram_photograph import (
     write_refined,
 )
 from instrument.bench.bench import Bench
-from instrument.cli.app import BenchOption, command_app, examples, naming_as_is, open_and_say
+from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.display.hologram_job import prepare_target
 from instrument.files.alignment_file import Alignment, load_alignment
 from instrument.files.errors import BenchError, FileError
@@ -26,7 +26,7 @@ from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
 from instrument.files.slm_image import levels_phase, read_slm_image
 
-app = command_app()
+app = App()
 
 PICTURES = (".png", ".tif", ".tiff", ".npy", ".bmp")
 

@@ -11,8 +11,8 @@ import typer
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.cli.app import (
+    App,
     BenchOption,
-    command_app,
     examples,
     naming_as_is,
     open_and_say,
@@ -21,7 +21,7 @@ from instrument.cli.app import (
 from instrument.cli.progress import progress_bar
 from instrument.runs.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
 
-app = command_app()
+app = App()
 
 DIM = 0.1
 """Of full scale: a lit photograph whose brightest pixel stays below it wastes most of the sensor's range."""

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError, FileError
 
-app = command_app()
+app = App()
 
 
 class SizeName(enum.StrEnum):

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.cli.app import command_app, examples, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.etendue import parse_size
 from instrument.cli.progress import progress_bar
 from instrument.display.table71_figure import rows, write_chart, write_csv
@@ -18,7 +18,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from recon.holography.table71 import GRIDS, METHODS, Cell, run_table
 
-app = command_app()
+app = App()
 
 
 @app.command(

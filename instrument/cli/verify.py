@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.cli.progress import progress_bar
 from instrument.runs.run import Run
 from instrument.runs.verification import verify as verify_run
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -235,8 +235,6 @@ def command(*words: str) -> tuple[int, str]:
 
 def command_names() -> list[tuple[str, ...]]:
     """Return every command and subcommand."""
-    import importlib
-
     import typer
 
     from instrument.cli import COMMANDS
@@ -244,7 +242,7 @@ def command_names() -> list[tuple[str, ...]]:
     found: list[tuple[str, ...]] = [()]
     for name, entry in COMMANDS.items():
         found.append((name,))
-        parsed = typer.main.get_command(importlib.import_module(entry.module).app)
+        parsed = typer.main.get_command(entry.load())
         found += [(name, inner) for inner in sorted(getattr(parsed, "commands", {}))]
     return found
 
