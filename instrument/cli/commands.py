@@ -47,11 +47,11 @@ COMMANDS: Mapping[str, Command] = {
     "calibrate": Command(
         BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "instrument.cli.calibrate"
     ),
-    "snap": Command(BENCH, "take a photograph", "instrument.cli.snap"),
+    "snap": Command(BENCH, "take a photograph", "instrument.cli.capture:snap_app"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
     "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.run_plan"),
     "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.resume"),
-    "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.record"),
+    "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.capture:record_app"),
     "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.list_runs"),
     "show": Command(
         ACQUISITION, "say what is in a run; or show a hologram on the SLM", "instrument.cli.show_pattern"

@@ -8,8 +8,7 @@ import typer
 
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError
-from instrument.cli.keys import keys
-from instrument.cli.progress import progress_bar
+from instrument.cli.progress import keys, progress_bar
 from instrument.files.formatting import duration, size
 from instrument.plan import Plan
 from instrument.runs.acquire import free_bytes
