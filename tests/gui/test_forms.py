@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,8 @@ def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
     assert procedure == form.make(values_of(form))
     for field in form.fields:
         assert field.label
-        assert field.tip
-        assert field.default is not None or field.optional or field.name in Z
+        assert field.declaration.help
+        assert field.default not in (None, MISSING) or field.declaration.default_words or field.name in Z
     compile(script(procedure, None), form.name, "exec")
 
 
