@@ -135,6 +135,7 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
     run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.declared = declared  # type: ignore[attr-defined]
+    run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
     return run
 
 

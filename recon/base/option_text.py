@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.base.declare import Declaration, Option, options_of
+from recon.base.declare import Declaration, Option, expression, options_of
 from recon.errors import InputError
 
 
@@ -141,7 +141,9 @@ def table(cls: type) -> str:
     """Return a Markdown table of an options class: for the reference pages."""
     rows = ["| in Python | on the command line | default | what it is |", "| --- | --- | --- | --- |"]
     group = ""
-    for o in options_of(cls):
+    options = options_of(cls)
+    order = list(dict.fromkeys(o.declaration.group for o in options))
+    for o in sorted(options, key=lambda o: order.index(o.declaration.group)):
         if o.declaration.group != group:
             group = o.declaration.group
             rows.append(f"| **{group}** | | | |")
@@ -152,7 +154,7 @@ def table(cls: type) -> str:
 def _row(o: Option, said: Declaration) -> str:
     switch = bool in o.kinds
     typed = "" if not o.flags else f"`{', '.join(o.flags)}{'' if switch else f' {metavar(o)}'}`"
-    default = "required" if o.is_required else said.default_words or f"`{o.default!r}`"
+    default = "required" if o.is_required else said.default_words or f"`{expression(o.default)}`"
     limits = f" ({', '.join(o.limits())})" if o.limits() else ""
     applies = f" Of a {', '.join(said.applies)}." if said.applies else ""
     unit = f" In {said.unit}." if said.unit else ""
