@@ -13,9 +13,9 @@ from PySide6.QtCore import QSignalBlocker
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
+from gui.widgets.dialogues import Browse
 from gui.widgets.entry import Entry, PathEntry, narrow
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.question import Browse
 from instrument.files.errors import BenchError
 from recon.base.declare import Option
 

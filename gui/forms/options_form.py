@@ -86,9 +86,9 @@ class OptionsForm(QWidget):
         self._seldom = seldom
         self.more.toggled.connect(self._fold)
         seldom.hide()
-        self.more.setVisible(any(map(self._is_folded, self.fields.values())))
         layout.addWidget(self.more, 0, Qt.AlignmentFlag.AlignLeft)
         layout.addWidget(seldom)
+        self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
         layout.addStretch(1)
         for name, field in self.fields.items():
             field.show(field.default)
