@@ -16,14 +16,14 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
-from instrument.display.hologram_job import Envelope
 from instrument.files.alignment_file import Alignment
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.holography import Budget, Display, HologramModel, Scores, Target, compute_hologram
+from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap, register_camera
 from recon.holography.judge import compare, low_pass
 from recon.holography.lowpass import make_band
+from recon.holography.options import Envelope
 
 Array = npt.NDArray[Any]
 
@@ -82,7 +82,7 @@ def capture_hologram(
         for _ in range(average):
             total += io.photograph(exposure_ms)
     ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
-    shape = make_band(display.slm_shape, display.factor, "alias_free").seen_shape
+    shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
     picture = np.fft.ifftshift(camera.resample(total, shape))
     seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
     wanted, peak = wanted_picture(target, display)
@@ -94,7 +94,7 @@ def capture_hologram(
 
 def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
     """Return the low-passed target on the smallest grid that holds it, and its peak."""
-    band = make_band(display.slm_shape, display.factor, "alias_free")
+    band = make_band(display.slm_shape, display.factor, "alias-free")
     spectrum, peak = target.spectrum(display, band)
     height, width = band.seen_shape
     half = np.zeros((height, width // 2 + 1), complex)
@@ -213,7 +213,7 @@ def refine_hologram(
         shown = plain.seen(now) / plain.peaks[0]
         aim = np.maximum(shown + gain * (measured.wanted - measured.seen), 0)
         model = HologramModel(display, [replace(target, image=aim, white=1.0)])
-        now = compute_hologram(model, budget=Budget(iterations, tolerance=0), initial=now).slm
+        now = compute_hologram(model, initial=now, iterations=iterations, tolerance=0).slm
         measured = _capture(io, now, display, target, camera, mean_per_ms, average)
         history.append(measured.scores.psnr_db)
         if progress is not None:

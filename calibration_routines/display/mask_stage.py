@@ -35,7 +35,7 @@ class PlacementCost:
 
     def __init__(self, display: Display) -> None:
         self.display = display
-        shape = make_band(display.slm_shape, display.factor, "alias_free").seen_shape
+        shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
         ey, ex = (np.fft.fftshift(e) for e in display.envelope(shape))
         self._target = Target(load_sample("leaves", shape) * ey[:, None] * ex, white=1.0)
         self._in_place: PlacedHologram | None = None

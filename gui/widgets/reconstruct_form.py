@@ -36,8 +36,8 @@ from instrument.reconstruction.request import (
 from instrument.reconstruction.result_file import Outputs
 from instrument.reconstruction.words import parse_binning, parse_dark, parse_erasures, parse_noise
 from recon.camera.camera_model import MODELS
+from recon.priors import PRIORS
 from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
-from recon.reconstruction.picture import PRIORS
 from recon.solvers.methods import method_names
 
 CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"

@@ -37,28 +37,40 @@ DISPLAY = "Holographic display"
 
 COMMANDS: Mapping[str, Command] = {
     "demo": Command(BENCH, "the main job, start to end, on the simulated bench", "instrument.cli.demo"),
-    "gui": Command(BENCH, "the desktop program: live view, stage, sweeps, results", "instrument.cli.gui"),
-    "new": Command(BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.new"),
-    "check": Command(BENCH, "open every device of the bench and report on it", "instrument.cli.check"),
-    "drivers": Command(BENCH, "list the installed drivers by kind of device", "instrument.cli.drivers"),
+    "gui": Command(
+        BENCH, "the desktop program: live view, stage, sweeps, results", "instrument.cli.bench:gui_app"
+    ),
+    "new": Command(
+        BENCH, "write a commented bench.toml (simulated by default)", "instrument.cli.bench:new_app"
+    ),
+    "check": Command(
+        BENCH, "open every device of the bench and report on it", "instrument.cli.bench:check_app"
+    ),
+    "drivers": Command(
+        BENCH, "list the installed drivers by kind of device", "instrument.cli.bench:drivers_app"
+    ),
     "devices": Command(
-        BENCH, "list what is connected: USB, HID, serial, video, GenICam, displays", "instrument.cli.devices"
+        BENCH,
+        "list what is connected: USB, HID, serial, video, GenICam, displays",
+        "instrument.cli.bench:devices_app",
     ),
     "calibrate": Command(
         BENCH, "measure PSFs, the sensor, the diffuser, or an SLM", "instrument.cli.calibrate"
     ),
     "snap": Command(BENCH, "take a photograph", "instrument.cli.capture:snap_app"),
     "plan": Command(ACQUISITION, "look at a plan before anything moves, or write one", "instrument.cli.plan"),
-    "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.run_plan"),
-    "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.resume"),
+    "run": Command(ACQUISITION, "carry out a plan", "instrument.cli.acquire:run_app"),
+    "resume": Command(ACQUISITION, "go on with a run that did not end", "instrument.cli.acquire:resume_app"),
     "record": Command(ACQUISITION, "record video at full camera rate", "instrument.cli.capture:record_app"),
-    "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.list_runs"),
+    "list": Command(ACQUISITION, "list the runs in a folder", "instrument.cli.runs:list_app"),
     "show": Command(
-        ACQUISITION, "say what is in a run; or show a hologram on the SLM", "instrument.cli.show_pattern"
+        ACQUISITION, "say what is in a run; or show a hologram on the SLM", "instrument.cli.show"
     ),
-    "verify": Command(ACQUISITION, "read every frame of a run and check it", "instrument.cli.verify"),
+    "verify": Command(
+        ACQUISITION, "read every frame of a run and check it", "instrument.cli.runs:verify_app"
+    ),
     "export": Command(
-        ACQUISITION, "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4", "instrument.cli.export"
+        ACQUISITION, "write a run's frames as TIFF, HDF5, NumPy, PNG, MP4", "instrument.cli.runs:export_app"
     ),
     "reconstruct": Command(
         RECONSTRUCTION, "reconstruct the scene from a PSF and a photograph", "instrument.cli.reconstruct"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import enum
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -16,68 +16,28 @@ from instrument.cli.hologram_output import tell
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.display.hologram_file import HologramFiles
 from instrument.display.hologram_job import (
-    HologramRequest,
     HologramResult,
-    foveal,
+    compute_and_judge,
     prepare_target,
     read_weights,
-    run_request,
 )
 from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
-from recon.holography import Budget, Display, HologramRecord, HologramStop, Target
-from recon.holography.optimise import Method
+from recon.holography import LOSSES, Display, HologramOptions, HologramRecord, HologramStop, Target
+from recon.holography.lowpass import Grid
+from recon.holography.options import Envelope, Fit, Method
 
 app = App()
 
 RGB_NM = (638.0, 520.0, 450.0)
 
 
-class LossName(enum.StrEnum):
-    """The losses of Kuo 2020, Eqs. 7.16, 7.17 and 7.19."""
-
-    NONE = "none"
-    FREQUENCY = "frequency"
-    SPATIAL = "spatial"
+_DEFAULT = HologramOptions()
 
 
-class MethodName(enum.StrEnum):
-    """The methods of :func:`recon.holography.compute_hologram`."""
-
-    LBFGS = "lbfgs"
-    NESTEROV = "nesterov"
-    ONE_STEP = "one-step"
-
-
-METHODS: dict[MethodName, Method] = {
-    MethodName.LBFGS: "lbfgs",
-    MethodName.NESTEROV: "nesterov",
-    MethodName.ONE_STEP: "one_step",
-}
-
-
-class GridName(enum.StrEnum):
-    """The grids of :mod:`recon.holography.lowpass`."""
-
-    ALIAS_FREE = "alias-free"
-    DISSERTATION = "dissertation"
-
-
-class FitName(enum.StrEnum):
-    """How a picture that is not square fills the field."""
-
-    COVER = "cover"
-    CONTAIN = "contain"
-    STRETCH = "stretch"
-
-
-class EnvelopeName(enum.StrEnum):
-    """What becomes of the mask pixels' diffraction envelope."""
-
-    SHADE = "shade"
-    CORRECT = "correct"
-    IGNORE = "ignore"
+def _words(words: Sequence[str]) -> str:
+    return f"<{'|'.join(words)}>"
 
 
 @app.command(
@@ -112,12 +72,17 @@ def hologram(
             show_default=False,
         ),
     ] = None,
-    loss: Annotated[LossName, typer.Option("--loss", help="Which differences count.")] = LossName.FREQUENCY,
+    loss: Annotated[
+        str,
+        typer.Option("--loss", help="Which differences count.", metavar=_words(LOSSES.names())),
+    ] = str(_DEFAULT.loss),
     centre: Annotated[
         str, typer.Option("--centre", metavar="Y,X", help="Of the spatial weights.")
-    ] = "0.5,0.5",
-    radius: Annotated[float, typer.Option("--radius", help="Of full weight, fraction of the field.")] = 0.28,
-    periphery: Annotated[float, typer.Option("--periphery", help="Weight far outside.")] = 0.1,
+    ] = ",".join(map(str, _DEFAULT.centre)),
+    radius: Annotated[
+        float, typer.Option("--radius", help="Of full weight, fraction of the field.")
+    ] = _DEFAULT.radius,
+    periphery: Annotated[float, typer.Option("--periphery", help="Weight far outside.")] = _DEFAULT.periphery,
     weights: Annotated[
         Path | None,
         typer.Option("--weights", metavar="FILE", help="A weight image instead.", show_default=False),
@@ -126,11 +91,16 @@ def hologram(
         Path | None,
         typer.Option("--alignment", metavar="FILE", help="From align mask.", show_default=False),
     ] = None,
-    method: Annotated[MethodName, typer.Option("--method", "-m")] = MethodName.LBFGS,
+    method: Annotated[
+        str, typer.Option("--method", "-m", metavar=_words(get_args(Method)))
+    ] = _DEFAULT.method,
     grid: Annotated[
-        GridName, typer.Option("--grid", help="dissertation: unpadded, aliases.")
-    ] = GridName.ALIAS_FREE,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Time-multiplexed frames.")] = 1,
+        str,
+        typer.Option("--grid", help="dissertation: unpadded, aliases.", metavar=_words(get_args(Grid))),
+    ] = _DEFAULT.grid,
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, help="Time-multiplexed frames.")
+    ] = _DEFAULT.frames,
     complex_slm: Annotated[
         bool, typer.Option("--complex", help="For an SLM that sets amplitude and phase; out is a .npy file.")
     ] = False,
@@ -153,19 +123,23 @@ def hologram(
         tuple[float, float, float], typer.Option("--wavelengths", metavar="R G B", help="With --color, nm.")
     ] = RGB_NM,
     fit: Annotated[
-        FitName, typer.Option("--fit", help="How the picture fills the square field.")
-    ] = FitName.COVER,
+        str,
+        typer.Option("--fit", help="How the picture fills the square field.", metavar=_words(get_args(Fit))),
+    ] = _DEFAULT.fit,
     srgb: Annotated[
         bool, typer.Option("--srgb", help="Values are sRGB-coded; default: they are intensities.")
     ] = False,
     envelope: Annotated[
-        EnvelopeName,
+        str,
         typer.Option(
             "--envelope",
             help="Mask pixels' envelope: shade the target too, correct it in the hologram, ignore it.",
+            metavar=_words(get_args(Envelope)),
         ),
-    ] = EnvelopeName.SHADE,
-    iterations: Annotated[int, typer.Option("--iterations", "-n", min=1, help="At most so many.")] = 100,
+    ] = _DEFAULT.envelope,
+    iterations: Annotated[
+        int, typer.Option("--iterations", "-n", min=1, help="At most so many.")
+    ] = _DEFAULT.iterations,
     time_s: Annotated[
         float | None, typer.Option("--time", metavar="S", help="At most S seconds.", show_default=False)
     ] = None,
@@ -173,7 +147,7 @@ def hologram(
         float | None,
         typer.Option("--psnr", metavar="DB", help="Stop at this PSNR of the seen image.", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the random start.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Of the random start.")] = _DEFAULT.seed,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
 ) -> None:
     """Compute the SLM phase that shows a picture through the bench's scattering mask.
@@ -181,34 +155,40 @@ def hologram(
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
-    if levels is not None and levels not in (2, 4, 8, 16, 32, 64, 128, 256):
-        raise BenchError(f"--levels {levels}: the SLM's phases are 2, 4, 8, 16, 32, 64, 128 or 256.")
     config = load_and_say(bench)
     size = slm_size(config)
-    request = HologramRequest(
-        method=METHODS[method],
-        loss_kind=loss.value,
-        weights=_weights(loss, weights, centre, radius, periphery),
-        grid="alias_free" if grid is GridName.ALIAS_FREE else "dissertation",
+    options = HologramOptions(
+        fit=fit,  # type: ignore[arg-type]
+        srgb=srgb,
+        loss=loss,
+        centre=_centre(centre),
+        radius=radius,
+        periphery=periphery,
+        weights=None if weights is None else read_weights(weights),
+        envelope=envelope,  # type: ignore[arg-type]
+        expansion=expansion,
         frames=frames,
         complex_slm=complex_slm,
         phase_levels=levels,
-        envelope=envelope.value,
-        budget=Budget(iterations, time_s, psnr_db),
+        iterations=iterations,
+        time_s=time_s,
+        psnr_db=psnr_db,
+        method=method,  # type: ignore[arg-type]
+        grid=grid,  # type: ignore[arg-type]
         seed=seed,
     )
     pictures = _pictures(target, video=video)
     depths = _depths(z_mm, 1 if video else len(target))
     lasers = wavelengths if color else (None,)
     displays = [
-        request.display_of(bench_display(config, size, expansion=expansion, wavelength_nm=nm))
+        options.display_of(bench_display(config, size, expansion=options.expansion, wavelength_nm=nm))
         for nm in lasers
     ]
     if alignment is not None:
         found = load_alignment(alignment)
         displays = [found.of(display) for display in displays]
     writer = HologramFiles(
-        out, config.display.slm_binning, request, displays, video=len(pictures) if video else 0
+        out, config.display.slm_binning, options, displays, video=len(pictures) if video else 0
     )
     writer.check(overwrite=force)
     with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
@@ -216,51 +196,41 @@ def hologram(
         for number, planes in enumerate(pictures):
             for channel, display in enumerate(displays):
                 targets = [
-                    prepare_target(
-                        _channel(picture, channel if color else None),
-                        display,
-                        z_mm=z,
-                        fit=fit.value,
-                        srgb=srgb,
-                        envelope=envelope.value,
-                    )
+                    prepare_target(_channel(picture, channel if color else None), display, options, z_mm=z)
                     for picture, z in zip(planes, depths, strict=True)
                 ]
                 result = _compute(
-                    display, targets, request, initial[channel], cancel, writer.label(number, channel)
+                    display, targets, options, initial[channel], cancel, writer.label(number, channel)
                 )
                 initial[channel] = result.hologram.slm if video else None
                 writer.write(number, channel, result)
-                tell(writer.label(number, channel), result, request)
+                tell(writer.label(number, channel), result, options)
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
 
 
 def _compute(
-    display: Display, targets: list[Target], request: HologramRequest, initial: Any, cancel: Any, label: str
+    display: Display, targets: list[Target], options: HologramOptions, initial: Any, cancel: Any, label: str
 ) -> HologramResult:
-    budget = request.budget
     with progress_bar() as bar:
-        task = bar.add_task(label, total=budget.iterations, note="")
+        task = bar.add_task(label, total=options.iterations, note="")
 
         def show(record: HologramRecord, _slm: object) -> None:
             done = float(record.iteration)
-            if budget.time_s is not None:
-                done = max(done, budget.iterations * record.seconds / budget.time_s)
+            if options.time_s is not None:
+                done = max(done, options.iterations * record.seconds / options.time_s)
             bar.update(task, completed=done, note=f"{record.psnr_db:.2f} dB")
 
-        return run_request(display, targets, request, initial=initial, callback=show, cancel=cancel)
+        return compute_and_judge(display, targets, options, initial=initial, callback=show, cancel=cancel)
 
 
-def _weights(
-    loss: LossName, weights: Path | None, centre: str, radius: float, periphery: float
-) -> np.ndarray[Any, Any] | None:
-    if loss is not LossName.SPATIAL:
-        if weights is not None:
-            raise BenchError("--weights needs --loss spatial.")
-        return None
-    return read_weights(weights) if weights is not None else foveal(centre, radius, periphery)
+def _centre(text: str) -> tuple[float, float]:
+    try:
+        y, x = (float(part) for part in text.split(","))
+    except ValueError:
+        raise BenchError(f"--centre {text!r}: write Y,X in fractions of the field, e.g. 0.5,0.5.") from None
+    return y, x
 
 
 def _pictures(target: list[Path], *, video: bool) -> list[list[Pixels]]:

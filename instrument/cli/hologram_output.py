@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from instrument.display.hologram_job import HologramRequest, HologramResult
+from instrument.display.hologram_job import HologramResult
+from recon.holography import HologramOptions
 
 
-def tell(label: str, result: HologramResult, request: HologramRequest) -> None:
+def tell(label: str, result: HologramResult, options: HologramOptions) -> None:
     """Say how good the hologram is, for which grid, envelope and frame count."""
     history = result.hologram.history
     typer.echo(
@@ -21,6 +22,6 @@ def tell(label: str, result: HologramResult, request: HologramRequest) -> None:
             f"middle quarter {score.crop_psnr_db:.2f} dB, SSIM {score.crop_ssim:.3f}"
         )
     typer.echo(
-        f"  (computed on the alias-free grid, envelope {request.envelope}, {request.frames} frame(s), "
+        f"  (computed on the alias-free grid, envelope {options.envelope}, {options.frames} frame(s), "
         "through the eye's low-pass)"
     )

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from recon.base.namespace import array_namespace
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.errors import InputError
+from recon.priors import PRIORS
 from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
-from recon.reconstruction.picture import PRIORS
 from recon.reconstruction.preparation import PRECISIONS, Precision
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from recon.base.noise import NoiseModel
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.errors import InputError
-from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT, PRIORS
+from recon.priors import PRIORS
+from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT
 from recon.reconstruction.preparation import channel_noise
 from recon.reconstruction.result import ImageGrid, Reconstruction
 from recon.solvers.fista import Fista
@@ -103,7 +104,7 @@ def reconstruct_patterned(
     calibration, z_um, noise, tau
         As :func:`recon.reconstruct`.
     prior : str
-        One of :data:`recon.reconstruction.picture.PRIORS`; ``"tv"`` has an exact, slower prox.
+        One of :data:`recon.priors.PRIORS`; ``"tv"`` has an exact, slower prox.
     background : array or number
         Subtracted from each frame.
     iterations : int

@@ -14,7 +14,7 @@ from recon.base.noise import NoiseModel
 from recon.base.options import require_options
 from recon.camera.camera_model import MODELS, ModelName
 from recon.errors import InputError
-from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
+from recon.priors import PRIORS, Prior
 from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
 from recon.reconstruction.preparation import Field, Precision, Prepared, prepare, require_precision
 from recon.reconstruction.result import Reconstruction
@@ -32,16 +32,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
-
-PRIORS: dict[str, Callable[[float], Prior]] = {
-    "tv": lambda weight: TotalVariation(weight) + NonNegativity(),
-    "tv-isotropic": lambda weight: TotalVariation(weight, isotropic=True) + NonNegativity(),
-    "tv-haar": lambda weight: HaarTotalVariation(weight) + NonNegativity(),
-    "l1": lambda weight: L1(weight) + NonNegativity(),
-    "nonnegative": lambda _: NonNegativity(),
-    "none": lambda _: Zero(),
-}
-"""Priors by name, as functions of their weight."""
 
 NOISE_WEIGHT = 1.0
 """Default weight of a prior in units of the noise (that a unit-energy PSF's adjoint passes on unchanged)."""
@@ -97,9 +87,10 @@ def reconstruct(
         A name from :func:`recon.solvers.methods.method_names`: ``"admm"``, ``"admm-sensor"``
         (for dense scenes on many pixels), ``"fista"``, ``"wiener"``.
     prior : str or Prior
-        A name from :data:`PRIORS` (all but ``"none"`` include non-negativity), or a prior for the scaled
-        problem of :func:`recon.reconstruction.preparation.prepare`. Of these, ``"wiener"`` keeps only the
-    bounds. tau : float, optional
+        A name from :data:`recon.priors.PRIORS` (all but ``"none"`` include non-negativity), or a prior for
+        the scaled problem of :func:`recon.reconstruction.preparation.prepare`. Of these, ``"wiener"`` keeps
+        only the bounds.
+    tau : float, optional
         Weight of the prior relative to ``max |A^H b|``: the same number works at any exposure and size, and
         for l1 a tau of 1 leaves nothing. Default: from the measurement's noise. For ``"wiener"``: its
         regularisation (see :func:`recon.solvers.wiener`), by default cross-validated.

@@ -35,7 +35,12 @@ def picture_solver(
     """
     structure = as_cropped_convolution(operator)
     camera = structure.convolution
-    tv, separable = split_prior(prior)
+    tv, separable, others = split_prior(prior)
+    if others:
+        names = ", ".join(type(other).__name__ for other in others)
+        raise StructureError(
+            f"On a GPU the prior is total variation or l1, with non-negativity; got {names}."
+        )
     bounds = (separable.lower, separable.upper)
     if bounds != (0.0, np.inf) or (tv and separable.weight > 0):
         raise StructureError(

@@ -49,7 +49,7 @@ class LiteralAdmm(Solver):
         super().__init__()
         structure = as_cropped_convolution(operator)
         convolution = structure.convolution
-        tv, self.separable = split_prior(prior)
+        tv, self.separable, _ = split_prior(prior)
         self.tau = tv.weight if tv else 0.0
         self.isotropic = bool(tv and tv.isotropic)
         self.mu_1, self.mu_2, self.mu_3 = mu

@@ -17,8 +17,8 @@ from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.errors import InputError
+from recon.priors import PRIORS as PICTURE_PRIORS
 from recon.priors.base import Prior
-from recon.reconstruction.picture import PRIORS as PICTURE_PRIORS
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.streams.over_time import LowRankPlusSparse, OverTime, TemporalTotalVariation
 from recon.streams.video import Floats, VideoCamera

@@ -21,8 +21,8 @@ from recon.camera.base import LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.errors import InputError
+from recon.priors import PRIORS as PICTURE_PRIORS
 from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT
-from recon.reconstruction.picture import PRIORS as PICTURE_PRIORS
 from recon.reconstruction.preparation import like_data, prepare
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.types import Calibration
@@ -31,7 +31,7 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
 PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
-"""The priors of :data:`recon.reconstruction.picture.PRIORS` that the exact-data ADMM solves."""
+"""The priors of :data:`recon.priors.PRIORS` that the exact-data ADMM solves."""
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
 """Iterations of a block's first frame and of the others: as good as independent frames at their best where

@@ -23,11 +23,9 @@ import numpy.typing as npt
 import recon
 from recon.base import threads
 from recon.holography import (
-    Budget,
     DcTerm,
     Display,
     HologramModel,
-    Loss,
     Target,
     compute_hologram,
     foveal_weights,
@@ -254,7 +252,7 @@ def hologram(
     pixels: int = 2,
     loss: str = "frequency",
     frames: int = 1,
-    grid: Any = "alias_free",
+    grid: Any = "alias-free",
     dc: tuple[float, float] | None = None,
     mask_fill: float = 0.0,
     bent: float = 0.0,
@@ -276,12 +274,13 @@ def hologram(
     model = HologramModel(
         display,
         shown,
-        Loss(loss, weights),  # type: ignore[arg-type]
+        loss=loss,
+        weights=weights,
         grid=grid,
         frames=frames,
         dtype=np.complex128 if precise else np.complex64,
     )
-    found = compute_hologram(model, budget=Budget(iterations=iterations, tolerance=0), **options)
+    found = compute_hologram(model, iterations=iterations, tolerance=0, **options)
     seen = np.stack([model.seen(found.slm, plane) for plane in range(len(shown))])
     # The judge knows no displacement: it says what is shown where the mask lies as it should.
     scores = judge(found.slm, replace(display, displacement=None), shown[0])

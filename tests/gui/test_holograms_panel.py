@@ -171,7 +171,7 @@ def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: Hol
     assert x < 0.49
     after = panel.target.weights()
     assert np.abs(after - before).max() > 0.1
-    np.testing.assert_array_equal(panel.order().request.weights, after)
+    np.testing.assert_array_equal(panel.order().options.weights, after)
 
 
 def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:

@@ -23,7 +23,7 @@ from instrument.cli import main
 from instrument.cli.reconstruct_options import Method, PriorName
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
-from recon.reconstruction.picture import PRIORS
+from recon.priors import PRIORS
 from recon.solvers.methods import method_names
 from recon.types import Calibration, Geometry
 

@@ -62,7 +62,7 @@ def test_is_the_textbook_s_admm_step_by_step(name, relax):
     """Boyd et al. 2011, scaled form with over-relaxation, on dense matrices."""
     operator, data = problem(erased=True)
     data = masked(operator, data)
-    tv, separable = split_prior(PRIORS[name])
+    tv, separable, _ = split_prior(PRIORS[name])
     camera, size = operator.inner, int(np.prod(operator.domain_shape))
     points = np.eye(size).reshape(size, *operator.domain_shape)
     M = np.stack([camera.circular(p).ravel() for p in points], axis=1)

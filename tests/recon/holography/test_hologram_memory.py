@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from recon.holography import (
-    Budget,
     Display,
     HologramModel,
-    Loss,
     Target,
     compute_hologram,
-    foveal_weights,
     random_mask,
 )
 from recon.holography.pose import Pose
@@ -25,12 +22,11 @@ SLM = (540, 960)
 
 def peak_bytes(display: Display, kind: str) -> int:
     """Largest memory held at once, from building the model to the last of four iterations."""
-    loss = Loss(kind, foveal_weights((256, 256)) if kind == "spatial" else None)  # type: ignore[arg-type]
     image = np.random.default_rng(0).random((1296, 1296))
 
     def run(on: Display) -> None:
-        model = HologramModel(on, [Target(image)], loss)
-        compute_hologram(model, budget=Budget(4, tolerance=0))
+        model = HologramModel(on, [Target(image)], loss=kind)
+        compute_hologram(model, iterations=4, tolerance=0)
 
     k = display.factor
     small = Display((32, 48), random_mask((32 * k, 48 * k)))

@@ -1,26 +1,100 @@
-"""``diffuserbench export``: a run's frames, or a reconstruction, for other programs."""
+"""What is on disk: ``list``, ``verify`` and ``export`` of runs, and of reconstructions."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
 
-from instrument.cli.app import App, examples
+from instrument.bench.config_file import load_config
+from instrument.cli.app import App, BenchOption, examples
 from instrument.cli.progress import one_task, progress_bar
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, FileError
 from instrument.files.plane_steps import uneven_steps
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.result_export import export_result
 from instrument.reconstruction.stored_result import open_result
+from instrument.runs.catalogue import run_paths, summary
 from instrument.runs.export import export as export_run
 from instrument.runs.run import Run
+from instrument.runs.verification import verify as verify_run
 
-app = App()
+list_app, verify_app, export_app = App(), App(), App()
 
 
-@app.command(
+@list_app.command(name="list", epilog=examples("diffuserbench list", "diffuserbench list /data/monday"))
+def list_runs(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="FOLDER", help="Default: data_folder of bench.toml.", show_default=False),
+    ] = None,
+    bench: BenchOption = None,
+) -> None:
+    """List the runs in a folder, the newest last: what became of each, its frames, its label."""
+    if folder is not None and not folder.is_dir():
+        raise FileError(folder, "is no folder.", "Name the folder that holds the runs.")
+    folder = folder or load_config(bench).data_folder
+    if not folder.is_dir():
+        typer.echo(f"{folder}: no such folder, so no runs yet.")
+        return
+    paths = run_paths(folder)
+    if not paths:
+        typer.echo(f"{folder}: no runs.")
+        return
+    table = Table(title=str(folder), title_justify="left", box=None)
+    for heading in ("run", "became", "frames", "kind", "bench"):
+        table.add_column(heading, overflow="fold", justify="right" if heading == "frames" else "left")
+    for path in paths:
+        found = summary(path)
+        if found.condition is None:
+            table.add_row(path.name, "UNREADABLE", "", "", found.problem)
+            continue
+        kind = "recording" if found.is_recording else "plan"
+        mark = "SIMULATED" if found.is_simulated else ""
+        table.add_row(path.name, found.condition, f"{found.stored} of {found.frames}", kind, mark)
+    Console(width=None if Console().is_terminal else 160).print(table, markup=False)
+
+
+@verify_app.command(
+    epilog=examples(
+        "diffuserbench verify runs/2026-11-21_14-03-22_axial-sweep", "diffuserbench verify runs/*"
+    )
+)
+def verify(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="The runs' folders.")],
+) -> None:
+    """Read every frame and its metadata and hold them against the log's checksums. Changes nothing.
+
+    Exit status 1 when anything is not as it was written. A run that ended early is sound, only not complete.
+    """
+    sound = True
+    for path in runs:
+        run = Run.open(path)
+        with progress_bar() as bar:
+            bar.add_task(path.name, total=len(run.records), note="")
+            found = verify_run(run, partial(_advance, bar))
+        for frame in found.damaged:
+            typer.echo(f"{path}: frame {frame.index}: {frame.problem}", err=True)
+        for problem in found.problems:
+            typer.echo(f"{path}: {problem}", err=True)
+        sound = sound and found.is_sound
+        verdict = "sound" if found.is_sound else "DAMAGED"
+        typer.echo(f"{path}: {verdict}, {run.condition}, {found.frames} of {run.n_frames} frames read back.")
+    if not sound:
+        typer.echo("diffuserbench resume takes damaged frames of a plan again.", err=True)
+        raise typer.Exit(1)
+
+
+def _advance(bar: Progress, done: int, _total: int) -> None:
+    bar.update(bar.task_ids[0], completed=done)
+
+
+@export_app.command(
     epilog=examples(
         "diffuserbench export RUN psfs.ome.tif --label psf",
         "diffuserbench export RUN video.mp4",

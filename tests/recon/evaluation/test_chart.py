@@ -11,7 +11,8 @@ from recon.evaluation.chart_reconstruction import ChartProblem, Setting, left_ou
 from recon.evaluation.even import even_with_best
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Point, pareto
-from recon.reconstruction.picture import PRIORS, reconstruct
+from recon.priors import PRIORS
+from recon.reconstruction.picture import reconstruct
 from recon.types import Calibration
 
 
