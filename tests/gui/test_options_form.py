@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -40,22 +41,12 @@ class Wanted:
             raise InputError("So many cannot be fine.")
 
 
-def place(text: str) -> tuple[int, int]:
-    try:
-        y, x = map(int, text.strip("()").split(","))
-    except ValueError:
-        raise BenchError(f"{text!r} is no place: Y,X.") from None
-    return y, x
-
-
 @pytest.fixture
 def form(qtbot: QtBot) -> OptionsForm:
     def only_plain(present: dict[str, Any]) -> str:
         return "" if present["how"] == "plain" else "Fine ones have no slack."
 
-    form = OptionsForm(
-        [Wanted], {"place": Behaviour(understand=place), "slack": Behaviour(enabled_when=only_plain)}
-    )
+    form = OptionsForm([Wanted], {"slack": Behaviour(enabled_when=only_plain)})
     scroll = QScrollArea()
     scroll.setWidget(form)
     scroll.setWidgetResizable(True)
@@ -119,11 +110,12 @@ def test_values_have_the_options_own_units(qtbot: QtBot, form: OptionsForm) -> N
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("far_um", "0", "Far must be above 0 mm, not 0 mm"),
+        ("far_um", "0", "Far must be a number, above 0 (mm), not 0."),
         ("far_um", "wide", "no number of mm"),
-        ("count", "10", "Number must be 1 or more, 9 or less"),
+        ("count", "10", "Number must be a whole number, 1 or more, 9 or less, not 10."),
         ("count", "2.5", "whole number"),
-        ("place", "there", "no place"),
+        ("place", "1", "Place must be Y,X"),
+        ("place", "1,b", "whole number"),
     ],
 )
 def test_what_is_wrong_is_told_where_it_stands(
@@ -137,7 +129,7 @@ def test_what_is_wrong_is_told_where_it_stands(
     assert form.widgets[name].property("refused")
     assert not form.check()
     assert form.values() is None
-    with pytest.raises(BenchError, match=reason.replace("(", r"\(")):
+    with pytest.raises(BenchError, match=re.escape(reason)):
         form.make(Wanted)
     type_in(qtbot, form, name, "3,3" if name == "place" else "3")
     assert not form.reason(name)
