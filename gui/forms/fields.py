@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import math
-import typing
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from PySide6.QtCore import QSignalBlocker
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
-from gui.widgets.entry import Entry, PathEntry, narrow
+from gui.widgets.dialogues import Browse
+from gui.widgets.entry import Entry, PathEntry, existing_path, narrow
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.question import Browse
 from instrument.files.errors import BenchError
 from recon.base.declare import Option
+from recon.base.option_text import default_shown, metavar, read, shown
+from recon.errors import InputError
 
 AUTOMATIC = "automatic"
-"""Shown for None among words to choose from."""
+"""Shown for None among words to choose from, where the declaration has no word for it."""
 _TEXT_HEIGHT_PX = 300
 
 
@@ -30,21 +30,27 @@ class Behaviour:
 
     Attributes
     ----------
-    understand : callable, optional
-        Turns a text into the value; BenchError with the reason where it cannot. Needed where the value is
-        neither a number, a path, a word to choose nor a text.
     browse : "open", "folder" or "save"
         What the dialogue of a path chooses.
     filters : str
         Of that dialogue, as QFileDialog has them.
+    must_exist : bool
+        Whether a path must name something that is there.
+    understand : callable, optional
+        Turns a text into the value in place of the declaration; BenchError with the reason where it cannot.
+    require : callable, optional
+        Called with a value that the declaration allows; returns why it cannot be all the same, empty where
+        it can.
     enabled_when : callable, optional
         Called with the form's present values by name; returns why the field does not apply, empty where it
         does. One that does not apply has its default.
     """
 
-    understand: Callable[[str], Any] | None = None
     browse: Browse = "open"
     filters: str = ""
+    must_exist: bool = False
+    understand: Callable[[str], Any] | None = None
+    require: Callable[[Any], str] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
 
 
@@ -67,27 +73,48 @@ class OptionField:
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         self.option = option
         self.behaviour = behaviour
+        said = option.declaration
+        # What is said of it calls it by its label, as the terminal calls it by its flag.
+        self._spoken = replace(option, name=self.bare_label, declaration=replace(said, flags=("",)))
 
     @property
-    def name(self) -> str:
+    def unit(self) -> str:
+        """The unit that people read."""
+        said = self.option.declaration
+        unit = said.shown_unit or said.unit
+        return "µm" if unit == "um" else unit
+
+    @property
+    def bare_label(self) -> str:
+        """Its label without the unit."""
+        said = self.option.declaration
+        return self.option.label.removesuffix(f" ({said.shown_unit or said.unit})")
+
+    @property
+    def label(self) -> str:
         """Its label, with the unit where the widget does not show it by itself."""
-        return self.option.label
+        return f"{self.bare_label} ({self.unit})" if self.unit else self.bare_label
 
     @property
     def tip(self) -> str:
         """What the declaration says of the option, with limits and default."""
-        said = self.option.declaration
-        lines = [said.help]
-        if limits := allowed(self.option):
-            lines.append(f"{limits[:1].upper()}{limits[1:]}.")
-        if said.default_words:
-            lines.append(f"Default: {said.default_words}.")
+        lines = [self.option.declaration.help]
+        if limits := self.option.limits(typed=True):
+            unit = f" {self.unit}" if self.unit else ""
+            lines.append(f"{', '.join(limits)}{unit}".capitalize() + ".")
+        if default := self.option.declaration.default_words:
+            lines.append(f"Default: {default}.")
         return "\n".join(lines)
 
     @property
     def default(self) -> Any:
         """The option's default; None where it has none and is needed."""
-        return None if self.option.default is MISSING else self.option.default
+        return None if self.option.is_required else self.option.default
+
+    def problem(self, value: Any) -> str:
+        """Say why a value cannot be; empty where it can."""
+        found = self._spoken.mistake(value, typed=True) or ""
+        return found or ("" if self.behaviour.require is None else self.behaviour.require(value))
 
     def read(self) -> tuple[Any, str]:
         """Return the value, in the option's own unit, and why it cannot be used; empty where it can."""
@@ -107,47 +134,40 @@ class NumberField(OptionField):
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         super().__init__(option, behaviour)
-        said = option.declaration
-        self.unit, self.scale = _pretty(said.shown_unit or said.unit), said.shown_factor
-        self._is_whole = float not in option.kinds
         empty = ""
         if option.default is None:  # an empty field shows no unit by itself
-            empty = f"{said.default_words or 'none'}{f' ({self.unit})' if self.unit else ''}"
-        self.widget: NumberEdit = NumberEdit(self.unit, integer=self._is_whole, tip=self.tip, empty=empty)
-        self.widget.check = self._problem
+            said = option.declaration
+            empty = said.default_words or said.none_word or "none"
+            empty += f" ({self.unit})" if self.unit else ""
+        self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
+        self.widget.check = lambda number: self.problem(self._in_own_unit(number))
         self.whole = self.widget
 
     @property
-    def name(self) -> str:
+    def label(self) -> str:
         """Its label; the unit stands behind the number."""
-        said = self.option.declaration
-        return self.option.label.removesuffix(f" ({said.shown_unit or said.unit})")
+        return self.bare_label
 
-    def _problem(self, number: float) -> str:
-        value = int(number) if self._is_whole else number * self.scale
-        if self.option.mistake(value) is None:
-            return ""
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{self.name} must be {allowed(self.option)}, not {number:g}{unit}."
+    def _in_own_unit(self, number: float) -> float | int:
+        # 22 mm are 22000 um, not 22000.000000000004.
+        factor = self.option.declaration.shown_factor
+        return int(number) if self.option.is_whole else float(f"{number * factor:.15g}")
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
         number, problem = self.widget.typed()
-        if number is None or problem:
-            return None, problem
-        # 22 mm are 22000 um, not 22000.000000000004.
-        return (int(number) if self._is_whole else float(f"{number * self.scale:.15g}")), ""
+        return (None, problem) if number is None or problem else (self._in_own_unit(number), "")
 
     def show(self, value: Any) -> None:
         """Show a value."""
         blocked = QSignalBlocker(self.widget)
-        self.widget.set_value(None if value is None else value / self.scale, overwrite=True)
+        scaled = None if value is None else value / self.option.declaration.shown_factor
+        self.widget.set_value(scaled, overwrite=True)
         blocked.unblock()
 
     def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
         """Have changes told."""
-        self.widget.textEdited.connect(lambda _: edited())
-        self.widget.submitted.connect(lambda _: edited())
+        self.widget.textChanged.connect(lambda _: edited())
         self.widget.refused.connect(refused)
 
 
@@ -176,7 +196,7 @@ class SwitchField(OptionField):
 
 
 class ChoiceField(OptionField):
-    """One of several words; None is one of them where it is the default."""
+    """One of several words; None is one of them where it can be."""
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         super().__init__(option, behaviour)
@@ -184,22 +204,25 @@ class ChoiceField(OptionField):
         self.whole = self.widget
         narrow(self.widget)
         self.widget.setToolTip(self.tip)
-        if option.default is None:
-            self.widget.addItem(AUTOMATIC, None)
+        none_word = option.declaration.none_word
+        if none_word or option.default is None:
+            self.widget.addItem(none_word or AUTOMATIC, None)
         if bool in option.kinds:
             self.widget.addItem("yes", True)
             self.widget.addItem("no", False)
-        for word in words_of(option):
-            self.widget.addItem(str(word), word)
+        for word in option.words:
+            self.widget.addItem(word, read(self._spoken, word))
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
-        return self.widget.currentData(), ""
+        value = self.widget.currentData()
+        return value, "" if value is None else self.problem(value)
 
     def show(self, value: Any) -> None:
         """Show a value."""
         blocked = QSignalBlocker(self.widget)
-        self.widget.setCurrentIndex(max(self.widget.findData(value), 0))
+        at = [self.widget.itemData(i) for i in range(self.widget.count())]
+        self.widget.setCurrentIndex(at.index(value) if value in at else 0)
         blocked.unblock()
 
     def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
@@ -212,27 +235,37 @@ class EntryField(OptionField):
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         super().__init__(option, behaviour)
-        self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=self._empty())
+        empty = default_shown(option) or ("none" if option.default is None else "")
+        self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=empty)
         self.whole = self.widget
         if option.kinds == (Path,):
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
             self.whole = path = PathEntry(self.widget, browse, behaviour.filters)
-            path.button.setAccessibleName(f"Choose {option.label}")
-
-    def _empty(self) -> str:
-        return self.option.declaration.default_words or ("none" if self.option.default is None else "")
+            path.button.setAccessibleName(f"Choose {self.bare_label}")
 
     def _understood(self, text: str) -> Any:
-        if not text and self.option.default is None:
-            return None
-        if not text and self.option.default is MISSING:
-            raise BenchError(f"{self.name} is needed here.")
-        if self.behaviour.understand is not None:
-            return self.behaviour.understand(text)
-        value: Any = Path(text).expanduser() if Path in self.option.kinds else text
-        if problem := self.option.mistake(value):
+        if not text:
+            if self.option.is_required:
+                raise BenchError(f"{self.bare_label} is needed here.")
+            return self.option.default
+        try:
+            if self.behaviour.understand is not None:
+                return self.behaviour.understand(text)
+            value = read(self._spoken, self._parts(text))
+        except InputError as error:
+            raise BenchError(str(error)) from error
+        except ValueError:  # not as many parts as are needed
+            raise BenchError(f"{self.bare_label} must be {metavar(self.option)}, not {text!r}.") from None
+        if self.option.kinds == (Path,):
+            value = existing_path(text) if self.behaviour.must_exist else value.expanduser()
+        if problem := self.problem(value):
             raise BenchError(problem)
         return value
+
+    def _parts(self, text: str) -> str | list[str]:
+        """Return one text, or the parts of what is repeated or has several words."""
+        has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
+        return text.replace(",", " ").split() if has_parts and not self.option.declaration.parse else text
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
@@ -244,7 +277,7 @@ class EntryField(OptionField):
     def show(self, value: Any) -> None:
         """Show a value."""
         blocked = QSignalBlocker(self.widget)
-        self.widget.setText("" if value is None or value is MISSING else str(value))
+        self.widget.setText("" if value is None else shown(self.option, value))
         blocked.unblock()
 
     def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
@@ -283,41 +316,13 @@ class LinesField(OptionField):
 
 def field_for(option: Option, behaviour: Behaviour) -> OptionField:
     """Return the field that fits an option's type."""
-    if words_of(option) or (bool in option.kinds and option.default is None):
-        return ChoiceField(option, behaviour)
-    if option.kinds == (bool,):
+    numbers = {int, float} & set(option.kinds)
+    if option.kinds == (bool,) and option.default is not None:
         return SwitchField(option, behaviour)
-    if behaviour.understand is None and set(option.kinds) <= {int, float}:
+    if (option.words and not numbers and Path not in option.kinds) or bool in option.kinds:
+        return ChoiceField(option, behaviour)
+    if numbers == set(option.kinds) and option.declaration.parse is None:
         return NumberField(option, behaviour)
     if isinstance(option.default, str) and "\n" in option.default:
         return LinesField(option, behaviour)
     return EntryField(option, behaviour)
-
-
-def words_of(option: Option) -> tuple[str, ...]:
-    """Return the words that an option can be: as declared, or as its type lists them."""
-    listed = [word for kind in option.kinds if typing.get_origin(kind) is Literal for word in kind.__args__]
-    only_words = len(listed) > 0 and all(typing.get_origin(kind) is Literal for kind in option.kinds)
-    return option.declaration.words() or (tuple(listed) if only_words else ())
-
-
-def allowed(option: Option) -> str:
-    """Return which numbers an option can be, in the unit that people read; empty where any."""
-    said = option.declaration
-    unit = _pretty(said.shown_unit or said.unit)
-    limits = (
-        ("", said.least, " or more"),
-        ("above ", said.above, ""),
-        ("", said.most, " or less"),
-        ("below ", said.below, ""),
-    )
-    found = [
-        f"{before}{value / said.shown_factor:g}{f' {unit}' if unit else ''}{after}"
-        for before, value, after in limits
-        if math.isfinite(value)
-    ]
-    return ", ".join(found)
-
-
-def _pretty(unit: str) -> str:
-    return "µm" if unit == "um" else unit

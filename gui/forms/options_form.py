@@ -82,13 +82,13 @@ class OptionsForm(QWidget):
         self.more.setAutoRaise(True)
         self.more.setArrowType(Qt.ArrowType.RightArrow)
         self.more.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
-        self.more.setToolTip(", ".join(f.name for f in self.fields.values() if self._is_folded(f)))
+        self.more.setToolTip(", ".join(f.bare_label for f in self.fields.values() if self._is_folded(f)))
         self._seldom = seldom
         self.more.toggled.connect(self._fold)
         seldom.hide()
-        self.more.setVisible(any(map(self._is_folded, self.fields.values())))
         layout.addWidget(self.more, 0, Qt.AlignmentFlag.AlignLeft)
         layout.addWidget(seldom)
+        self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
         layout.addStretch(1)
         for name, field in self.fields.items():
             field.show(field.default)
@@ -254,10 +254,10 @@ class OptionsForm(QWidget):
         reason.setObjectName("reason")
         reason.setWordWrap(True)
         reason.hide()
-        label = QLabel(field.name)
+        label = QLabel(field.label)
         label.setToolTip(field.tip)
         label.setBuddy(field.widget)
-        field.widget.setAccessibleName(field.name)
+        field.widget.setAccessibleName(field.bare_label)
         if isinstance(field, LinesField):
             rows.addRow(field.whole)
         else:

@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.background_reading import NewestOnly
 from gui.hologram_work import (
     Computed,
     HologramOrder,
@@ -31,13 +32,11 @@ from gui.hologram_work import (
     show_on_slm,
 )
 from gui.jobs import BusyError, Job
-from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.entry import Entry, PathEntry, existing_path, narrow, number
-from gui.widgets.facts import FactsView
 from gui.widgets.hologram_words import (
     brush_radius,
     depth_mm,
@@ -49,7 +48,7 @@ from gui.widgets.hologram_words import (
 )
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from gui.widgets.view_grid import ViewGrid
+from gui.widgets.result_views import FactsView, ViewGrid
 from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsView
 from instrument.bench.display_setup import depth_limit_mm
 from instrument.display.hologram_job import HologramResult, field_picture

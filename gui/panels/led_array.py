@@ -23,7 +23,7 @@ from gui.jobs import BusyError
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.theme import colours
-from gui.widgets.message import elided
+from gui.widgets.dialogues import elided
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import plot_widget, restyle
 from instrument.plan.patterns import shape_buttons

@@ -25,10 +25,9 @@ from gui.jobs import Job, JobContext
 from gui.live_follower import LiveFollower
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
-from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.question import choose_path
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.formatting import duration
 from instrument.live.full_picture import MOST_ITERATIONS, full_picture

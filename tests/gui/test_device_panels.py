@@ -16,7 +16,7 @@ from gui.panel import Panel
 from gui.panels.led_array import LedPanel
 from gui.panels.slm import SlmPanel
 from gui.panels.stage import StagePanel
-from gui.widgets.question import Question
+from gui.widgets.dialogues import Question
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.slm_correction import SlmCorrection, load_slm_correction

@@ -19,7 +19,7 @@ import instrument
 from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
-from gui.widgets.view_grid import best_columns
+from gui.widgets.result_views import best_columns
 from instrument.bench.config_file import parse_config
 from instrument.bench.display_setup import bench_display, depth_limit_mm
 from instrument.files.images import read_image, write_image

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gui.psf_pictures import PsfPictures, small
+from gui.widgets.sweep_views import PsfPictures, small
 
 
 def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:

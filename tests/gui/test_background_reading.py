@@ -6,8 +6,8 @@ import threading
 
 from pytestqt.qtbot import QtBot
 
+from gui.background_reading import NewestOnly
 from gui.jobs import JobRunner
-from gui.newest_only import NewestOnly
 
 WAIT_MS = 60_000
 
