@@ -23,7 +23,7 @@ from calibration_routines.psf.sampling import (
     planes_needed,
 )
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
-from calibration_routines.psf.sweep_options import AxialSweep, PointSweep, Sweep
+from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, PointSweep, Sweep, VolumeSweep
 from calibration_routines.psf.sweep_plan import check_sweep, sweep_plan
 from calibration_routines.psf.sweep_record import is_sweep
 from calibration_routines.psf.sweep_watch import PointTaken, SourceVisit, SweepEvent
@@ -39,6 +39,7 @@ __all__ = [
     "ExposureOutcome",
     "FieldResponse",
     "GridSweep",
+    "LateralSweep",
     "Photograph",
     "PointSweep",
     "PointTaken",
@@ -48,6 +49,7 @@ __all__ = [
     "SweepCalibration",
     "SweepEvent",
     "SweepExposures",
+    "VolumeSweep",
     "auto_expose",
     "axial_planes",
     "calibrate_sweep",
