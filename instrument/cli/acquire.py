@@ -143,7 +143,7 @@ def resume(
     from calibration_routines import is_sweep, watch_resumed
     from calibration_routines.psf.sweep import FOLDER
     from calibration_routines.psf.sweep_procedure import event_lines
-    from instrument.cli.sweeping import print_lines
+    from instrument.cli.calibrate import print_lines
 
     found = Run.open(run)
     if found.plan is None:
@@ -176,23 +176,23 @@ def resume(
 def _finish(run: Path, bench: Bench | None) -> None:
     """Make a sweep's calibration of its complete run, with retakes where there is a bench."""
     from calibration_routines import finish_sweep
-    from instrument.cli.sweeping import describe_result
+    from calibration_routines.psf.sweep_procedure import sweep_outcome
+    from instrument.cli.calibrate import print_outcome
 
     with one_task("Analysing") as advance:
         done = finish_sweep(run, bench, on_analysis=advance)
-    describe_result(Console(), done)
+    print_outcome(Console(), sweep_outcome(done))
 
 
 def _finish_others(run: Run) -> None:
     """Make the result of a complete run of calibrate angular or dpc that has none yet."""
     from calibration_routines.plan_procedures import finish_simple
-    from instrument.cli.sweeping import print_lines
+    from instrument.cli.calibrate import print_outcome
 
     with one_task("Analysing"):
         outcome = finish_simple(run)
-    if outcome is None:
-        return
-    print_lines(Console(), [*outcome.verdict, *(f"Wrote        {file}" for file in outcome.files)])
+    if outcome is not None:
+        print_outcome(Console(), outcome)
 
 
 def _close_recording(run: Run) -> None:

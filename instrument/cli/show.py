@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calibration_routines.display.hologram_photograph import CaptureOptions
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError, FileError
@@ -26,8 +27,8 @@ _PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photograph
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowOptions:
-    """How a hologram is shown and photographed, or where the picture of a run goes."""
+class _Shown:
+    """How a hologram is shown."""
 
     slm_calibration: Path | None = option(None, help="From calibrate slm.", applies=_PATTERN, group=_SHOWN)
     alignment: Path | None = option(
@@ -50,14 +51,12 @@ class ShowOptions:
         None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=_PHOTOGRAPHED
     )
     target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=_PHOTOGRAPHED)
-    average: int = option(4, help="Photographs a frame.", least=1, applies=_PATTERN, group=_PHOTOGRAPHED)
-    refine: int = option(
-        0,
-        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
-        least=0,
-        applies=_PATTERN,
-        group=_PHOTOGRAPHED,
-    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions(CaptureOptions, _Shown):
+    """How a hologram is shown and photographed, or where the picture of a run goes."""
+
     as_is: bool = option(
         False,
         help="Ask nobody; the laser stays on, and the background is estimated.",
@@ -206,8 +205,7 @@ def _capture(
         fields,
         display,
         prepare_target(read_image(options.target).pixels, display, wanted),
-        average=options.average,
-        refine=options.refine,
+        options,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
     )
     mark = " (SIMULATED)" if found.simulated else ""
