@@ -119,7 +119,7 @@ def _summary(
             ),
             (
                 "reconstruction",
-                f"{result.method} + {result.prior}, {width} x {height}, {len(result.history)} iterations",
+                f"{result.solver} + {result.prior}, {width} x {height}, {len(result.history)} iterations",
             ),
             ("compared", "inside the screen, linear light, one scale factor"),
         ),

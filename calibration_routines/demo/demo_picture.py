@@ -73,7 +73,7 @@ class Viewer:
         def look(record: IterationRecord, image: Callable[[], Float]) -> None:
             if not self.seconds or record.seconds - self.seconds[-1] >= _LOOK_EVERY_S:
                 self.seconds.append(record.seconds)
-                self.psnr_db.append(compare(self.picture(image()), self.truth, self.field).psnr_db)
+                self.psnr_db.append(compare(self.picture(image()[0]), self.truth, self.field).psnr_db)
                 advance(record.seconds)
 
         return look

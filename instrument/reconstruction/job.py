@@ -51,6 +51,7 @@ from instrument.reconstruction.record import (
 )
 from recon.base.noise import NoiseModel
 from recon.camera.refocus import at_depth
+from recon.reconstruction.measurement import binned_noise
 from recon.types import Calibration
 
 
@@ -130,9 +131,7 @@ class Job:
         factor: float = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
         if factor > 1 and self.provenance.get("mosaic"):
             factor /= 2  # red and blue have a quarter of the pixels
-        if isinstance(noise, NoiseModel):
-            return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
-        return None if noise is None else noise / factor
+        return binned_noise(noise, factor)
 
 
 def job_from_files(

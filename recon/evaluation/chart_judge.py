@@ -18,14 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.background import BackgroundRemoval
-from recon.camera.local_convolution import field_of
 from recon.evaluation.chart_settings import Setting, binnings_of
 from recon.evaluation.scene_score import score
 from recon.evaluation.scored import Point
-from recon.reconstruction.channel import BACKGROUND_FREQUENCIES, ChannelProblem
-from recon.reconstruction.preparation import channel_noise, data_of
-from recon.reconstruction.reduced import binned, blocks, enlarged, reduced_calibration
-from recon.reconstruction.volume import prepare_volume
+from recon.reconstruction.block_means import binned, blocks, enlarged
+from recon.reconstruction.measurement import Measurement, channel_noise
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
+from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.reduction import reduced_calibration
 from recon.types import Calibration
 
 if TYPE_CHECKING:
@@ -63,8 +64,7 @@ class Judge:
         self.held = binned((held & kept).astype(np.float32), factor) > 0.5
         self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
         self.erasures = self.held | ~self.kept
-        data, valid, _ = data_of(problem.measurement, None, None if kept.all() else ~kept)
-        pixel_noise = channel_noise(data[0], valid[0], problem.noise)
+        pixel_noise = channel_noise(problem.measurement, kept, problem.noise)
         self.noise = pixel_noise / factor
         self._block_noise = pixel_noise / block
         starts = [
@@ -77,7 +77,7 @@ class Judge:
         self._scored = self._blocks(self.held & self.kept) > 0.5
         used = self._blocks(~self.erasures) > 1 - 1e-6
         self._waves, self._block_waves = _slow_waves(~self.erasures), _slow_waves(used)
-        self._camera: ChannelProblem | None = None
+        self._camera: Part | None = None
 
     def _blocks(self, image: Array) -> Array:
         """Average over the coarsest binning's blocks, those that every binning has."""
@@ -123,40 +123,32 @@ class Judge:
 
     def _on_sensor(self, planes: Array) -> Array:
         height, width = self.measurement.shape
-        (_, (row, column)) = field_of((height, width), self.calibration.psfs.shape[2:])
-        top, left = row - height // 2, column - width // 2
-        return planes[:, top : top + height, left : left + width]
+        psf = self.calibration.psfs.shape
+        (rows, columns), _ = window_of("sensor", (height, width), (psf[2], psf[3]))
+        return planes[:, rows, columns]
 
     def _predict(self, planes: Array) -> Array:
         """Return the measurement that the setting's own model makes of what was found."""
-        camera = self._problem()
-        full = tuple(
-            s + p - 1 for s, p in zip(self.measurement.shape, self.calibration.psfs.shape[2:], strict=True)
-        )
-        window = (slice(0, full[0]), slice(0, full[1]))
-        placed = camera.start(planes, window)
-        predicted: Array = camera.camera.forward(placed)[0]
+        part = self._part()
+        placed = np.zeros(part.camera.domain_shape, part.dtype)
+        placed[0, :, : planes.shape[1], : planes.shape[2]] = planes / part.problem.image_scale[0, 0]
+        predicted: Array = part.camera.forward(placed)[0]
         if self.setting.background:
-            predicted = predicted + camera.background(placed)
+            predicted = predicted + part.background(placed)[0]
         return predicted * np.float32(self.noise)
 
-    def _problem(self) -> ChannelProblem:
+    def _part(self) -> Part:
         if self._camera is None:
-            scaled = prepare_volume(
-                self.measurement,
+            problem = Problem.of(
+                Measurement(self.measurement, self.noise, erasures=self.erasures),
                 self.central if self.setting.method != "volume" else self.calibration,
-                None,
-                self.erasures,
-                self.noise,
+                ReconstructionOptions(
+                    model=self.setting.model,
+                    estimate_background=self.setting.background,
+                    prior="nonnegative",
+                ),
             )
-            self._camera = ChannelProblem(
-                scaled,
-                0,
-                self.setting.model,
-                smooth=self.setting.background,
-                prior="nonnegative",
-                weights=np.ones((len(scaled.depths.z_um), 3)),
-            )
+            self._camera = Part(problem, slice(0, 1))
         return self._camera
 
 

@@ -1,0 +1,101 @@
+"""Priors by name, and how heavy each is where nobody says: one table by prior and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from recon.errors import InputError
+from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
+
+PRIORS: dict[str, Callable[[float], Prior]] = {
+    "tv": lambda weight: TotalVariation(weight) + NonNegativity(),
+    "tv-isotropic": lambda weight: TotalVariation(weight, isotropic=True) + NonNegativity(),
+    "tv-haar": lambda weight: HaarTotalVariation(weight) + NonNegativity(),
+    "l1": lambda weight: L1(weight) + NonNegativity(),
+    "nonnegative": lambda _: NonNegativity(),
+    "none": lambda _: Zero(),
+}
+"""Priors by name, as functions of their weight."""
+
+CameraClass = Literal["picture", "planes", "varying", "varying, with a background"]
+"""One PSF for one plane without a background; one PSF a depth; PSFs that vary over the field."""
+
+
+@dataclass(frozen=True, slots=True)
+class DefaultWeight:
+    """A default weight: in units of the noise, and at least so much.
+
+    Attributes
+    ----------
+    noise : float
+        In units of the noise, which the adjoint of a unit-energy PSF passes on unchanged.
+    least : float
+        Relative to ``max |A^H b|``: what errors of the model ask for when noise does not.
+    why : str
+    """
+
+    noise: float
+    least: float
+    why: str
+
+
+_AS_NOISE = "as large as the noise that the adjoint passes on"
+_VARYING = (
+    "near the best from 100 to 20000 photons, in the mean 0.9 dB (pictures by TV), 0.7 dB (volumes by TV) "
+    "and 0.6 dB (points by l1) better than the weights of one PSF, at four to twelve times the distance of "
+    "diffuser and sensor; strokes on black as near as that stand more. One convolution leaves errors of the "
+    "model, which larger weights hide as they hide noise; the true model leaves noise alone"
+)
+DEFAULT_WEIGHTS: Mapping[tuple[str, CameraClass], DefaultWeight] = {
+    ("tv", "picture"): DefaultWeight(1.0, 1e-5, _AS_NOISE),
+    ("tv", "planes"): DefaultWeight(1.0, 1e-5, _AS_NOISE),
+    ("tv", "varying"): DefaultWeight(0.5, 1e-5, _VARYING),
+    ("tv", "varying, with a background"): DefaultWeight(0.5, 1e-5, _VARYING),
+    ("l1", "picture"): DefaultWeight(1.0, 1e-5, f"{_AS_NOISE}: a picture has as many unknowns as data"),
+    ("l1", "planes"): DefaultWeight(
+        1.5, 1e-2, "what noise exceeds in few of the many voxels; errors of the model stand out among them"
+    ),
+    ("l1", "varying"): DefaultWeight(1.0, 4e-3, _VARYING),
+    ("l1", "varying, with a background"): DefaultWeight(
+        1.0, 1e-2, "with a background points lose the hold that the total of the light gives them"
+    ),
+}
+"""By what the prior counts ("tv": differences, "l1": light) and the camera."""
+
+
+def kind_of(prior: str) -> Literal["tv", "l1"]:
+    """Return what a prior counts: differences, or light."""
+    return "tv" if prior.startswith("tv") else "l1"
+
+
+def is_weighted(prior: str) -> bool:
+    """Whether a prior has a weight: bounds have none."""
+    return prior not in ("nonnegative", "none")
+
+
+def default_tau(prior: str, camera: CameraClass, peak: float) -> float:
+    """Return the default weight relative to ``max |A^H b|``, which is ``peak`` in units of the noise."""
+    row = DEFAULT_WEIGHTS[kind_of(prior), camera]
+    return max(row.noise / peak if peak > 0 else 0.0, row.least)
+
+
+def penalty_of(prior: str | Prior, weight: float) -> Prior:
+    """Return a prior of some weight, in units of the scaled problem; one of the user's own as it is."""
+    return prior if isinstance(prior, Prior) else PRIORS[prior](weight)
+
+
+def name_of(prior: str | Prior) -> str:
+    """Return how a prior is recorded."""
+    return prior if isinstance(prior, str) else "+".join(type(t).__name__ for t in prior.terms())
+
+
+def require_prior(prior: str | Prior) -> None:
+    """Raise InputError for what is neither a prior nor the name of one."""
+    import difflib
+
+    if not isinstance(prior, Prior) and prior not in PRIORS:
+        near = difflib.get_close_matches(str(prior), PRIORS, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"The prior {prior!r} is not known. Choose one of {', '.join(PRIORS)}.{hint}")
