@@ -20,7 +20,6 @@ import numpy as np
 from instrument.files.sample_images import load_sample
 from recon.base.threads import set_threads
 from recon.holography import (
-    Budget,
     DcTerm,
     Display,
     HologramModel,
@@ -47,8 +46,7 @@ def solve(
 ) -> np.ndarray:
     """Compute SLM frames."""
     model = HologramModel(display, [target], frames=frames)
-    budget = Budget(iterations, tolerance=0)
-    return compute_hologram(model, budget=budget, initial=start).slm
+    return compute_hologram(model, initial=start, iterations=iterations, tolerance=0).slm
 
 
 def psnr(slm: np.ndarray, display: Display, target: Target) -> float:

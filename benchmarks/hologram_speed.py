@@ -22,7 +22,7 @@ import numpy as np
 
 from instrument.files.sample_images import load_sample
 from recon.base.threads import set_threads
-from recon.holography import Budget, Display, HologramModel, Target, compute_hologram, random_mask
+from recon.holography import Display, HologramModel, Target, compute_hologram, random_mask
 
 Curve = list[tuple[int, float, float]]
 
@@ -59,12 +59,13 @@ def literal(display: Display, image: np.ndarray, iterations: int, step: float, s
 def ours(display: Display, image: np.ndarray, iterations: int, seed: int) -> Curve:
     """Run L-BFGS on the same grid from the same start."""
     model = HologramModel(display, [Target(image, white=1.0)], grid="dissertation")
-    compute_hologram(model, budget=Budget(iterations=1))  # compiles
+    compute_hologram(model, iterations=1)  # compiles
     curve: Curve = []
     began = time.process_time()
     found = compute_hologram(
         model,
-        budget=Budget(iterations=iterations, tolerance=0),
+        iterations=iterations,
+        tolerance=0,
         seed=seed,
         callback=lambda r, _: curve.append((r.iteration, time.process_time() - began, r.psnr_db)),
     )

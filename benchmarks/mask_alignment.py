@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.hologram_capture import capture_hologram
+from calibration_routines.display.hologram_photograph import capture_hologram
 from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
 from drivers.simulated.display_world import DisplayWorld
 from instrument.bench.bench import Bench
@@ -30,7 +30,7 @@ from instrument.bench.config_file import display_text, parse_config
 from instrument.bench.display_setup import bench_display
 from instrument.display.hologram_job import prepare_target
 from instrument.files.sample_images import load_sample
-from recon.holography import Budget, DcTerm, Display, HologramModel, compute_hologram
+from recon.holography import DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera
 from recon.holography.pose import Pose, nodes_of
 
@@ -119,7 +119,7 @@ def residual(world: DisplayWorld, found: np.ndarray, mask_shape: tuple[int, int]
 def hologram(display: Display, target: object) -> np.ndarray:
     """Compute a hologram."""
     model = HologramModel(display, [target])  # type: ignore[list-item]
-    return compute_hologram(model, budget=Budget(iterations=ITERATIONS)).slm[0]
+    return compute_hologram(model, iterations=ITERATIONS).slm[0]
 
 
 def one_start(seed: int, kind: str, plain: np.ndarray | None) -> tuple[dict[str, object], np.ndarray]:

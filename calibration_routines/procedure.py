@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from calibration_routines.display.spot_camera import SpotLook
-from calibration_routines.psf.axial_exposure import SweepExposures
+from calibration_routines.psf.exposure import SweepExposures
 from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, PlanEstimate, Step, estimate

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QApplication
 from gui.main_window import MainWindow, theme_of
 from gui.session import BenchSession
 from gui.theme import apply_theme
-from gui.widgets.message import TextWindow
+from gui.widgets.dialogues import TextWindow
 from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, in_words
 

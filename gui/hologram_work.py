@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,14 @@ from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
 from instrument.bench.safety import StepsFailedError
 from instrument.display.hologram_file import HologramFiles
-from instrument.display.hologram_job import Fit, HologramRequest, HologramResult, prepare_target, run_request
+from instrument.display.hologram_job import HologramResult, compute_and_judge, prepare_target
 from instrument.files.alignment_file import load_alignment
 from instrument.files.atomic import check_writable
 from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
 from instrument.reconstruction.result_list import free_name
 from instrument.runs.run_control import EndedEarlyError, RunControl
-from recon.holography import Display, HologramRecord, Target
+from recon.holography import Display, HologramOptions, HologramRecord, Target
 
 _INTERVAL_S = 0.25
 _FRAME_S = 0.02
@@ -49,49 +49,36 @@ class HologramOrder:
     out : Path
     z_mm : float
         Depth behind the focal plane.
-    fit : "cover", "contain" or "stretch"
-    srgb : bool
-    expansion : int or None
-        None: the bench's.
     alignment : Path or None
         From ``align mask``.
     further : tuple of (Path, float)
         Pictures in other planes, each with its depth in mm behind the focal plane.
-    request : HologramRequest
+    options : HologramOptions
     """
 
     picture: Path
     out: Path
     z_mm: float = 0.0
-    fit: Fit = "cover"
-    srgb: bool = False
-    expansion: int | None = None
     alignment: Path | None = None
     further: tuple[tuple[Path, float], ...] = ()
-    request: HologramRequest = field(default_factory=HologramRequest)
+    options: HologramOptions = field(default_factory=HologramOptions)
 
     def display(self, config: BenchConfig, size: tuple[tuple[int, int], float]) -> Display:
         """Return the display that it is computed for; errors as ``bench_display`` and ``load_alignment``."""
-        display = self.request.display_of(bench_display(config, size, expansion=self.expansion))
+        options = self.options
+        display = options.display_of(bench_display(config, size, expansion=options.expansion))
         return display if self.alignment is None else load_alignment(self.alignment).of(display)
 
     def targets(self, display: Display) -> list[Target]:
         """Return the picture of each plane as a target; errors as ``read_image``."""
         return [
-            prepare_target(
-                read_image(picture).pixels,
-                display,
-                z_mm=z_mm,
-                fit=self.fit,
-                srgb=self.srgb,
-                envelope=self.request.envelope,
-            )
+            prepare_target(read_image(picture).pixels, display, self.options, z_mm=z_mm)
             for picture, z_mm in ((self.picture, self.z_mm), *self.further)
         ]
 
     def files(self, config: BenchConfig, display: Display) -> HologramFiles:
         """Return the files that are written."""
-        return HologramFiles(self.out, config.display.slm_binning, self.request, [display])
+        return HologramFiles(self.out, config.display.slm_binning, self.options, [display])
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +118,7 @@ def compute(
     if write:
         files.check(overwrite=False)
     targets = order.targets(display)
-    budget = order.request.budget
+    options = order.options
     history: list[HologramRecord] = []
     told_s = 0.0
 
@@ -140,15 +127,15 @@ def compute(
         history.append(record)
         if time.monotonic() - told_s < _INTERVAL_S:
             return
-        share = record.iteration / max(budget.iterations, 1)
-        if budget.time_s is not None:
-            share = max(share, record.seconds / budget.time_s)
+        share = record.iteration / max(options.iterations, 1)
+        if options.time_s is not None:
+            share = max(share, record.seconds / options.time_s)
         phase = np.mod(np.angle(np.asarray(slm).reshape(-1, *display.slm_shape)[0]), 2 * np.pi)
         with contextlib.suppress(JobCancelledError):  # the optimiser hears of it by itself
             context.report(Progress(min(share, 1.0), tuple(history), phase.astype(np.float32)))
         told_s = time.monotonic()
 
-    result = run_request(display, targets, order.request, callback=watch, cancel=context.cancel)
+    result = compute_and_judge(display, targets, options, callback=watch, cancel=context.cancel)
     if write:
         files.write(0, 0, result)
     return Computed(order, display, targets[0], result, tuple(files.patterns(0, 0)) if write else ())
@@ -235,23 +222,23 @@ def _display_bench(
 def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None) -> str:
     """Return the Python that computes and writes a hologram.
 
-    ``weights`` is the expression that makes the request's weights; None where there are none.
+    ``weights`` is the expression that makes the weights; None where there are none.
     """
-    request = expression(_without_weights(order.request))
+    options = expression(replace(order.options, weights=None))
     if weights is not None:
-        request = f"replace({request}, loss_kind='spatial', weights={weights})"
+        options = f"replace({options}, weights={weights})"
     imports = [
         "from instrument.bench.config_file import load_config",
         "from instrument.bench.display_setup import bench_display, slm_size",
         "from instrument.display.hologram_file import HologramFiles",
-        "from instrument.display.hologram_job import HologramRequest, prepare_target, run_request",
+        "from instrument.display.hologram_job import compute_and_judge, prepare_target",
         "from instrument.files.images import read_image",
-        "from recon.holography import Budget, foveal_weights, painted_weights",
+        "from recon.holography import HologramOptions, foveal_weights, painted_weights",
     ]
     lines = [
         f"config = load_config({'None' if config.path is None else expression(config.path)})",
-        f"request = {request}",
-        f"display = request.display_of(bench_display(config, slm_size(config), expansion={order.expansion}))",
+        f"options = {options}",
+        "display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))",
     ]
     if order.alignment is not None:
         imports.append("from instrument.files.alignment_file import load_alignment")
@@ -259,21 +246,12 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
     lines += [
         f"planes = {expression([(order.picture, order.z_mm), *order.further])}",
         "targets = [",
-        f"    prepare_target(read_image(picture).pixels, display, z_mm=z_mm, fit={order.fit!r}, "
-        f"srgb={order.srgb}, envelope=request.envelope)",
+        "    prepare_target(read_image(picture).pixels, display, options, z_mm=z_mm)",
         "    for picture, z_mm in planes",
         "]",
-        "result = run_request(display, targets, request)",
-        f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, request, [display])",
+        "result = compute_and_judge(display, targets, options)",
+        f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, options, [display])",
         "files.write(0, 0, result)",
     ]
     head = ["from dataclasses import replace", "from pathlib import Path", "", *sorted(imports), ""]
     return "\n".join([*head, *lines, ""])
-
-
-def _without_weights(request: HologramRequest) -> HologramRequest:
-    from dataclasses import replace
-
-    if request.loss_kind != "spatial":
-        return request
-    return replace(request, loss_kind="frequency", weights=None)

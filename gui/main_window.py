@@ -22,16 +22,15 @@ from PySide6.QtWidgets import (
 )
 
 from gui.jobs import Job, words_for
-from gui.operator_request import OperatorRequest
 from gui.panel import Panel
 from gui.panels import PANELS, PanelEntry
 from gui.session import BenchSession
+from gui.session_news import OperatorRequest
 from gui.theme import THEMES, apply_theme
-from gui.widgets.device_chips import DeviceChips
+from gui.widgets.dialogues import Question
 from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.panel_place import PanelPlace
-from gui.widgets.question import Question
+from gui.widgets.window_parts import DeviceChips, PanelPlace
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QSizePolicy, QVB
 
 from gui.jobs import Job, JobRunner
 from gui.session import BenchSession
-from gui.widgets.message import elided
+from gui.widgets.dialogues import elided
 
 _REFUSAL_MS = 12_000
 

@@ -24,11 +24,11 @@ from PySide6.QtWidgets import (
 from calibration_routines.procedure import Outcome, Outlook, Procedure
 from gui.forms.as_python import script
 from gui.forms.field import Form
+from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.procedure_run import Ended, ProcedureRun, Situation
 from gui.session import BenchSession
-from gui.widgets.form_view import FormView
 from gui.widgets.run_bar import RunBar
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
@@ -65,7 +65,7 @@ class ProcedurePanel(Panel):
         self.run = ProcedureRun(session, self)
         self.outlook: Outlook | None = None
         """Of the form as it stands, once it was checked."""
-        self.views = {form.name: FormView(form) for form in self.forms}
+        self.views = {form.name: OptionsForm(form.fields) for form in self.forms}
         self.choice = QComboBox()
         self.choice.setToolTip("What to do")
         self.choice.setAccessibleName("Routine")
@@ -156,7 +156,7 @@ class ProcedurePanel(Panel):
         return self.forms[self.choice.currentIndex()]
 
     @property
-    def view(self) -> FormView:
+    def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
         return self.views[self.form.name]
 

@@ -13,9 +13,9 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.errors import RunEndedError
 from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
-from calibration_routines.psf.axial_exposure import SweepExposures
+from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
-from calibration_routines.psf.sweep_words import event_lines, exposure_lines
 from gui.jobs import Job, JobContext
 from gui.session import BenchSession
 from instrument.bench.photograph import Snapshot

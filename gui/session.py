@@ -19,10 +19,8 @@ from drivers.errors import (
     StoppedError,
 )
 from drivers.frame import Frame
-from gui.device_state import DeviceState, is_gone
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
-from gui.log_bridge import LogBridge
-from gui.operator_request import OperatorRequest
+from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.live.live_camera import LiveCamera

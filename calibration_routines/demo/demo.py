@@ -1,31 +1,94 @@
-"""The main job, start to end, on the simulated bench: calibrate, photograph, reconstruct, compare, show."""
+"""The main job, start to end, on the simulated bench: calibrate, photograph, reconstruct, compare, show.
+
+What it left where, its stages and their times stand in ``demo.json``, which is always whole.
+"""
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from calibration_routines.demo.demo_figure import write_pictures
-from calibration_routines.demo.demo_journal import Journal, new_folder
-from calibration_routines.demo.demo_picture import Viewer
+from calibration_routines.demo.demo_picture import Comparison, Viewer, compare, write_pictures
 from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.optics.comparison import Comparison, compare
 from calibration_routines.optics.photograph import Photograph, expose_scene, photograph
-from calibration_routines.psf.axial_exposure import SweepExposures, expose_sweep
+from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.field_response import FieldResponse, measure_field_response
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
+from instrument.files.errors import FileError
 from instrument.files.interrupt import CtrlC
 from instrument.runs.runner import Progress
 from recon import Reconstruction, reconstruct
+
+FILE = "demo.json"
+
+
+def new_folder(parent: Path) -> Path:
+    """Make a folder ``demo-DATE-TIME`` in ``parent``, which is made as well where missing.
+
+    Raises
+    ------
+    FileError
+        When it cannot be made.
+    """
+    name = f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}"
+    for suffix in ("", *(f"-{n}" for n in range(2, 100))):
+        folder = parent / f"{name}{suffix}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            if not parent.is_dir():
+                raise FileError(parent, "is no folder.", "Name a folder with --out.") from None
+            continue
+        except OSError as error:
+            raise FileError(folder, f"cannot be made: {error.strerror or error}.") from error
+        return folder
+    raise FileError(parent / name, "and 98 more of the same second exist already.")
+
+
+class Journal:
+    """The demo's record, ``demo.json`` in its folder; written from the first :meth:`note` on.
+
+    Attributes
+    ----------
+    seconds : dict
+        Name of each stage done to the seconds it took, in order.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / FILE
+        self.seconds: dict[str, float] = {}
+        self._record: dict[str, Any] = {}
+
+    def note(self, **entries: Any) -> None:
+        """Add entries (JSON-compatible) and write the file."""
+        self._record |= entries
+        self._write()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; while it runs the file names it."""
+        self.note(stage=name)
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = round(time.perf_counter() - started, 2)
+
+    def _write(self) -> None:
+        write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
+
 
 Advance = Callable[[float, float], None]
 Stage = Callable[[str], AbstractContextManager[Advance]]

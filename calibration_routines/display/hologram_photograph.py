@@ -1,27 +1,238 @@
-"""Photograph a pattern that is on the SLM: register the camera, judge, refine, keep what was seen."""
+"""Photograph a pattern that is on the SLM: register the camera, judge it, refine it, keep what was seen.
+
+With the camera in the loop one hologram is improved by what the camera sees of it; never for the worse.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.camera_in_the_loop import Refinement, refine_hologram
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.hologram_capture import Capture, capture_hologram, find_camera
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
-from instrument.display.hologram_job import Envelope
 from instrument.files.alignment_file import Alignment
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.holography import Display, Target
+from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
+from recon.holography.camera_map import CameraMap, register_camera
+from recon.holography.judge import compare, low_pass
+from recon.holography.lowpass import make_band
+from recon.holography.options import Envelope
 
 Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """A photographed hologram.
+
+    Attributes
+    ----------
+    seen : ndarray, float64, (height, width)
+        Low-passed picture over the field of view, the axis in the middle, in units of the target's white.
+    wanted : ndarray, float64
+        The target on the same grid, low-passed.
+    scores : Scores
+    saturated_fraction : float
+        Of the photograph's pixels.
+    """
+
+    seen: npt.NDArray[np.float64]
+    wanted: npt.NDArray[np.float64]
+    scores: Scores
+    saturated_fraction: float
+
+
+def capture_hologram(
+    io: DisplayBench,
+    fields: Sequence[Array],
+    display: Display,
+    target: Target,
+    camera: CameraMap,
+    *,
+    mean_per_ms: float,
+    average: int = 1,
+) -> Capture:
+    """Show SLM fields one after the other, add their photographs, and compare with the target.
+
+    Parameters
+    ----------
+    io : DisplayBench
+    fields : sequence of ndarray, complex, (height, width)
+        Time-multiplexed frames.
+    display : Display
+    target : Target
+    camera : CameraMap
+    mean_per_ms : float
+        Counts a millisecond of the mean intensity, from the registration.
+    average : int
+        Photographs of each frame.
+    """
+    full = (1 << io.bench.camera.significant_bits) - 1
+    exposure_ms = full / (12 * mean_per_ms)
+    total = np.zeros(io.bench.camera.image_shape)
+    for field in fields:
+        io.show(field)
+        for _ in range(average):
+            total += io.photograph(exposure_ms)
+    ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
+    shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
+    picture = np.fft.ifftshift(camera.resample(total, shape))
+    seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
+    wanted, peak = wanted_picture(target, display)
+    scaled = seen * (wanted.mean() / seen.mean())
+    return Capture(
+        scaled / peak, wanted / peak, compare(scaled, wanted, peak), float((total >= ceiling).mean())
+    )
+
+
+def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the low-passed target on the smallest grid that holds it, and its peak."""
+    band = make_band(display.slm_shape, display.factor, "alias-free")
+    spectrum, peak = target.spectrum(display, band)
+    height, width = band.seen_shape
+    half = np.zeros((height, width // 2 + 1), complex)
+    rows = np.r_[0 : band.top, height - (band.kept[0] - band.top) : height]
+    half[rows, : band.kept[1]] = spectrum
+    image = np.fft.irfft2(half, (height, width)) * (height * width)
+    return np.fft.fftshift(low_pass(image, display.slm_shape)), peak
+
+
+def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
+    """Blank the SLM, register the camera by the mask's speckle, and learn how bright the mean intensity is.
+
+    Returns
+    -------
+    CameraMap
+    float
+        Counts a millisecond of the mean intensity.
+
+    Raises
+    ------
+    InputError
+        When the speckle is not recognised.
+    """
+    camera = io.bench.camera
+    pitch_um = camera.pixel_pitch_um * camera.binning
+    across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
+    io.show(np.ones(display.slm_shape, complex))
+    frame = io.photograph(camera.exposure_ms)
+    found = register_camera(frame, display, across)
+    return found, _inner_mean(frame, found)
+
+
+def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
+    """Return counts a millisecond of the mean intensity of random phases.
+
+    A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
+    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
+    """
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
+    io.show(np.exp(1j * phases))
+    full = (1 << io.bench.camera.significant_bits) - 1
+    return _inner_mean(io.photograph(full / (12 * mean_per_ms)), camera)
+
+
+def _inner_mean(frame: Array, camera: CameraMap) -> float:
+    """Return the mean over the inner field of view, the mask pixels' envelope divided out."""
+    rows, columns = camera.pixels(np.array([-0.3, 0.3]), np.array([-0.3, 0.3]))
+    inner = frame[round(rows[0]) : round(rows[1]), round(columns[0]) : round(columns[1])]
+    envelope = (np.sinc(np.linspace(-0.3, 0.3, 101)) ** 2).mean() ** 2
+    return float(inner.mean() / envelope)
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """The best hologram found.
+
+    Attributes
+    ----------
+    slm : ndarray, complex64, (1, height, width)
+    first, best : Capture
+        Of the hologram given and of the best one; the same where nothing was gained.
+    psnr_db : tuple of float
+        Captured, round by round; the first is the hologram given.
+    """
+
+    slm: npt.NDArray[np.complex64]
+    first: Capture
+    best: Capture
+    psnr_db: tuple[float, ...]
+
+
+def refine_hologram(
+    io: DisplayBench,
+    slm: Array,
+    display: Display,
+    target: Target,
+    camera: CameraMap,
+    *,
+    mean_per_ms: float,
+    rounds: int = 4,
+    iterations: int = 15,
+    average: int = 4,
+    gain: float = 0.8,
+    progress: Callable[[int, float], object] | None = None,
+) -> Refinement:
+    """Photograph, let the model aim as far beyond as the picture falls short, compute again, photograph.
+
+    The model is wrong, but it knows well which change of the pattern changes the picture how. So it is asked
+    for what it showed last plus what the photograph lacked. The best pattern by photograph is kept: the
+    result is the given one where nothing helps (its photograph decides, with the camera's noise averaged).
+
+    Parameters
+    ----------
+    io : DisplayBench
+    slm : ndarray, complex, (1, height, width)
+        Start, from :func:`recon.holography.compute_hologram`.
+    display : Display
+        As the hologram was computed for, displacement included.
+    target : Target
+    camera : CameraMap
+    mean_per_ms : float
+    rounds, iterations : int
+        Photographs after the first, and iterations between them.
+    average : int
+        Photographs averaged in each round.
+    gain : float
+        Part of the shortfall that is added.
+    progress : callable, optional
+        ``progress(round, psnr_db)``.
+    """
+    best_slm = now = np.asarray(slm, np.complex64)
+    first = _capture(io, now, display, target, camera, mean_per_ms, average)
+    best, measured, history = first, first, [first.scores.psnr_db]
+    plain = HologramModel(display, [target])
+    for number in range(1, rounds + 1):
+        shown = plain.seen(now) / plain.peaks[0]
+        aim = np.maximum(shown + gain * (measured.wanted - measured.seen), 0)
+        model = HologramModel(display, [replace(target, image=aim, white=1.0)])
+        now = compute_hologram(model, initial=now, iterations=iterations, tolerance=0).slm
+        measured = _capture(io, now, display, target, camera, mean_per_ms, average)
+        history.append(measured.scores.psnr_db)
+        if progress is not None:
+            progress(number, measured.scores.psnr_db)
+        if measured.scores.psnr_db > best.scores.psnr_db:
+            best, best_slm = measured, now
+    return Refinement(best_slm, first, best, tuple(history))
+
+
+def _capture(
+    io: DisplayBench,
+    slm: Array,
+    display: Display,
+    target: Target,
+    camera: CameraMap,
+    mean: float,
+    average: int,
+) -> Capture:
+    return capture_hologram(io, list(slm), display, target, camera, mean_per_ms=mean, average=average)
 
 
 @dataclass(frozen=True, slots=True)

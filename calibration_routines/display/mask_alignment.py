@@ -7,7 +7,7 @@ nothing moves at first: each picture holds many spots, each computed for another
 2. Search: shift in steps of one SLM pixel, at a few depths; the spots that stand out are candidates, tried
    with rotations and scales, then on finer grids (:mod:`~calibration_routines.display.mask_search`).
 3. Refinement: pairs of spots on either side of the pose, a pair a parameter; all eight parameters in one
-   step (:mod:`~calibration_routines.display.mask_refinement`).
+   step (:mod:`~calibration_routines.display.mask_search`).
 4. The stage: a small move and back tells which way its axes go and how well it comes back; then it takes out
    shift, depth, rotation and significant tilts, until a further move promises less than that repeatability
    (:mod:`~calibration_routines.display.mask_stage`).
@@ -31,10 +31,8 @@ from calibration_routines.display.alignment_session import (
     Progress,
 )
 from calibration_routines.display.display_io import DisplayBench, approach_from_below
-from calibration_routines.display.mask_refinement import Measured, measure_sections, refine_pose
-from calibration_routines.display.mask_search import search_pose
-from calibration_routines.display.mask_stage import MaskStage
-from calibration_routines.display.placement_cost import PlacementCost
+from calibration_routines.display.mask_search import Measured, measure_sections, refine_pose, search_pose
+from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.display.spot_camera import SpotLook
 from recon.errors import InputError
 from recon.holography import Display

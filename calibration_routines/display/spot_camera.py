@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.hologram_capture import find_camera, random_brightness
+from calibration_routines.display.hologram_photograph import find_camera, random_brightness
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
 from recon.holography.pose import Pose

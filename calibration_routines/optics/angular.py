@@ -21,9 +21,9 @@ from scipy import ndimage
 
 from calibration_routines.errors import CalibrationError, RunEndedError
 from calibration_routines.optics.angular_response import AngularResponse, Curve, save_response
-from calibration_routines.psf.axial_analysis import DarkModel, replace_hot
-from calibration_routines.psf.axial_exposure import SweepExposures, expose_sweep
-from calibration_routines.psf.drift import Drift, judge_drift
+from calibration_routines.psf.analysis import DarkModel, replace_hot
+from calibration_routines.psf.exposure import SweepExposures, expose_sweep
+from calibration_routines.psf.stage_fit import Drift, judge_drift
 from calibration_routines.psf.sweep_plan import (
     DARK,
     PSF,

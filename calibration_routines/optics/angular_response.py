@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import write_text
-from instrument.files.errors import FileError
+from instrument.files.record import RecordFormat, plain, value_of
 from recon.optics.fall_off import FallOff
 
 CUT_OFF = 0.2
 """Response at the cut-off angle, relative to the axis (Kuo 2020, Sec. 4.4)."""
-_FORMAT = "diffuserbench angular response"
+_RESPONSE = RecordFormat(
+    "diffuserbench angular response", "angular response", make="diffuserbench calibrate angular writes one."
+)
 _LEAST = 1e-4  # below it a response's logarithm would be noise
 
 Floats = npt.NDArray[np.float64]
@@ -134,10 +134,10 @@ def _logarithm(angles: Floats, values: Floats) -> Callable[[Floats], Floats]:
 
 def save_response(response: AngularResponse, file: Path) -> Path:
     """Write the response as JSON; returns the file."""
-    data: dict[str, Any] = {"format": _FORMAT, **asdict(response)}
+    data: dict[str, Any] = plain(response)
     for name, curve in (("along_x", response.along_x), ("along_y", response.along_y)):
         data[name]["cut_offs_deg"] = curve.cut_offs_deg()
-    write_text(file, json.dumps(data, indent=1) + "\n")
+    _RESPONSE.write(file, data)
     return file
 
 
@@ -149,21 +149,6 @@ def load_response(file: Path | str) -> AngularResponse:
     FileError
         When the file cannot be read or is something else.
     """
-    path = Path(file)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data["format"] != _FORMAT:
-            raise ValueError(f"its format is {data['format']!r}, not {_FORMAT!r}")
-        curves = []
-        for name in ("along_x", "along_y"):
-            columns = (tuple(float(v) for v in data[name][c]) for c in ("angles_deg", "response", "seen"))
-            curves.append(Curve(*columns))
-        return AngularResponse(
-            curves[0], curves[1], tuple(data["findings"]), str(data["bench"]), bool(data["simulated"])
-        )
-    except OSError as error:
-        raise FileError(path, f"cannot be read: {error.strerror or error}.") from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileError(
-            path, f"is no angular response ({error}).", "calibrate angular writes one."
-        ) from error
+    data = _RESPONSE.read(Path(file))
+    with _RESPONSE.damaged(Path(file)):
+        return value_of(AngularResponse, data)  # the cut-offs beside its curves follow from them

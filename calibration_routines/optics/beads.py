@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError
 from calibration_routines.optics.photograph import expose_scene, photograph
-from calibration_routines.psf.axial_analysis import binned
+from calibration_routines.psf.analysis import binned
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, OperatorNeededError, SettingsError
 from instrument.runs.run_control import RunControl

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError
-from calibration_routines.psf.axial_analysis import DarkModel, replace_hot
+from calibration_routines.psf.analysis import DarkModel, replace_hot
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints

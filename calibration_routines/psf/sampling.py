@@ -1,4 +1,4 @@
-"""How many places a calibration must measure, from the physics of the camera (Kuo 2020, Sec. 5.3).
+"""How many places a calibration must measure and where they lie, from the physics (Kuo 2020, Sec. 5.3).
 
 Across the field the registered PSFs change with the sensor's angular response, ``f(atan(x / z))`` at the
 pixel beneath the axis (Eq. 5.9). Its bandwidth gives the spacing. Along the axis the edge of the pattern
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration_routines.psf.axial_plan import planes_needed
+from calibration_routines.psf.sweep_plan import Position
+from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
 from recon.optics.fall_off import FallOff
 from recon.types import Geometry
@@ -142,3 +144,159 @@ def axial_planes(
         f"{number} planes, at most {1e6 * step:.3g} per metre apart: 4 wavelength / p^2 with lenslets of "
         f"{lenslet_um:g} um and {wavelength_nm:g} nm (Kuo 2020, Eq. 5.10)",
     )
+
+
+MOST_POINTS_A_SIDE = 41
+"""More points along one axis at one depth are a mistake, or need --spacing."""
+_REACH_MARGIN = 0.98  # of the stage's travel
+
+
+@dataclass(frozen=True, slots=True)
+class GridSweep:
+    """The points of a sweep and why they lie where they do.
+
+    Attributes
+    ----------
+    points_um : tuple of (x, y, z)
+        Nearest depth first; within a depth row by row, every other row backwards.
+    reasons : tuple of str
+        What the numbers come from, in words.
+    shapes : tuple of (int, int)
+        Points along y and x at each depth.
+    """
+
+    points_um: tuple[Position, ...]
+    reasons: tuple[str, ...]
+    shapes: tuple[tuple[int, int], ...]
+
+
+def grid_sweep(
+    bench: Bench,
+    depths_um: tuple[float, ...],
+    *,
+    response: FallOff | None = None,
+    half_field_um: tuple[float, float] | None = None,
+    spacing_um: float | None = None,
+    x_um: float = 0.0,
+    y_um: float = 0.0,
+) -> GridSweep:
+    """Plan a grid of points at each depth.
+
+    Parameters
+    ----------
+    bench : Bench
+        Asked for its geometry and for how far its stage reaches.
+    depths_um : tuple of float
+    response : callable, optional
+        The sensor's angular response, for the spacing (:func:`lateral_spacing`).
+    half_field_um : (float, float), optional
+        Half height and half width of the grid, the same at all depths. Default: the field opposite to the
+        sensor, which is that of a reconstruction, as far as the stage reaches.
+    spacing_um : float, optional
+        Of the points; by default by Nyquist of the response, larger at larger depths.
+    x_um, y_um : float
+        The grid's centre.
+
+    Raises
+    ------
+    BenchError
+        When a number makes no sense, the geometry is not known, there is no stage, or the grid would be too
+        large.
+    """
+    _check_numbers(depths_um, half_field_um, spacing_um, (x_um, y_um))
+    points: list[Position] = []
+    reasons: list[str] = []
+    shapes = []
+    for number, z_um in enumerate(depths_um):
+        (half_y, half_x), field = _half_field(bench, z_um, half_field_um, (y_um, x_um))
+        axes, words = [], []
+        for along, half, centre in (("y", half_y, y_um), ("x", half_x, x_um)):
+            if spacing_um is None:
+                sampling = lateral_spacing(response, z_um, along=along)
+                spacing = sampling.value
+                words.append(sampling.reason)
+            else:
+                spacing = spacing_um
+            needed = 2 * np.ceil(half / spacing - 1e-9) + 1  # a float: it may be too large for an integer
+            if needed > MOST_POINTS_A_SIDE:
+                raise BenchError(
+                    f"A field of {2e-3 * half:.3g} mm along {along} at z = {z_um / 1e3:.4g} mm needs "
+                    f"{needed:.6g} points every {spacing / 1e3:.3g} mm, more than {MOST_POINTS_A_SIDE}. "
+                    "Make the field smaller or the spacing larger."
+                )
+            points_along = int(needed)
+            axes.append(
+                centre + np.linspace(-half, half, points_along) if points_along > 1 else np.array([centre])
+            )
+        shapes.append((len(axes[0]), len(axes[1])))
+        if number in (0, len(depths_um) - 1):
+            reasons += [f"Field: {field}", *(f"Spacing: {w}" for w in words)]
+        for row, y in enumerate(axes[0]):
+            across = axes[1] if row % 2 == 0 else axes[1][::-1]
+            points += [(round(float(x), 3), round(float(y), 3), z_um) for x in across]
+    if spacing_um is not None:
+        reasons.append(f"Spacing: {spacing_um / 1e3:.3g} mm at most, as asked")
+    return GridSweep(tuple(points), tuple(dict.fromkeys(reasons)), tuple(shapes))
+
+
+def _check_numbers(
+    depths_um: tuple[float, ...],
+    half_field_um: tuple[float, float] | None,
+    spacing_um: float | None,
+    centre_um: tuple[float, float],
+) -> None:
+    problems = [
+        f"a depth must be a finite number above 0 mm, not {z_um / 1e3:g}"
+        for z_um in depths_um
+        if not 0 < z_um < np.inf
+    ]
+    if spacing_um is not None and not 0 < spacing_um < np.inf:
+        problems.append(f"the spacing must be a finite number above 0 mm, not {spacing_um / 1e3:g}")
+    if not np.isfinite((*centre_um, *(half_field_um or ()))).all():
+        problems.append("the field and its centre must be finite numbers")
+    if problems:
+        raise BenchError("; ".join(problems) + ".")
+
+
+def _half_field(
+    bench: Bench, z_um: float, asked_um: tuple[float, float] | None, centre_um: tuple[float, float]
+) -> tuple[tuple[float, float], str]:
+    """Return half height and width of the grid at a depth, and why."""
+    if asked_um is not None:
+        if min(asked_um) < 0:
+            raise BenchError("Half the field's height and width must not be negative.")
+        words = f"+-{asked_um[1] / 1e3:.3g} x +-{asked_um[0] / 1e3:.3g} mm (x, y), as asked"
+        return asked_um, words
+    geometry = bench.geometry
+    if geometry.diffuser_distance_mm is None or geometry.pixel_pitch_um is None:
+        raise BenchError(
+            "How large the field is follows from diffuser_distance_mm and pixel_pitch_um: give them in "
+            "[geometry] of bench.toml, or give the field."
+        )
+    height, width = bench.camera.frame_shape[:2]
+    magnification = 1e3 * geometry.diffuser_distance_mm / z_um
+    seen = tuple(n * geometry.pixel_pitch_um / 2 / magnification for n in (height, width))
+    reach = _reach(bench, centre_um)
+    half = (min(seen[0], reach[0]), min(seen[1], reach[1]))
+    limited = " as far as the stage reaches," if half != seen else ""
+    words = (
+        f"+-{half[1] / 1e3:.3g} x +-{half[0] / 1e3:.3g} mm (x, y) at z = {z_um / 1e3:.4g} mm: the field "
+        f"opposite to the sensor,{limited} +-{np.rad2deg(np.arctan2(half[1], z_um)):.3g} x "
+        f"+-{np.rad2deg(np.arctan2(half[0], z_um)):.3g} degrees"
+    )
+    return half, words
+
+
+def _reach(bench: Bench, centre_um: tuple[float, float]) -> tuple[float, float]:
+    """How far the source can go from the centre to both sides along y and x."""
+    if bench.stage is None:
+        raise BenchError(f"{bench.config.label} has no [stage]: a grid of points needs one.")
+    limits = bench.stage.limits
+    reach = []
+    for axis, centre, offset in (
+        ("y_um", centre_um[0], bench.config.source.offset_um[1]),
+        ("x_um", centre_um[1], bench.config.source.offset_um[0]),
+    ):
+        low, high = limits.get(axis, (0.0, 0.0))
+        reach.append(max(0.0, _REACH_MARGIN * min(high + offset - centre, centre - low - offset)))
+    return reach[0], reach[1]

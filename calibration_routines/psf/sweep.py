@@ -17,20 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.display.stage_fit import StageFit
 from calibration_routines.errors import RunEndedError
-from calibration_routines.psf.axial_analysis import (
+from calibration_routines.psf.analysis import (
     DarkModel,
     PlaneFrames,
     SweepAnalysis,
     analyse_sweep,
     binned,
+    optical_binning,
     replace_hot,
 )
-from calibration_routines.psf.axial_exposure import SweepExposures, expose_sweep
-from calibration_routines.psf.drift import Drift, judge_drift
-from calibration_routines.psf.feature_size import optical_binning
+from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
+from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift
 from calibration_routines.psf.sweep_plan import (
     DARK,
     PSF,

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from calibration_routines.errors import CalibrationError
-from calibration_routines.psf.auto_exposure import AutoExposure, ExposureOutcome, ExposureTrial
-from calibration_routines.psf.axial_exposure import SweepExposures
 from calibration_routines.psf.axial_plan import AxialSweep
+from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, ExposureTrial, SweepExposures
 from calibration_routines.psf.sweep_plan import PointSweep, Position, Sweep
 from instrument.files.atomic import write_text
 from recon.types import Geometry

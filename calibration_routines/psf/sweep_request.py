@@ -11,8 +11,7 @@ import numpy as np
 
 from calibration_routines.optics.angular_response import load_response
 from calibration_routines.psf.axial_plan import AxialSweep
-from calibration_routines.psf.grid_plan import GridSweep, grid_sweep
-from calibration_routines.psf.sampling import axial_planes
+from calibration_routines.psf.sampling import GridSweep, axial_planes, grid_sweep
 from calibration_routines.psf.sweep_plan import PointSweep, Sweep
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError

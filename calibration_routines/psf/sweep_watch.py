@@ -16,13 +16,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.stage_fit import (
-    MAX_GAIN_ERROR,
-    MAX_ROTATION_MRAD,
-    find_pattern,
-    nominal_px_per_um,
-)
-from calibration_routines.psf.axial_analysis import (
+from calibration_routines.psf.analysis import (
     Counts,
     DarkModel,
     PlaneFrames,
@@ -31,14 +25,21 @@ from calibration_routines.psf.axial_analysis import (
     plane_light,
     saturated_pixels,
 )
-from calibration_routines.psf.background import block_mean
-from calibration_routines.psf.drift import LARGEST_PX, compare_visit, judge_visit
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
     PsfQuality,
     judge_next,
     measure_psf,
     with_finding,
+)
+from calibration_routines.psf.stage_fit import (
+    LARGEST_PX,
+    MAX_GAIN_ERROR,
+    MAX_ROTATION_MRAD,
+    compare_visit,
+    find_pattern,
+    judge_visit,
+    nominal_px_per_um,
 )
 from calibration_routines.psf.sweep_plan import (
     DARK,
@@ -51,6 +52,7 @@ from calibration_routines.psf.sweep_plan import (
 )
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
+from recon.base.blocks import block_mean
 from recon.types import Geometry
 
 Float = npt.NDArray[np.float32]

@@ -6,10 +6,10 @@ import logging
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class RawFrame:
         Whether all of it arrived.
     buffer : object
         What the driver needs to give it back.
+    facts : mapping
+        Further fields of :class:`~drivers.frame.FrameMetadata`, by name, that the device sent with the frame.
     """
 
     data: Bytes
@@ -59,6 +61,7 @@ class RawFrame:
     device_time_ns: int | None
     complete: bool
     buffer: object
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -386,6 +389,7 @@ class BufferedCamera(Camera):
             binning=run.binning,
             dropped_before=lost,
             saturated_fraction=float(np.count_nonzero(image >= full_scale) / image.size),
+            **raw.facts,
         )
 
     def _count_from(self, number: int, run: _Run) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from calibration_routines.display.alignment_session import AlignmentSettings
 from calibration_routines.display.display_procedures import AlignmentProcedure
-from gui.forms.field import Field, Form, field_of
+from gui.forms.field import Form, field_of, setting
 from instrument.files.errors import SettingsError
 
 _SECTIONS = AlignmentSettings().division
@@ -34,8 +34,8 @@ ALIGNMENT = Form(
         field_of(AlignmentSettings, "depth_um", "Depth", "Largest distance to look for", unit="µm"),
         field_of(AlignmentSettings, "moves", "Stage moves", "At most; 0: nothing moves", "whole"),
         field_of(AlignmentSettings, "max_frames", "Frames", "Give up rather than take more", "whole"),
-        Field("rows", "Section rows", "Of the SLM, measured one by one", "whole", _SECTIONS[0]),
-        Field("columns", "Section columns", "Of the SLM, measured one by one", "whole", _SECTIONS[1]),
+        setting("rows", "Section rows", "Of the SLM, measured one by one", "whole", _SECTIONS[0]),
+        setting("columns", "Section columns", "Of the SLM, measured one by one", "whole", _SECTIONS[1]),
         field_of(
             AlignmentSettings, "roll_mrad", "Rotation", "Largest to look for", unit="mrad", advanced=True
         ),

@@ -4,49 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
 from typing import Any, Literal
 
 from calibration_routines.procedure import Procedure
 from instrument.bench.bench import Bench
+from recon.base.declare import Declaration, Option
 
 Kind = Literal["number", "whole", "switch", "choice", "file", "text"]
+_TYPES: dict[Kind, type] = {
+    "number": float,
+    "whole": int,
+    "switch": bool,
+    "choice": str,
+    "file": Path,
+    "text": str,
+}
 MM = 1e3
 """Settings are in micrometres, people think of distances in millimetres."""
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """One setting.
-
-    Attributes
-    ----------
-    name : str
-        As the settings' class has it, which also names it in a ``SettingsError``.
-    label, tip : str
-    kind : str
-    default : object
-        In the setting's own unit; None: empty.
-    unit : str
-        As it is shown.
-    scale : float
-        The setting's own unit over the shown one.
-    optional : str
-        What happens when it is left empty; empty where it is needed.
-    choices : tuple of str
-    advanced : bool
-        Whether it is shown among those that seldom change.
-    """
-
-    name: str
-    label: str
-    tip: str
-    kind: Kind = "number"
-    default: Any = None
-    unit: str = ""
-    scale: float = 1.0
-    optional: str = ""
-    choices: tuple[str, ...] = ()
-    advanced: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +31,7 @@ class Form:
     Attributes
     ----------
     name, title, tip : str
-    fields : tuple of Field
+    fields : tuple of Option
     make : callable
         Makes the procedure of values by name; raises SettingsError or another BenchError.
     needs : tuple of str
@@ -68,32 +43,43 @@ class Form:
     name: str
     title: str
     tip: str
-    fields: tuple[Field, ...]
+    fields: tuple[Option, ...]
     make: Callable[[Mapping[str, Any]], Procedure]
     needs: tuple[str, ...] = ()
     start: Callable[[Bench], Mapping[str, Any]] | None = None
 
     def defaults(self) -> dict[str, Any]:
         """Return the values that fields begin with."""
-        return {field.name: field.default for field in self.fields}
+        return {field.name: None if field.default is MISSING else field.default for field in self.fields}
 
 
-def field_of(
-    settings: type,
-    name: str,
-    label: str,
-    tip: str,
-    kind: Kind = "number",
-    *,
-    default: Any = MISSING,
-    unit: str = "",
-    scale: float = 1.0,
-    optional: str = "",
-    choices: tuple[str, ...] = (),
-    advanced: bool = False,
-) -> Field:
-    """Return the field of a dataclass' setting, which begins with the class' own default."""
+def field_of(settings: type, name: str, label: str, tip: str, kind: Kind = "number", **said: Any) -> Option:
+    """Return a dataclass' setting as a declared option, which begins with the class' own default."""
     (known,) = (field for field in fields(settings) if field.name == name)
-    if default is MISSING:
-        default = None if known.default is MISSING else known.default
-    return Field(name, label, tip, kind, default, unit, scale, optional, choices, advanced)
+    default = said.pop("default", None if known.default is MISSING else known.default)
+    return setting(name, label, tip, kind, default, **said)
+
+
+def setting(
+    name: str, label: str, tip: str, kind: Kind = "number", default: Any = None, **said: Any
+) -> Option:
+    """Return a setting as a declared option.
+
+    ``unit`` is the one that is shown and ``scale`` how much of the setting's own it is; ``optional`` says
+    what happens when it is left empty, empty where it is needed; ``choices`` and ``advanced`` as they say.
+    """
+    optional, kind_of_value = said.get("optional", ""), _TYPES[kind]
+    return Option(
+        name,
+        kind_of_value | None if optional else kind_of_value,
+        default if optional or default is not None else MISSING,
+        Declaration(
+            help=f"{tip}.",
+            shown_unit=said.get("unit", ""),
+            shown_factor=said.get("scale", 1.0),
+            choices=said.get("choices", ()),
+            group="Rarely needed" if said.get("advanced") else "",
+            label=label,
+            default_words=optional,
+        ),
+    )

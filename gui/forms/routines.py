@@ -17,7 +17,7 @@ from calibration_routines.optics.optics_procedures import (
     DpcProcedure,
     PhotographProcedure,
 )
-from calibration_routines.psf.plan_procedures import PlanProcedure
+from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import (
     AxialRequest,
@@ -25,14 +25,15 @@ from calibration_routines.psf.sweep_request import (
     VolumeRequest,
     reachable_depths_um,
 )
-from gui.forms.field import MM, Field, Form, field_of
+from gui.forms.field import MM, Form, field_of, setting
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.plan import Plan
+from recon.base.declare import Option
 from recon.blind import BlindSettings
 
 
-def _taking(settings: type) -> tuple[Field, ...]:
+def _taking(settings: type) -> tuple[Option, ...]:
     return (
         field_of(settings, "average", "Frames a PSF", "All are stored; their mean is the PSF", "whole"),
         field_of(
@@ -79,7 +80,7 @@ def _taking(settings: type) -> tuple[Field, ...]:
     )
 
 
-def _centre(settings: type, what: str) -> tuple[Field, ...]:
+def _centre(settings: type, what: str) -> tuple[Option, ...]:
     return tuple(
         field_of(settings, f"{axis}_um", f"{what} {axis}", f"From the diffuser's centre, along {axis}",
                  unit="mm", scale=MM, advanced=True)
@@ -87,7 +88,7 @@ def _centre(settings: type, what: str) -> tuple[Field, ...]:
     )  # fmt: skip
 
 
-def _planes(settings: type) -> tuple[Field, ...]:
+def _planes(settings: type) -> tuple[Option, ...]:
     return (
         field_of(
             settings,
@@ -118,7 +119,7 @@ def _planes(settings: type) -> tuple[Field, ...]:
     )
 
 
-def _grid(settings: type) -> tuple[Field, ...]:
+def _grid(settings: type) -> tuple[Option, ...]:
     return (
         *(
             field_of(
@@ -324,9 +325,9 @@ BEADS = Form(
         field_of(
             BeadSlides, "binning", "Binning", "In software, on top of the camera's", "whole", unit="px"
         ),
-        Field("rows", "Rows of PSFs", "Over the field", "whole", _SOLVER.grid[0]),
-        Field("columns", "Columns of PSFs", "Over the field", "whole", _SOLVER.grid[1]),
-        Field("rank", "Highest rank", "Raised step by step up to this", "whole", len(_SOLVER.ranks)),
+        setting("rows", "Rows of PSFs", "Over the field", "whole", _SOLVER.grid[0]),
+        setting("columns", "Columns of PSFs", "Over the field", "whole", _SOLVER.grid[1]),
+        setting("rank", "Highest rank", "Raised step by step up to this", "whole", len(_SOLVER.ranks)),
         field_of(
             BlindSettings, "iterations", "Iterations", "Of each half-step", "whole", advanced=True
         ),
@@ -395,9 +396,9 @@ PLAN = Form(
     "Plan",
     "Any acquisition, as a plan in TOML: positions, light, SLM images, exposures",
     (
-        Field("file", "File", "A plan to read (.toml); relative paths are seen from its folder", "file",
+        setting("file", "File", "A plan to read (.toml); relative paths are seen from its folder", "file",
               optional="none: what stands below"),
-        Field("text", "Plan", "TOML; diffuserbench plan new writes the same example", "text",
+        setting("text", "Plan", "TOML; diffuserbench plan new writes the same example", "text",
               (files("instrument.plan") / "example.toml").read_text()),
     ),
     _plan,

@@ -26,10 +26,9 @@ from gui.forms.alignment import ALIGNMENT
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import colours
-from gui.widgets.displacement_plot import DisplacementPlot
+from gui.widgets.alignment_plots import DisplacementPlot, PoseView
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from gui.widgets.pose_view import PoseView
 
 _TRIED = {
     "shift_x": "shift x (mask pixels)",

@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QComboBox, QFormLayout, QLabel, QLineEdit, QPushBu
 from drivers.camera import Camera, Roi
 from gui.jobs import BusyError, Job
 from gui.panel import Panel
-from gui.widgets.message import TextWindow
+from gui.widgets.dialogues import TextWindow
 from gui.widgets.number_edit import NumberEdit
 from instrument.bench.camera_settings import CameraState, read_camera
 

@@ -12,7 +12,7 @@ from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.widgets.chart_view import ChartView
-from gui.widgets.question import choose_path
+from gui.widgets.dialogues import choose_path
 from gui.widgets.stability_view import StabilityView
 from instrument.evaluation.chart_reader import read_chart
 from instrument.evaluation.chart_words import subject_of

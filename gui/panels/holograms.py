@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.background_reading import NewestOnly
 from gui.hologram_work import (
     Computed,
     HologramOrder,
@@ -31,13 +32,11 @@ from gui.hologram_work import (
     show_on_slm,
 )
 from gui.jobs import BusyError, Job
-from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.entry import Entry, PathEntry, existing_path, narrow, number
-from gui.widgets.facts import FactsView
 from gui.widgets.hologram_words import (
     brush_radius,
     depth_mm,
@@ -49,22 +48,22 @@ from gui.widgets.hologram_words import (
 )
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from gui.widgets.view_grid import ViewGrid
+from gui.widgets.result_views import FactsView, ViewGrid
 from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsView
 from instrument.bench.display_setup import depth_limit_mm
-from instrument.display.hologram_job import HologramRequest, HologramResult, field_picture
+from instrument.display.hologram_job import HologramResult, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.reconstruction.result_list import free_name
 from recon.errors import InputError
-from recon.holography import Budget, Scores
+from recon.holography import LOSSES, HologramOptions, Scores
 from recon.holography.display import require_defocus
 
 _IMAGES = "Pictures (*.png *.tif *.tiff *.jpg *.bmp *.npy)"
 _PREVIEW_ITERATIONS = 8
 _AVERAGE = 4
 _MODES = {"all alike": "uniform", "a fovea, dragged": "fovea", "painted": "painted"}
-_LOSSES = {"what the eye resolves": "frequency", "every pixel": "none"}
+_DEFAULT = HologramOptions()
 
 
 class HologramsPanel(Panel):
@@ -105,7 +104,7 @@ class HologramsPanel(Panel):
         self.brush = Entry(brush_radius, "0.06", tip="Radius of the brush, as a fraction of the field")
         self.clear = QPushButton("Clear")
         self.clear.setToolTip("Take off all that was painted (left button paints, right button rubs out)")
-        self.loss = _choice(list(_LOSSES), "Which differences count (Kuo 2020, Eqs. 7.16 and 7.17)")
+        self.loss = _choice([], "\n".join(f"{loss.name}: {loss.help}" for loss in LOSSES.values()))
         self.envelope = _choice(
             ["shade", "correct", "ignore"],
             "The mask pixels' envelope: shade the target too, correct it in the hologram, or ignore it",
@@ -116,7 +115,9 @@ class HologramsPanel(Panel):
             tip="Time-multiplexed frames",
         )
         self.iterations = Entry(
-            number("The number of iterations", "", above_zero=True, whole=True), "100", tip="At most so many"
+            number("The number of iterations", "", above_zero=True, whole=True),
+            str(_DEFAULT.iterations),
+            tip="At most so many",
         )
         self.psnr_db = Entry(
             number("The PSNR", "dB", above_zero=True), tip="Stop at this PSNR", placeholder="no limit (dB)"
@@ -268,24 +269,25 @@ class HologramsPanel(Panel):
             When a field is not understood, or nothing counts.
         """
         weights = self.target.weights()
-        iterations = _PREVIEW_ITERATIONS if preview else self.iterations.value() or 100
-        request = HologramRequest(
-            loss_kind="spatial" if weights is not None else _LOSSES[self.loss.currentText()],  # type: ignore[arg-type]
+        iterations = _PREVIEW_ITERATIONS if preview else self.iterations.value() or _DEFAULT.iterations
+        options = HologramOptions(
+            fit=self.fit.currentText(),  # type: ignore[arg-type]
+            srgb=self.srgb.isChecked(),
+            expansion=self.expansion.value(),
+            loss=self.loss.currentText(),
             weights=weights,
             frames=self.frames.value() or 1,
             envelope=self.envelope.currentText(),  # type: ignore[arg-type]
-            budget=Budget(iterations, psnr_db=self.psnr_db.value()),
+            iterations=iterations,
+            psnr_db=self.psnr_db.value(),
         )
         return HologramOrder(
             picture=self.picture.value(),
             out=self.out.value(),
             z_mm=self.z_mm.value(),
-            fit=self.fit.currentText(),  # type: ignore[arg-type]
-            srgb=self.srgb.isChecked(),
-            expansion=self.expansion.value(),
             alignment=self.alignment.value(),
             further=self.further.value(),
-            request=request,
+            options=options,
         )
 
     def _depth_mm(self, text: str) -> float:
@@ -539,8 +541,17 @@ class HologramsPanel(Panel):
         mode = _MODES[self.weights_mode.currentText()]
         self._rows.setRowVisible(self.periphery, mode != "uniform")
         self._rows.setRowVisible(self._painting, mode == "painted")
-        self._rows.setRowVisible(self.loss, mode == "uniform")
+        self._offer_losses(weighted=mode != "uniform")
         self.target.set_mode(mode)  # type: ignore[arg-type]
+
+    def _offer_losses(self, *, weighted: bool) -> None:
+        """Offer the losses that take weights, or those that do not."""
+        names = [loss.name for loss in LOSSES.values() if loss.takes_weights == weighted]
+        if [self.loss.itemText(n) for n in range(self.loss.count())] != names:
+            self.loss.clear()
+            self.loss.addItems(names)
+            if _DEFAULT.loss in names:
+                self.loss.setCurrentText(str(_DEFAULT.loss))
 
     def _set_running(self, running: bool) -> None:
         for button in (self.preview_button, self.compute_button):

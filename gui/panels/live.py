@@ -23,14 +23,13 @@ from drivers.frame import Frame
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.panels.camera_form import CameraForm
-from gui.panels.live_overlays import CrossHair, ProfileLine, RegionBox
-from gui.panels.record_bar import RecordBar
 from gui.session import BenchSession
-from gui.widgets.colour_maps import NAMES
-from gui.widgets.histogram import HistogramPlot
+from gui.theme import NAMES
 from gui.widgets.image_view import ImageView
+from gui.widgets.live_overlays import CrossHair, HistogramPlot, ProfileLine, RegionBox
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import curve_pen, plot_widget
+from gui.widgets.record_bar import RecordBar
 from instrument.live.frame_view import histogram, line_profile, percentiles, sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
 from instrument.runs.snapshot import (

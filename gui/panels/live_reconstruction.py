@@ -25,10 +25,9 @@ from gui.jobs import Job, JobContext
 from gui.live_follower import LiveFollower
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
-from gui.widgets.message import elided
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.question import choose_path
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.formatting import duration
 from instrument.live.full_picture import full_picture
@@ -144,10 +143,11 @@ class LiveReconstructionPanel(Panel):
         path = self.session.config.path
         calibration = "calibration" if self.loaded is None else str(self.loaded.path)
         return (
-            "from instrument.bench.bench import open_bench\n\n"
+            "from instrument.bench.bench import open_bench\n"
+            "from instrument.live.live import live_view\n\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"
             f"    settings = dict(z_um={self.z_um!r}, budget_ms={self.budget.value!r})\n"
-            f"    with bench.live({calibration!r}, **settings) as live:\n"
+            f"    with live_view(bench, {calibration!r}, **settings) as live:\n"
             "        for result in live:\n"
             "            print(result.picture.quality, result.latency_ms)\n"
         )

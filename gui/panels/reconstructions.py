@@ -23,18 +23,16 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.background_reading import NewestOnly
 from gui.jobs import Job, JobContext
-from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.python_lines import expression
 from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
-from gui.widgets.colour_maps import as_shown
-from gui.widgets.convergence import ConvergenceView
-from gui.widgets.facts import FactsView
-from gui.widgets.picture_view import PictureView
-from gui.widgets.question import Question, choose_path
+from gui.theme import as_shown
+from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.reconstruct_form import CALIBRATION, PSF, ReconstructForm
+from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError

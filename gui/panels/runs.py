@@ -27,13 +27,13 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
-from calibration_routines.psf.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.psf.sweep import FOLDER
 from calibration_routines.psf.sweep_record import is_sweep
+from gui.background_reading import NewestOnly
 from gui.forms.as_python import script
 from gui.jobs import BusyError, Job, JobContext
-from gui.newest_only import NewestOnly
 from gui.panel import Panel
 from gui.procedure_run import Ended, ProcedureRun
 from gui.session import BenchSession

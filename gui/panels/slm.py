@@ -21,10 +21,9 @@ from PySide6.QtWidgets import (
 from gui.jobs import BusyError
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
-from gui.widgets.message import elided
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from gui.widgets.question import choose_path
 from instrument.files.errors import BenchError
 from instrument.files.slm_correction import SlmCorrection, load_slm_correction, show_levels
 from instrument.files.slm_image import read_slm_image

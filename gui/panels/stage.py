@@ -24,8 +24,8 @@ from drivers.stage import StageAxis
 from gui.jobs import BusyError, Job
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.dialogues import Question
 from gui.widgets.number_edit import NumberEdit
-from gui.widgets.question import Question
 
 _READ_MS = 200
 _FINE, _COARSE = 0.1, 10.0

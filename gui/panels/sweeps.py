@@ -17,13 +17,10 @@ from calibration_routines.psf.sweep_watch import PointTaken
 from gui.forms.routines import ROUTINES
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
-from gui.psf_pictures import PsfPictures
 from gui.session import BenchSession
+from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView
-from gui.widgets.message import elided
-from gui.widgets.path_plot import PathPlot
-from gui.widgets.picture import Picture
-from gui.widgets.psf_table import PsfTable
+from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import count

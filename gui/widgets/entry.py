@@ -10,7 +10,7 @@ from PySide6.QtCore import Signal
 from PySide6.QtGui import QFocusEvent
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QToolButton, QWidget
 
-from gui.widgets.question import Browse, choose_path
+from gui.widgets.dialogues import Browse, choose_path
 from instrument.files.errors import BenchError
 
 

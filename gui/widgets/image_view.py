@@ -1,4 +1,4 @@
-"""An image to look at: colour map, levels, zoom, pan, values under the mouse; by mouse and by keys."""
+"""Images on the screen: shown with levels, stretched to their place, and walked over by arrow keys."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, QRectF, Qt, Signal
+from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, Qt, Signal
+from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from gui.theme import colours
-from gui.widgets.arrow_keys import ArrowKeys
-from gui.widgets.colour_maps import grey_indices, indices_of, spares_hues, table
+from gui.theme import colours, grey_indices, indices_of, spares_hues, table
 from instrument.live.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
@@ -234,3 +233,135 @@ class ImageView(QWidget):
         pixel = self.pixel_at(event.scenePos())
         if pixel is not None:
             self.clicked.emit(*pixel)
+
+
+class StretchedImage(ImageView):
+    """Shows images over ``extent``, (width, height) in voxels; places under the mouse are voxels.
+
+    Parameters
+    ----------
+    keep_aspect : bool
+        Whether voxels are square on the screen; without, the image fills its place.
+    parent : QWidget, optional
+    """
+
+    def __init__(self, *, keep_aspect: bool = True, parent: QWidget | None = None) -> None:
+        super().__init__(parent=parent)
+        self.extent = (1, 1)
+        self.box.setAspectLocked(keep_aspect)
+
+    def show_over(self, image: Image, extent: tuple[int, int], levels: tuple[float, float]) -> None:
+        """Show an image, (height, width[, 3]), over ``extent``."""
+        moved = self.extent != extent or self.image is None
+        self.extent = extent
+        self.show_image(image, *levels)
+        self.item.setRect(0, 0, *extent)
+        if moved:
+            self.whole()
+
+    def whole(self) -> None:
+        """Show the whole extent."""
+        across, down = self.extent
+        self.box.setRange(xRange=(0, across), yRange=(0, down), padding=0.01)
+
+    def pixel_at(self, place: QPointF) -> tuple[int, int] | None:
+        """Return column and row of the voxel at a place of the scene; None outside."""
+        if self.image is None:
+            return None
+        point: Any = self.box.mapSceneToView(place)
+        column, row = int(np.floor(point.x())), int(np.floor(point.y()))
+        across, down = self.extent
+        return (column, row) if 0 <= column < across and 0 <= row < down else None
+
+    def describe(self, column: int, row: int) -> str:
+        """Return a voxel's place and value in words."""
+        assert self.image is not None
+        height, width = self.image.shape[:2]
+        value = self.image[row * height // self.extent[1], column * width // self.extent[0]]
+        return f"{column}, {row}: {' '.join(f'{v:.5g}' for v in np.atleast_1d(value))}"
+
+
+ARROWS: dict[int, tuple[int, int]] = {
+    Qt.Key.Key_Left: (-1, 0),
+    Qt.Key.Key_Right: (1, 0),
+    Qt.Key.Key_Up: (0, -1),
+    Qt.Key.Key_Down: (0, 1),
+}
+"""Columns and rows: down the screen is positive, as in an image."""
+_ZOOM: dict[int, float] = {
+    Qt.Key.Key_Plus: 1.25,
+    Qt.Key.Key_Equal: 1.25,
+    Qt.Key.Key_Minus: 0.8,
+    Qt.Key.Key_0: 0.0,
+}
+
+
+class ArrowKeys(QObject):
+    """Keys of a widget that shows a picture or plot; the widget takes the keyboard by Tab or a click.
+
+    The steps are those of the stage: Shift makes them ten times as large, Ctrl a tenth.
+
+    Parameters
+    ----------
+    widget : QWidget
+        Where the keyboard is when the keys are pressed.
+
+    Signals
+    -------
+    moved : float, float
+        Steps to the right and down.
+    resized : float, float
+        The same with Alt.
+    acted : bool
+        Space or Return (True); Backspace or Delete (False).
+    zoomed : float
+        Factor of ``+`` and ``-``; 0 for the key ``0``: show the whole.
+    entered
+        The widget has the keyboard now.
+    left
+        It has not any more.
+    """
+
+    moved = Signal(float, float)
+    resized = Signal(float, float)
+    acted = Signal(bool)
+    zoomed = Signal(float)
+    entered = Signal()
+    left = Signal()
+
+    def __init__(self, widget: QWidget) -> None:
+        super().__init__(widget)
+        widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        widget.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """Take the keys that mean something here."""
+        if event.type() is QEvent.Type.FocusIn:
+            self.entered.emit()
+        elif event.type() is QEvent.Type.FocusOut:
+            self.left.emit()
+        if event.type() is not QEvent.Type.KeyPress or not isinstance(event, QKeyEvent):
+            return False
+        key, held = event.key(), event.modifiers()
+        if key in ARROWS:
+            scale = 1.0
+            if held & Qt.KeyboardModifier.ShiftModifier:
+                scale = 10.0
+            elif held & Qt.KeyboardModifier.ControlModifier:
+                scale = 0.1
+            across, down = ARROWS[key]
+            signal = self.resized if held & Qt.KeyboardModifier.AltModifier else self.moved
+            signal.emit(across * scale, down * scale)
+            return True
+        if held & (Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.AltModifier):
+            return False  # shortcuts
+        if key in _ZOOM:
+            self.zoomed.emit(_ZOOM[key])
+            return True
+        if key in (Qt.Key.Key_Space, Qt.Key.Key_Return, Qt.Key.Key_Enter):
+            self.acted.emit(True)
+            return True
+        if key in (Qt.Key.Key_Backspace, Qt.Key.Key_Delete):
+            self.acted.emit(False)
+            return True
+        return False

@@ -10,8 +10,7 @@ import pyqtgraph as pg
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QPushButton, QWidget
 
-from gui.theme import colours
-from gui.widgets.colour_maps import NAMES
+from gui.theme import NAMES, colours
 from gui.widgets.number_edit import NumberEdit
 from instrument.reconstruction.result_file import white_level
 

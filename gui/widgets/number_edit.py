@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QFocusEvent, QKeyEvent
@@ -70,6 +71,8 @@ class NumberEdit(QLineEdit):
         super().__init__(parent)
         self.unit = unit
         self.minimum, self.maximum = minimum, maximum
+        self.check: Callable[[float], str] | None = None
+        """Further says of a number why it cannot be; empty where it can."""
         self._integer = integer
         self._tip = tip
         self._value = value
@@ -175,7 +178,8 @@ class NumberEdit(QLineEdit):
             unit = f" {self.unit}" if self.unit else ""
             in_force = "" if self._value is None else f" In force: {self._text(self._value)}."
             return None, f"{number:g}{unit} is outside what is allowed: {self._range()}.{in_force}"
-        return number, ""
+        problem = "" if self.check is None else self.check(number)
+        return (None, problem) if problem else (number, "")
 
     def _range(self) -> str:
         unit = f" {self.unit}" if self.unit else ""

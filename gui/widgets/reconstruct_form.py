@@ -34,9 +34,9 @@ from instrument.reconstruction.request import (
 from instrument.reconstruction.result_file import Outputs
 from instrument.reconstruction.words import parse_binning, parse_dark, parse_erasures, parse_noise
 from recon.camera.camera_model import MODELS
+from recon.priors import PRIORS
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, VOLUME_PRIORS
-from recon.reconstruction.weights import PRIORS
 
 CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"

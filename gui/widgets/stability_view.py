@@ -12,7 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from gui.theme import colours
-from gui.widgets.arrow_keys import ArrowKeys
+from gui.widgets.image_view import ArrowKeys
 from gui.widgets.plot import curve_pen, plot_widget, restyle
 from recon.verdict.failure import Failure
 

@@ -22,12 +22,12 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.background_reading import Axis, Slice, SliceReader
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours
+from gui.widgets.image_view import StretchedImage
 from gui.widgets.levels_bar import LevelsBar
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from gui.widgets.slice_reader import Axis, Slice, SliceReader
-from gui.widgets.stretched_image import StretchedImage
 from instrument.files.volume_source import Plane, VolumeSource
 from instrument.reconstruction.volume_views import Projections, grey, in_colour_of_depth, project
 

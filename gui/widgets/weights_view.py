@@ -14,7 +14,7 @@ from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtWidgets import QWidget
 
 from gui.theme import colours
-from gui.widgets.stretched_image import StretchedImage
+from gui.widgets.image_view import StretchedImage
 from recon.holography import foveal_weights, painted_weights
 
 WeightsMode = Literal["uniform", "fovea", "painted"]

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import Self, cast
 
 from drivers.camera import Camera
 from drivers.device import Device, SharedPart
@@ -29,10 +29,7 @@ from instrument.bench.photograph import Snapshot, photograph
 from instrument.bench.safety import Step, StepsFailedError, safe_steps, try_all
 from instrument.bench.source_mount import Position, SourceMount
 from instrument.files.errors import BenchError
-from recon.types import Calibration, Geometry
-
-if TYPE_CHECKING:
-    from instrument.live.live import LiveView
+from recon.types import Geometry
 
 _log = logging.getLogger(__name__)
 _at_exit = ClosingAtExit()
@@ -208,25 +205,6 @@ class Bench:
                 "was lost while frames were taken; those since are not kept.",
                 "Check its cable and power, then take them again.",
             )
-
-    def live(self, calibration: Calibration | Path | str, *, n_buffers: int = 4, **settings: Any) -> LiveView:
-        """Return a live reconstruction of the camera, to be used as a context manager.
-
-        ``settings`` are those of :class:`recon.streams.live.LiveReconstructor`: ``z_um``, ``budget_ms``,
-        ...::
-
-            with bench.live("calibration", budget_ms=33) as live:
-                for result in live:
-                    show(result.picture.image, result.picture.quality)
-
-        Raises
-        ------
-        FileError, InputError
-            When the calibration cannot be used.
-        """
-        from instrument.live.live import live_view
-
-        return live_view(self.camera.stream(n_buffers), calibration, **settings)
 
     def with_surroundings(self, metadata: FrameMetadata) -> FrameMetadata:
         """Return a frame's metadata completed with stage position, LED pattern and SLM image as they are."""

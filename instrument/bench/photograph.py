@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ class Snapshot:
         ``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for
         a single frame, float32 for a mean.
     metadata : FrameMetadata
-        Of the last frame; ``dropped_before`` is summed and ``saturated_fraction`` the largest of all frames.
+        Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`.
     average : int
         Number of frames averaged.
     """
@@ -59,20 +59,18 @@ def photograph(
     if average < 1:
         raise BenchError(f"A photograph is the mean of 1 or more frames, not {average}.")
     total = np.zeros((), np.float64)
-    dropped, saturated = 0, 0.0
+    metadata: list[FrameMetadata] = []
     for taken in range(1, average + 1):
         frame = camera.snap()
-        dropped += frame.metadata.dropped_before
-        saturated = max(saturated, frame.metadata.saturated_fraction)
+        metadata.append(frame.metadata)
         if average > 1:
             total = np.add(total, frame.image)
         if seen is not None:
             seen(frame)
         if on_frame is not None:
             on_frame(taken)
-    metadata = replace(frame.metadata, dropped_before=dropped, saturated_fraction=saturated)
     if average == 1:
-        return Snapshot(frame.image, metadata, average)
+        return Snapshot(frame.image, frame.metadata, average)
     mean = np.asarray(total / average, np.float32)
     mean.flags.writeable = False
-    return Snapshot(mean, metadata, average)
+    return Snapshot(mean, FrameMetadata.of_mean(metadata), average)

@@ -6,9 +6,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from instrument.cli.options import GroupedCommand, flat
+from instrument.files.errors import FileError
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
@@ -26,16 +29,28 @@ BenchOption = Annotated[
 ]
 
 
-def command_app(help_text: str = "") -> typer.Typer:
-    """Return an empty app in the house style: plain help, no installer, errors left to ``main``."""
-    return typer.Typer(
-        help=help_text or None,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        no_args_is_help=bool(help_text),
-        context_settings={"help_option_names": ["--help", "-h"], "max_content_width": 100},
-    )
+class App(typer.Typer):
+    """A typer application whose commands may take options objects, in the house style: plain help."""
+
+    def __init__(self, help_text: str = "") -> None:
+        super().__init__(
+            help=help_text or None,
+            add_completion=False,
+            pretty_exceptions_enable=False,
+            rich_markup_mode=None,
+            no_args_is_help=bool(help_text),
+            context_settings={"help_option_names": ["--help", "-h"], "max_content_width": 110},
+        )
+
+    def command(self, name: str | None = None, **settings: Any) -> Callable[[Any], Any]:
+        """Register a function as a command; its options classes become flags."""
+        register = super().command(name, cls=GroupedCommand, **settings)
+
+        def registered(function: Callable[..., None]) -> Callable[..., None]:
+            register(flat(function))
+            return function
+
+        return registered
 
 
 def examples(*lines: str) -> str:
@@ -96,6 +111,18 @@ def naming_as_is() -> Iterator[None]:
         raise OperatorNeededError(
             f"{error} Or, where the light already is as it must be, add --as-is."
         ) from None
+
+
+def require_new(file: Path, *, overwrite: bool) -> None:
+    """Refuse to write over a file.
+
+    Raises
+    ------
+    FileError
+        When it exists, unless it may be overwritten.
+    """
+    if file.exists() and not overwrite:
+        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
 
 
 @contextmanager

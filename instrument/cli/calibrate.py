@@ -10,12 +10,12 @@ from rich.console import Console
 
 from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
 from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
-from instrument.cli.app import BenchOption, command_app, examples, open_and_say
+from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.numbers import finite, positive
 from instrument.cli.sweeping import say_and_take
 from instrument.files.errors import BenchError
 
-app = command_app("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
+app = App("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
 
 ZMin = Annotated[
     float, typer.Option("--z-min", metavar="MM", callback=finite, help="Nearest plane, from the diffuser.")

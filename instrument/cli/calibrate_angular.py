@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from calibration_routines import SweepExposures
 from calibration_routines.optics.optics_procedures import AngularProcedure
-from calibration_routines.psf.sweep_words import exposure_lines
+from calibration_routines.psf.sweep_procedure import exposure_lines
 from instrument.cli.app import BenchOption, examples, open_and_say
 from instrument.cli.numbers import finite
 from instrument.cli.sweeping import Told, print_lines

@@ -14,13 +14,13 @@ from rich.markup import escape
 from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
 from calibration_routines.demo.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.psf.sweep_words import exposure_lines, quality_lines
+from calibration_routines.psf.sweep_procedure import exposure_lines, quality_lines
 from instrument.bench.bench import Bench
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.cli.progress import one_task
 from instrument.cli.sweeping import describe_plan, print_lines
 
-app = command_app()
+app = App()
 
 
 @app.command(epilog=examples("diffuserbench demo", "diffuserbench demo --out /tmp/demos"))

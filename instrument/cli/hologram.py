@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import enum
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,73 +11,58 @@ import numpy.typing as npt
 import typer
 
 from instrument.bench.display_setup import bench_display, slm_size
-from instrument.cli.app import BenchOption, command_app, examples, load_and_say, saying_what_is_left
-from instrument.cli.hologram_output import tell
+from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.display.hologram_file import HologramFiles
 from instrument.display.hologram_job import (
-    HologramRequest,
     HologramResult,
-    foveal,
+    compute_and_judge,
     prepare_target,
     read_weights,
-    run_request,
 )
 from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
-from recon.holography import Budget, Display, HologramRecord, HologramStop, Target
-from recon.holography.optimise import Method
+from recon.base.declare import option
+from recon.holography import Display, HologramOptions, HologramRecord, HologramStop, Target
 
-app = command_app()
-
-RGB_NM = (638.0, 520.0, 450.0)
+app = App()
 
 
-class LossName(enum.StrEnum):
-    """The losses of Kuo 2020, Eqs. 7.16, 7.17 and 7.19."""
+@dataclass(frozen=True, kw_only=True)
+class HologramInputs:
+    """What is shown, for which display, and where the pattern goes."""
 
-    NONE = "none"
-    FREQUENCY = "frequency"
-    SPATIAL = "spatial"
+    z_mm: tuple[float, ...] = option(
+        (),
+        help="Depth of each target behind the focal plane; once a target.",
+        default_words="0",
+        unit="mm",
+        group="Files",
+    )
+    video: bool = option(
+        False, help="TARGET is a folder or stack; each frame starts from the last.", group="Files"
+    )
+    color: bool = option(False, help="Field-sequential colour: one pattern a channel.", group="Files")
+    wavelengths: tuple[float, float, float] = option(
+        (638.0, 520.0, 450.0), help="With --color, nm.", above=0, metavar="R G B", group="Files"
+    )
+    weights: Path | None = option(None, help="A weight image instead of the fovea.", group="What counts")
+    alignment: Path | None = option(None, help="From align mask.", group="Display")
+    out: Path = option(
+        Path("slm.png"),
+        help="8-bit phase, 256 levels a turn (--complex: .npy); .json and a preview.",
+        flags=("--out", "-o"),
+        group="Files",
+    )
+    force: bool = option(False, help="Overwrite files that exist.", group="Files")
 
-
-class MethodName(enum.StrEnum):
-    """The methods of :func:`recon.holography.compute_hologram`."""
-
-    LBFGS = "lbfgs"
-    NESTEROV = "nesterov"
-    ONE_STEP = "one-step"
-
-
-METHODS: dict[MethodName, Method] = {
-    MethodName.LBFGS: "lbfgs",
-    MethodName.NESTEROV: "nesterov",
-    MethodName.ONE_STEP: "one_step",
-}
-
-
-class GridName(enum.StrEnum):
-    """The grids of :mod:`recon.holography.lowpass`."""
-
-    ALIAS_FREE = "alias-free"
-    DISSERTATION = "dissertation"
-
-
-class FitName(enum.StrEnum):
-    """How a picture that is not square fills the field."""
-
-    COVER = "cover"
-    CONTAIN = "contain"
-    STRETCH = "stretch"
-
-
-class EnvelopeName(enum.StrEnum):
-    """What becomes of the mask pixels' diffraction envelope."""
-
-    SHADE = "shade"
-    CORRECT = "correct"
-    IGNORE = "ignore"
+    def depths(self, count: int) -> list[float]:
+        """Return the depth of each of ``count`` targets; BenchError where they do not fit."""
+        depths = list(self.z_mm) or [0.0] * count
+        if len(depths) != count or (count > 1 and not self.z_mm):
+            raise BenchError(f"Give --z-mm once for each of the {count} targets (found {len(self.z_mm)}).")
+        return depths
 
 
 @app.command(
@@ -92,175 +77,65 @@ class EnvelopeName(enum.StrEnum):
 )
 def hologram(
     target: Annotated[list[Path], typer.Argument(metavar="TARGET...", help="The picture, or one per plane.")],
+    inputs: HologramInputs,
+    options: HologramOptions,
     bench: BenchOption = None,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="8-bit phase, 256 levels a turn; .json and a preview."
-        ),
-    ] = Path("slm.png"),
-    z_mm: Annotated[
-        list[float] | None,
-        typer.Option("--z-mm", metavar="MM", help="Depth of each target behind the focal plane. Default: 0."),
-    ] = None,
-    expansion: Annotated[
-        int | None,
-        typer.Option(
-            "--expansion",
-            "-q",
-            help="Étendue expansion 4, 16, 36 ... Default: the bench's.",
-            show_default=False,
-        ),
-    ] = None,
-    loss: Annotated[LossName, typer.Option("--loss", help="Which differences count.")] = LossName.FREQUENCY,
-    centre: Annotated[
-        str, typer.Option("--centre", metavar="Y,X", help="Of the spatial weights.")
-    ] = "0.5,0.5",
-    radius: Annotated[float, typer.Option("--radius", help="Of full weight, fraction of the field.")] = 0.28,
-    periphery: Annotated[float, typer.Option("--periphery", help="Weight far outside.")] = 0.1,
-    weights: Annotated[
-        Path | None,
-        typer.Option("--weights", metavar="FILE", help="A weight image instead.", show_default=False),
-    ] = None,
-    alignment: Annotated[
-        Path | None,
-        typer.Option("--alignment", metavar="FILE", help="From align mask.", show_default=False),
-    ] = None,
-    method: Annotated[MethodName, typer.Option("--method", "-m")] = MethodName.LBFGS,
-    grid: Annotated[
-        GridName, typer.Option("--grid", help="dissertation: unpadded, aliases.")
-    ] = GridName.ALIAS_FREE,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Time-multiplexed frames.")] = 1,
-    complex_slm: Annotated[
-        bool, typer.Option("--complex", help="For an SLM that sets amplitude and phase; out is a .npy file.")
-    ] = False,
-    levels: Annotated[
-        int | None,
-        typer.Option(
-            "--levels",
-            metavar="N",
-            help="The SLM shows N phases only (2, 4, 8 ... 256). Default: continuous, written in 256.",
-            show_default=False,
-        ),
-    ] = None,
-    video: Annotated[
-        bool, typer.Option("--video", help="TARGET is a folder or stack; each frame starts from the last.")
-    ] = False,
-    color: Annotated[
-        bool, typer.Option("--color", help="Field-sequential colour: one pattern a channel.")
-    ] = False,
-    wavelengths: Annotated[
-        tuple[float, float, float], typer.Option("--wavelengths", metavar="R G B", help="With --color, nm.")
-    ] = RGB_NM,
-    fit: Annotated[
-        FitName, typer.Option("--fit", help="How the picture fills the square field.")
-    ] = FitName.COVER,
-    srgb: Annotated[
-        bool, typer.Option("--srgb", help="Values are sRGB-coded; default: they are intensities.")
-    ] = False,
-    envelope: Annotated[
-        EnvelopeName,
-        typer.Option(
-            "--envelope",
-            help="Mask pixels' envelope: shade the target too, correct it in the hologram, ignore it.",
-        ),
-    ] = EnvelopeName.SHADE,
-    iterations: Annotated[int, typer.Option("--iterations", "-n", min=1, help="At most so many.")] = 100,
-    time_s: Annotated[
-        float | None, typer.Option("--time", metavar="S", help="At most S seconds.", show_default=False)
-    ] = None,
-    psnr_db: Annotated[
-        float | None,
-        typer.Option("--psnr", metavar="DB", help="Stop at this PSNR of the seen image.", show_default=False),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the random start.")] = 0,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
 ) -> None:
     """Compute the SLM phase that shows a picture through the bench's scattering mask.
 
     Writes the pattern, a JSON file with settings and metrics, and a preview of what will be seen with and
     without the eye's low-pass (computed, not photographed). Ctrl-C keeps the pattern so far.
     """
-    if levels is not None and levels not in (2, 4, 8, 16, 32, 64, 128, 256):
-        raise BenchError(f"--levels {levels}: the SLM's phases are 2, 4, 8, 16, 32, 64, 128 or 256.")
     config = load_and_say(bench)
     size = slm_size(config)
-    request = HologramRequest(
-        method=METHODS[method],
-        loss_kind=loss.value,
-        weights=_weights(loss, weights, centre, radius, periphery),
-        grid="alias_free" if grid is GridName.ALIAS_FREE else "dissertation",
-        frames=frames,
-        complex_slm=complex_slm,
-        phase_levels=levels,
-        envelope=envelope.value,
-        budget=Budget(iterations, time_s, psnr_db),
-        seed=seed,
-    )
-    pictures = _pictures(target, video=video)
-    depths = _depths(z_mm, 1 if video else len(target))
-    lasers = wavelengths if color else (None,)
+    if inputs.weights is not None:
+        options = replace(options, weights=read_weights(inputs.weights))
+    pictures = _pictures(target, video=inputs.video)
+    depths = inputs.depths(1 if inputs.video else len(target))
+    lasers = inputs.wavelengths if inputs.color else (None,)
     displays = [
-        request.display_of(bench_display(config, size, expansion=expansion, wavelength_nm=nm))
+        options.display_of(bench_display(config, size, expansion=options.expansion, wavelength_nm=nm))
         for nm in lasers
     ]
-    if alignment is not None:
-        found = load_alignment(alignment)
+    if inputs.alignment is not None:
+        found = load_alignment(inputs.alignment)
         displays = [found.of(display) for display in displays]
-    writer = HologramFiles(
-        out, config.display.slm_binning, request, displays, video=len(pictures) if video else 0
-    )
-    writer.check(overwrite=force)
+    frames = len(pictures) if inputs.video else 0
+    writer = HologramFiles(inputs.out, config.display.slm_binning, options, displays, video=frames)
+    writer.check(overwrite=inputs.force)
     with saying_what_is_left(*writer.files()), first_interrupt_cancels() as cancel:
         initial: list[Any] = [None] * len(displays)
         for number, planes in enumerate(pictures):
             for channel, display in enumerate(displays):
                 targets = [
                     prepare_target(
-                        _channel(picture, channel if color else None),
-                        display,
-                        z_mm=z,
-                        fit=fit.value,
-                        srgb=srgb,
-                        envelope=envelope.value,
+                        _channel(picture, channel if inputs.color else None), display, options, z_mm=z
                     )
                     for picture, z in zip(planes, depths, strict=True)
                 ]
-                result = _compute(
-                    display, targets, request, initial[channel], cancel, writer.label(number, channel)
-                )
-                initial[channel] = result.hologram.slm if video else None
+                label = writer.label(number, channel)
+                result = _compute(display, targets, options, initial[channel], cancel, label)
+                initial[channel] = result.hologram.slm if inputs.video else None
                 writer.write(number, channel, result)
-                tell(writer.label(number, channel), result, request)
+                _tell(label, result, options)
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
 
 
 def _compute(
-    display: Display, targets: list[Target], request: HologramRequest, initial: Any, cancel: Any, label: str
+    display: Display, targets: list[Target], options: HologramOptions, initial: Any, cancel: Any, label: str
 ) -> HologramResult:
-    budget = request.budget
     with progress_bar() as bar:
-        task = bar.add_task(label, total=budget.iterations, note="")
+        task = bar.add_task(label, total=options.iterations, note="")
 
         def show(record: HologramRecord, _slm: object) -> None:
             done = float(record.iteration)
-            if budget.time_s is not None:
-                done = max(done, budget.iterations * record.seconds / budget.time_s)
+            if options.time_s is not None:
+                done = max(done, options.iterations * record.seconds / options.time_s)
             bar.update(task, completed=done, note=f"{record.psnr_db:.2f} dB")
 
-        return run_request(display, targets, request, initial=initial, callback=show, cancel=cancel)
-
-
-def _weights(
-    loss: LossName, weights: Path | None, centre: str, radius: float, periphery: float
-) -> np.ndarray[Any, Any] | None:
-    if loss is not LossName.SPATIAL:
-        if weights is not None:
-            raise BenchError("--weights needs --loss spatial.")
-        return None
-    return read_weights(weights) if weights is not None else foveal(centre, radius, periphery)
+        return compute_and_judge(display, targets, options, initial=initial, callback=show, cancel=cancel)
 
 
 def _pictures(target: list[Path], *, video: bool) -> list[list[Pixels]]:
@@ -272,16 +147,28 @@ def _pictures(target: list[Path], *, video: bool) -> list[list[Pixels]]:
     return [[frame] for frame in read_stack(target[0]).pixels]
 
 
-def _depths(z_mm: list[float] | None, count: int) -> list[float]:
-    depths = [0.0] * count if not z_mm else list(z_mm)
-    if len(depths) != count or (count > 1 and not z_mm):
-        raise BenchError(f"Give --z-mm once for each of the {count} targets (found {len(z_mm or [])}).")
-    return depths
-
-
 def _channel(picture: Pixels, channel: int | None) -> npt.NDArray[Any]:
     if channel is None:
         return picture
     if picture.ndim != 3:
         raise BenchError("--color needs a colour picture; this one is grey.")
     return np.ascontiguousarray(picture[..., channel])
+
+
+def _tell(label: str, result: HologramResult, options: HologramOptions) -> None:
+    """Say how good the hologram is, for which grid, envelope and frame count."""
+    history = result.hologram.history
+    typer.echo(
+        f"{label}: {history[-1].iteration} iterations, {result.hologram.seconds:.1f} s: "
+        f"{result.hologram.stop_reason}"
+    )
+    for plane, score in enumerate(result.scores):
+        name = f"  plane {plane + 1}: " if len(result.scores) > 1 else "  seen: "
+        typer.echo(
+            f"{name}{score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
+            f"middle quarter {score.crop_psnr_db:.2f} dB, SSIM {score.crop_ssim:.3f}"
+        )
+    typer.echo(
+        f"  (computed on the alias-free grid, envelope {options.envelope}, {options.frames} frame(s), "
+        "through the eye's low-pass)"
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from instrument.cli.app import command_app, examples
+from instrument.cli.app import App, examples
 from instrument.cli.reconstruct_options import (
     AllowSaturatedOption,
     BackgroundOption,
@@ -58,7 +58,7 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, known_device
 from instrument.reconstruction.result_file import Outputs
 
-app = command_app()
+app = App()
 
 
 @app.command(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import signal
@@ -34,9 +33,8 @@ def run_command(name: str, command: Command, arguments: Sequence[str], *, debug:
     )
     _end_on_signals()
     try:
-        app: typer.Typer = importlib.import_module(command.module).app
         # Not through typer's own main, which would answer Ctrl-C itself before a word is said about it.
-        parser = typer.main.get_command(app)
+        parser = typer.main.get_command(command.load())
         with parser.make_context(f"diffuserbench {name}", list(arguments)) as context:
             parser.invoke(context)
     except BaseException as error:

@@ -1,34 +1,231 @@
-"""``diffuserbench show``: what is in a run, with a picture."""
+"""``diffuserbench show``: what is in a run; or put a hologram on the SLM, and photograph it."""
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
-from instrument.cli.app import command_app, examples
+from calibration_routines.display.display_io import DisplayBench, bring_mask
+from calibration_routines.display.hologram_photograph import (
+    display_of_pattern,
+    envelope_of_pattern,
+    photograph_hologram,
+    write_capture,
+    write_refined,
+)
+from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
+from instrument.cli.options import Given
+from instrument.display.hologram_job import prepare_target
+from instrument.files.alignment_file import load_alignment
+from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import size
+from instrument.files.images import read_image
+from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import levels_phase, read_slm_image
 from instrument.runs.run import Run
 from instrument.runs.run_picture import contact_sheet
+from recon.base.declare import option
+from recon.holography import Display, HologramOptions
 
-app = command_app()
+app = App()
+
+PICTURES = (".png", ".tif", ".tiff", ".npy", ".bmp")
+_PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photographed, with --capture"
 
 
-@app.command(epilog=examples("diffuserbench show runs/2026-11-21_14-03-22_axial-sweep"))
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions:
+    """How a hologram is shown and photographed, or where the picture of a run goes."""
+
+    slm_calibration: Path | None = option(None, help="From calibrate slm.", applies=_PATTERN, group=_SHOWN)
+    alignment: Path | None = option(
+        None,
+        help="From align mask: bring the mask's stage to where it left it.",
+        applies=_PATTERN,
+        group=_SHOWN,
+    )
+    seconds: float | None = option(
+        None,
+        help="How long.",
+        default_words="until Enter or Ctrl-C",
+        unit="s",
+        least=0,
+        flags=("--seconds",),
+        applies=_PATTERN,
+        group=_SHOWN,
+    )
+    capture: Path | None = option(
+        None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=_PHOTOGRAPHED
+    )
+    target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=_PHOTOGRAPHED)
+    average: int = option(4, help="Photographs a frame.", least=1, applies=_PATTERN, group=_PHOTOGRAPHED)
+    refine: int = option(
+        0,
+        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
+        least=0,
+        applies=_PATTERN,
+        group=_PHOTOGRAPHED,
+    )
+    as_is: bool = option(
+        False,
+        help="Ask nobody; the laser stays on, and the background is estimated.",
+        applies=_PATTERN,
+        group=_PHOTOGRAPHED,
+    )
+    force: bool = option(False, help="Overwrite files that exist.", applies=_PATTERN, group=_PHOTOGRAPHED)
+    picture: Path | None = option(
+        None,
+        help="Where its picture goes (PNG).",
+        default_words="summary.png in its folder",
+        flags=("--picture", "-p"),
+        applies=("run",),
+        group="Of a run",
+    )
+
+    def check(self, n_patterns: int) -> None:
+        """Refuse what does not go together, or a file that exists.
+
+        Raises
+        ------
+        BenchError, FileError
+        """
+        capture = self.capture
+        if (capture is None) != (self.target is None):
+            raise BenchError("Give --capture FILE and --target FILE together.")
+        if capture is not None and (capture.exists() and not self.force):
+            raise FileError(capture, "exists already.", "Choose another name, or overwrite with --force.")
+        if capture is not None and capture.suffix.lower() != ".png":
+            raise FileError(capture, "a capture is written as .png.")
+        if self.as_is and capture is None:
+            raise BenchError("--as-is goes with --capture: without it no light is switched and nobody asked.")
+        if self.refine and (capture is None or n_patterns > 1):
+            raise BenchError("--refine needs --capture, and one pattern.")
+
+
+@app.command(
+    epilog=examples(
+        "diffuserbench show runs/2026-11-21_14-03-22_axial-sweep",
+        "diffuserbench show slm.png --bench display.toml --seconds 60",
+        "diffuserbench show slm.png --bench display.toml --capture seen.png --target picture.png",
+        "diffuserbench show slm-frame1.png slm-frame2.png --capture seen.png --target picture.png",
+    )
+)
 def show(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="The run's folder.")],
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            "--picture",
-            "-p",
-            metavar="FILE",
-            help="Where the picture goes (PNG). Default: summary.png in the run's folder.",
-            show_default=False,
+    what: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN|PATTERN...",
+            help="A run's folder; or an 8-bit phase picture from hologram (several: frames that add).",
         ),
-    ] = None,
+    ],
+    options: ShowOptions,
+    given: Given,
+    bench: BenchOption = None,
 ) -> None:
+    """Say how a run ended and what it holds, with a picture; or show a hologram on the SLM.
+
+    A hologram's look-up table and flatness are applied here, once. Without --capture the light is yours.
+
+    With --capture the camera is registered by the mask's own speckle, the hologram photographed, brought to
+    the field of view, low-passed as an eye would, and compared with --target: PSNR and SSIM.
+    """
+    if len(what) == 1 and what[0].suffix.lower() not in PICTURES:
+        given.refuse("a run", "run")
+        _show_run(what[0], options.picture)
+        return
+    given.refuse("a hologram", "hologram")
+    options.check(len(what))
+    correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
+    place = load_alignment(options.alignment) if options.alignment else None
+    read = [read_slm_image(path) for path in what]
+    with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
+        if opened.slm is None:
+            raise BenchError(f"{opened.label} has no [slm].")
+        for path, (levels, _) in zip(what, read, strict=True):
+            if levels.shape != opened.slm.shape:
+                raise FileError(path, f"is {levels.shape} pixels, the SLM {opened.slm.shape}.")
+        bring_mask(opened, place.stage_position if place else {})
+        binning = opened.config.display.slm_binning
+        io = DisplayBench(opened, binning, correction, estimate_background=options.as_is)
+        fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
+        if options.capture is None:
+            _hold(io, fields, options.seconds)
+            return
+        slm = opened.slm.shape, opened.slm.pixel_pitch_um
+        _capture(
+            io,
+            fields,
+            display_of_pattern(opened.config, slm, read[0][1], place),
+            read[0][1],
+            what[0],
+            options,
+        )
+
+
+def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
+    io.show(fields[0])
+    typer.echo(f"Shown on {io.slm.name}: {io.bench.label}", err=True)
+    if seconds is None and len(fields) == 1:
+        typer.echo("Press Enter to end.", err=True)
+        input()
+        return
+    end = time.monotonic() + (seconds if seconds is not None else float("inf"))
+    frame = 0
+    while time.monotonic() < end:
+        frame = (frame + 1) % len(fields)
+        if len(fields) > 1:
+            io.show(fields[frame])
+        time.sleep(min(0.02, max(end - time.monotonic(), 0)))
+
+
+def _capture(
+    io: DisplayBench,
+    fields: list[Any],
+    display: Display,
+    facts: dict[str, Any],
+    pattern: Path,
+    options: ShowOptions,
+) -> None:
+    """Photograph, say how good it is, write."""
+    assert options.capture is not None
+    assert options.target is not None
+    found = photograph_hologram(
+        io,
+        fields,
+        display,
+        prepare_target(
+            read_image(options.target).pixels, display, HologramOptions(envelope=envelope_of_pattern(facts))
+        ),
+        average=options.average,
+        refine=options.refine,
+        progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
+    )
+    mark = " (SIMULATED)" if found.simulated else ""
+    typer.echo(f"camera registered to {found.camera_residual_px:.2f} px{mark}")
+    if found.background_estimated:
+        typer.echo("Background estimated (--as-is): the darkest 10 x 10 pixels.", err=True)
+    if found.refined is not None:
+        path = write_refined(pattern, found.refined, facts, io.binning)
+        first, best = found.refined.psnr_db[0], found.capture.scores.psnr_db
+        typer.echo(f"camera in the loop: {first:.2f} dB -> {best:.2f} dB; {path}")
+    write_capture(options.capture, found)
+    score = found.capture.scores
+    typer.echo(
+        f"photographed: {score.psnr_db:.2f} dB, SSIM {score.ssim:.3f}; "
+        f"middle quarter {score.crop_psnr_db:.2f} dB"
+    )
+    if found.capture.saturated_fraction > 1e-3:
+        percent = 100 * found.capture.saturated_fraction
+        typer.echo(f"Warning: {percent:.1f} % of the camera's pixels are saturated.", err=True)
+    typer.echo(f"Wrote {options.capture}")
+
+
+def _show_run(run: Path, picture: Path | None) -> None:
     """Say how a run ended, what it holds, with which bench and software; draw a sheet of its frames."""
     found = Run.open(run)
     for name, value in _facts(found):

@@ -21,9 +21,14 @@ from calibration_routines import (
 )
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.sweep_plan import DARK, depths_um, reference_point
-from calibration_routines.psf.sweep_procedure import take_sweep
+from calibration_routines.psf.sweep_procedure import (
+    event_lines,
+    event_note,
+    exposure_lines,
+    quality_lines,
+    take_sweep,
+)
 from calibration_routines.psf.sweep_request import SweepRequest
-from calibration_routines.psf.sweep_words import event_lines, event_note, exposure_lines, quality_lines
 from instrument.bench.bench import Bench
 from instrument.cli.progress import progress_bar
 from instrument.files.formatting import count

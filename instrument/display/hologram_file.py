@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from instrument.display.hologram_job import HologramRequest, HologramResult
-from instrument.files.errors import FileError
+from instrument.display.hologram_job import HologramResult
+from instrument.files.errors import BenchError, FileError
 from instrument.files.images import side_car, write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.holography import Display
+from recon.holography import Display, HologramOptions
+from recon.holography.losses import loss_of
 
 CHANNELS = ("red", "green", "blue")
 
@@ -25,15 +26,20 @@ class HologramFiles:
 
     out: Path
     binning: int
-    request: HologramRequest
+    options: HologramOptions
     displays: Sequence[Display]
     video: int = 0
 
     def check(self, *, overwrite: bool) -> None:
         """Refuse what could not be written, before any work."""
-        expected = ".npy" if self.request.complex_slm else ".png"
+        levels = self.options.phase_levels
+        if levels is not None and 256 % levels:
+            raise BenchError(
+                f"{levels} phase levels cannot be written in 256: 2, 4, 8, 16, 32, 64, 128 or 256 can."
+            )
+        expected = ".npy" if self.options.complex_slm else ".png"
         if self.out.suffix.lower() != expected:
-            kind = "a complex" if self.request.complex_slm else "a phase"
+            kind = "a complex" if self.options.complex_slm else "a phase"
             raise FileError(self.out, f"{kind} pattern is written as {expected}.")
         if not self.out.parent.is_dir():
             raise FileError(self.out.parent, "there is no such folder.")
@@ -64,7 +70,7 @@ class HologramFiles:
 
         display = self.displays[channel]
         facts = {
-            **result.facts(self.request),
+            **result.facts(self.options),
             "binning": self.binning,
             "expansion": display.expansion,
             "slm_shape": list(display.slm_shape),
@@ -76,14 +82,14 @@ class HologramFiles:
         patterns = self.patterns(number, channel)
         for frame, path in enumerate(patterns):
             about = {**facts, "frame": frame + 1, "of_frames": len(patterns)}
-            if self.request.complex_slm:
+            if self.options.complex_slm:
                 write_image(path, result.hologram.slm[frame], {"format": "diffuserbench SLM field", **about})
             else:
                 write_slm_image(path, phase_levels(result.hologram.phase_rad[frame], self.binning), about)
         lines = [
             ("expansion", f"{display.expansion}x, {display.slm_shape[1]} x {display.slm_shape[0]} pixels"),
-            ("loss, method", f"{self.request.loss_kind}, {self.request.method}"),
-            ("judged", f"alias-free grid, envelope {self.request.envelope}, {self.request.frames} frame(s)"),
+            ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
+            ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
             ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
             ("stopped", str(result.hologram.stop_reason)),
             ("iterations", f"{result.hologram.history[-1].iteration}"),
@@ -106,11 +112,11 @@ class HologramFiles:
     def patterns(self, number: int, channel: int) -> list[Path]:
         """Return the pattern files of one hologram, one a time-multiplexed frame."""
         stem = self._stem(number, channel)
-        if self.request.frames == 1:
+        if self.options.frames == 1:
             return [self.out.with_name(stem + self.out.suffix)]
         return [
             self.out.with_name(f"{stem}-frame{frame + 1}{self.out.suffix}")
-            for frame in range(self.request.frames)
+            for frame in range(self.options.frames)
         ]
 
     def _preview(self, number: int, channel: int) -> Path:

@@ -46,7 +46,7 @@ def write_csv(path: Path, cells: Sequence[Cell]) -> None:
             [q, "dissertation", "dissertation", method, "printed in the dissertation", *figures, ""]
         )
     for cell in cells:
-        judged = [("alias_free", cell.alias_free)]
+        judged = [("alias-free", cell.alias_free)]
         if cell.grid == "dissertation":
             judged.insert(0, ("dissertation", cell.own))
         for name, found in judged:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
+from instrument.files.record import RecordFormat, plain, value_of
 from recon.holography import Display
-from recon.holography.pose import NAMES, NODES, Pose
+from recon.holography.pose import NODES, Pose
 
-FORMAT = "diffuserbench mask alignment"
+ALIGNMENT = RecordFormat(
+    "diffuserbench mask alignment", "mask alignment", make="Make one: diffuserbench align mask"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +57,6 @@ class Alignment:
         FileError
             When the alignment is another mask's.
         """
-        from dataclasses import replace
-
         if display.mask.shape != self.mask_shape:
             raise FileError(
                 "alignment",
@@ -68,8 +67,7 @@ class Alignment:
 
 def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -> None:
     """Write an alignment with further facts; errors as ``write_text``."""
-    record = {"format": FORMAT, **asdict(alignment), "rest": alignment.rest.round(4).tolist(), **facts}
-    write_text(path, json.dumps(record, indent=1) + "\n")
+    ALIGNMENT.write(path, {**plain(alignment), "rest": alignment.rest.round(4), **facts})
 
 
 def load_alignment(path: Path) -> Alignment:
@@ -80,30 +78,11 @@ def load_alignment(path: Path) -> Alignment:
     FileError
         When it is missing, no alignment, or damaged.
     """
-    try:
-        record = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise FileError(path, "there is no such file.", "Make one: diffuserbench align mask") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(path, f"cannot be read as an alignment: {error}.") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise FileError(path, f"is no mask alignment ('format' should be {FORMAT!r}).")
-    try:
-        pose = Pose(**{name: float(record["pose"][name]) for name in NAMES})
-        if not np.isfinite(pose.vector()).all():
+    record = ALIGNMENT.read(path)
+    with ALIGNMENT.damaged(path):
+        alignment = value_of(Alignment, record)  # what is not the alignment's own are facts about it
+        if not np.isfinite(alignment.pose.vector()).all():
             raise ValueError("the pose is not finite")
-        rest = np.array(record["rest"], float)
-        if rest.shape != (*NODES, 2) or not np.isfinite(rest).all():
-            raise ValueError(f"'rest' should be {(*NODES, 2)} numbers, not {rest.shape}")
-        height, width = record["mask_shape"]
-        return Alignment(
-            pose,
-            dict(record["error"]),
-            rest,
-            float(record["efficiency"]),
-            dict(record["stage_position"]),
-            (int(height), int(width)),
-            bool(record["simulated"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"is a damaged mask alignment: {error}.") from None
+        if alignment.rest.shape != (*NODES, 2) or not np.isfinite(alignment.rest).all():
+            raise ValueError(f"'rest' should be {(*NODES, 2)} numbers, not {alignment.rest.shape}")
+        return alignment

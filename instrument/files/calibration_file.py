@@ -14,13 +14,11 @@ Source positions need not be evenly spaced, which OME-Zarr cannot say: they stan
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 import secrets
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +26,27 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.errors import FileError
-from instrument.files.plain_json import plain
+from instrument.files.record import RecordFormat
 from recon.types import Calibration, Geometry
 
-FORMAT = "diffuserbench calibration"
-VERSION = 1
 _JSON = "calibration.json"
 _PSFS = "psfs.ome.zarr"
 _BACKGROUND = "background.ome.zarr"
 _RESTORE = "Take the calibration again or restore it from a copy."
+_FIELDS = ("shape", "source_positions_um", "geometry", "quality", "provenance", "sha256")
 
 
 class CalibrationFileError(FileError):
     """A calibration cannot be written or read; the text names the file, what is wrong, and what to do."""
+
+
+CALIBRATION = RecordFormat(
+    "diffuserbench calibration",
+    "calibration",
+    restore=_RESTORE,
+    fields=_FIELDS,
+    error=CalibrationFileError,
+)
 
 
 def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite: bool = False) -> Path:
@@ -101,38 +107,19 @@ def load_calibration(folder: Path | str) -> Calibration:
         raise CalibrationFileError(path, "does not exist.")
     if not (path / _JSON).is_file():
         raise CalibrationFileError(path, f"is no calibration: it holds no {_JSON}.")
-    record = _read_json(path / _JSON)
-    if record.get("format") != FORMAT:
-        raise CalibrationFileError(
-            path / _JSON, f"'format' is {record.get('format')!r}, expected {FORMAT!r}."
-        )
-    if record.get("version") != VERSION:
-        raise CalibrationFileError(
-            path / _JSON,
-            f"version {record.get('version')!r} is not known to this program, which reads version {VERSION}.",
-            "Update diffuserbench.",
-        )
-    try:
+    record = CALIBRATION.read(path / _JSON)
+    with CALIBRATION.damaged(path / _JSON):
         psfs = np.ascontiguousarray(_read_array(path, _PSFS, record["sha256"]).swapaxes(0, 1))
         has_background = _BACKGROUND in record["sha256"]
         positions = [[math.nan if v is None else v for v in row] for row in record["source_positions_um"]]
-        geometry = dict(record["geometry"])
-        if geometry.get("aperture_mm") is not None:
-            geometry["aperture_mm"] = tuple(geometry["aperture_mm"])
         return Calibration(
             psfs=psfs,
             source_positions_um=np.array(positions, np.float64).reshape(-1, 3),
             background=_read_array(path, _BACKGROUND, record["sha256"]) if has_background else None,
-            geometry=Geometry(**geometry),
+            geometry=CALIBRATION.value(Geometry, record["geometry"], path / _JSON),
             quality=record["quality"],
             provenance=record["provenance"],
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationFileError(
-            path / _JSON,
-            f"does not describe the arrays beside it ({error}): it was changed or damaged.",
-            _RESTORE,
-        ) from error
 
 
 def is_calibration(folder: Path | str) -> bool:
@@ -150,12 +137,9 @@ def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:
     CalibrationFileError
     """
     path = Path(folder) / _JSON
-    try:
-        depths = {
-            float(place[2]) for place in _read_json(path)["source_positions_um"] if place[2] is not None
-        }
-    except (LookupError, TypeError, ValueError) as error:
-        raise CalibrationFileError(path, f"tells no source positions: {error!r}.") from None
+    record = CALIBRATION.read(path)
+    with CALIBRATION.damaged(path):
+        depths = {float(place[2]) for place in record["source_positions_um"] if place[2] is not None}
     return tuple(sorted(z for z in depths if math.isfinite(z)))
 
 
@@ -173,18 +157,16 @@ def _write(calibration: Calibration, folder: Path) -> None:
     for name, array in arrays.items():
         _write_ome_zarr(array, folder / name, "czyx" if array.ndim == 4 else "cyx", pitch)
     record = {
-        "format": FORMAT,
-        "version": VERSION,
         "shape": list(calibration.psfs.shape),
         "source_positions_um": [
             [None if math.isnan(v) else float(v) for v in row] for row in calibration.source_positions_um
         ],
-        "geometry": asdict(calibration.geometry),
-        "quality": plain(calibration.quality),
-        "provenance": plain(calibration.provenance),
+        "geometry": calibration.geometry,
+        "quality": calibration.quality,
+        "provenance": calibration.provenance,
         "sha256": {name: _sha256(array) for name, array in arrays.items()},
     }
-    (folder / _JSON).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / _JSON).write_text(CALIBRATION.text(record, indent=2), encoding="utf-8")
     for path in folder.rglob("*"):
         if path.is_file():
             with path.open("rb") as file:
@@ -233,18 +215,6 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
             _RESTORE,
         )
     return array.astype(np.float32, copy=False)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationFileError(path, f"cannot be read: {error.strerror or error}.") from error
-    except ValueError as error:
-        raise CalibrationFileError(path, f"is no valid JSON ({error}): it was changed or damaged.") from error
-    if not isinstance(record, dict):
-        raise CalibrationFileError(path, "holds no JSON object: it is not a calibration's.")
-    return record
 
 
 def _replace(partial: Path, target: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.slm import Slm
-from instrument.files.atomic import write_text
-from instrument.files.errors import FileError
+from instrument.files.record import RecordFormat
 
-FORMAT = "diffuserbench SLM calibration"
+SLM_CALIBRATION = RecordFormat(
+    "diffuserbench SLM calibration", "SLM calibration", make="Make one: diffuserbench calibrate slm"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +65,13 @@ class SlmCorrection:
 
     def save(self, path: Path, facts: dict[str, Any]) -> None:
         """Write as JSON; errors as ``write_text``."""
-        flat = None if self.flatness_rad is None else np.round(self.flatness_rad, 5).tolist()
+        flat = None if self.flatness_rad is None else np.round(self.flatness_rad, 5)
         record = {
-            "format": FORMAT,
-            "phase_of_level_rad": np.round(self.phase_of_level_rad, 6).tolist(),
+            "phase_of_level_rad": np.round(self.phase_of_level_rad, 6),
             "flatness_rad": flat,
             **facts,
         }
-        write_text(path, json.dumps(record) + "\n")
+        SLM_CALIBRATION.write(path, record, indent=None)
 
 
 def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrection | None = None) -> None:
@@ -100,20 +99,11 @@ def load_slm_correction(path: Path) -> SlmCorrection:
     Raises
     ------
     FileError
-        When it is missing or no SLM calibration.
+        When it is missing, no SLM calibration, or damaged.
     """
-    try:
-        record = json.loads(path.read_text("utf-8"))
-    except FileNotFoundError:
-        raise FileError(path, "there is no such file.", "Make one: diffuserbench calibrate slm") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(path, f"cannot be read as an SLM calibration: {error}.") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise FileError(path, f"is no SLM calibration ('format' should be {FORMAT!r}).")
-    try:
+    record = SLM_CALIBRATION.read(path)
+    with SLM_CALIBRATION.damaged(path):
         flat = record["flatness_rad"]
         return SlmCorrection(
             np.array(record["phase_of_level_rad"], float), None if flat is None else np.array(flat, float)
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"is a damaged SLM calibration: {error}.") from None

@@ -6,7 +6,6 @@ applied when the pattern is shown, and only then.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ import numpy.typing as npt
 
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, side_car, write_image
+from instrument.files.record import RecordFormat
 
-FORMAT = "diffuserbench SLM phase"
+SLM_PHASE = RecordFormat("diffuserbench SLM phase", "description of an SLM pattern")
 LEVELS = 256
 
 
@@ -35,7 +35,23 @@ def levels_phase(levels: npt.NDArray[np.uint8], binning: int = 1) -> npt.NDArray
 
 def write_slm_image(path: Path, levels: npt.NDArray[np.uint8], facts: Mapping[str, Any]) -> None:
     """Write a pattern as PNG, and beside it a JSON file that says how it was made; as ``write_image``."""
-    write_image(path, levels, {"format": FORMAT, "levels_per_turn": LEVELS, **facts})
+    write_image(path, levels, SLM_PHASE.stamped({"levels_per_turn": LEVELS, **facts}))
+
+
+def read_slm_levels(path: Path | str) -> npt.NDArray[np.uint8]:
+    """Return the grey levels of an SLM image, ``(height, width)`` uint8, whatever stands beside it.
+
+    Raises
+    ------
+    FileError
+        When it is missing, no image, or not 8-bit grey.
+    """
+    pixels = read_image(path).pixels
+    if pixels.ndim != 2 or pixels.dtype != np.uint8:
+        raise FileError(
+            path, f"is {pixels.dtype} {pixels.shape}; an SLM image is 8-bit grey (256 levels a turn)."
+        )
+    return pixels.astype(np.uint8, copy=False)
 
 
 def read_slm_image(path: Path | str) -> tuple[npt.NDArray[np.uint8], dict[str, Any]]:
@@ -44,22 +60,7 @@ def read_slm_image(path: Path | str) -> tuple[npt.NDArray[np.uint8], dict[str, A
     Raises
     ------
     FileError
-        When it is no 8-bit grey image, or the JSON file is no description of a pattern.
+        As :func:`read_slm_levels`; or when the JSON file is no description of a pattern.
     """
-    path = Path(path)
-    pixels = read_image(path).pixels
-    if pixels.ndim != 2 or pixels.dtype != np.uint8:
-        raise FileError(
-            path, f"is {pixels.dtype} {pixels.shape}; a pattern is an 8-bit grey image (256 levels a turn)."
-        )
-    image = pixels.astype(np.uint8, copy=False)
-    beside = side_car(path)
-    if not beside.exists():
-        return image, {}
-    try:
-        facts = json.loads(beside.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(beside, f"cannot be read as JSON: {error}.") from None
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise FileError(beside, f"is no description of an SLM pattern ('format' should be {FORMAT!r}).")
-    return image, facts
+    levels, beside = read_slm_levels(path), side_car(path)
+    return levels, SLM_PHASE.read(beside) if beside.exists() else {}

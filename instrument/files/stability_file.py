@@ -14,10 +14,15 @@ import numpy as np
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
+from instrument.files.record import RecordFormat
 from recon.verdict.map import Axis, Cell, Size, StressMap, boundary, severity_grid
 
-FORMAT = "diffuserbench-stability"
-VERSION = 1
+STABILITY = RecordFormat(
+    "diffuserbench-stability",
+    "stability maps",
+    make="Make it with diffuserbench stability.",
+    fields=("program", "utc", "machine", "command", "maps"),
+)
 CELLS = "cells.jsonl"
 RESULT = "stability.json"
 _KEY = ("map", "size", "axes", "program", "scene")
@@ -114,36 +119,24 @@ def map_record(stress: StressMap, size: Size, cells: Sequence[Cell]) -> dict[str
 def write_stability(folder: Path, maps: Mapping[str, Any], command: str) -> Path:
     """Write ``stability.json``: the given maps take the place of those of their name, others stay."""
     path = folder / RESULT
-    kept = dict(read_stability(path)["maps"]) if path.exists() else {}
+    before = read_stability(path) if path.exists() else {"maps": {}}
     record = {
-        "format": FORMAT,
-        "version": VERSION,
+        **before,  # also what a newer version may have added
         "program": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": platform.machine(),
         "command": command,
-        "maps": {**kept, **maps},
+        "maps": {**before["maps"], **maps},
     }
-    write_text(path, json.dumps(record, allow_nan=False, indent=None, separators=(",", ":")) + "\n")
+    STABILITY.write(path, record, indent=None)
     return path
 
 
 def read_stability(path: Path) -> dict[str, Any]:
     """Read ``stability.json``; errors name the file."""
-    if not path.is_file():
-        raise FileError(path, "does not exist.", "Make it with diffuserbench stability.")
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileError(
-            path, f"cannot be read as JSON: {error}.", "Make it with diffuserbench stability."
-        ) from error
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise FileError(path, "holds no stability maps.", "Make it with diffuserbench stability.")
-    if record.get("version") != VERSION:
-        raise FileError(
-            path, f"has version {record.get('version')}; this program reads {VERSION}.", "Make it again."
-        )
+    record = STABILITY.read(path)
+    with STABILITY.damaged(path):
+        dict(record["maps"])
     return record
 
 

@@ -15,6 +15,9 @@ import numpy as np
 
 from drivers.common.stream import FrameStream
 from drivers.frame import Frame, FrameMetadata
+from instrument.bench.bench import Bench
+from instrument.files.calibration_file import load_calibration
+from instrument.reconstruction.job import find_calibration
 from recon.streams.live import LivePicture, LiveReconstructor
 from recon.types import Calibration
 
@@ -261,10 +264,25 @@ class LiveView:
             self._changed.notify_all()
 
 
-def live_view(stream: FrameStream, calibration: Calibration | Path | str, **settings: Any) -> LiveView:
-    """Return a live view of a stream, to be started: a calibration or its folder, and settings.
+def live_view(
+    bench: Bench, calibration: Calibration | Path | str, *, n_buffers: int = 4, **settings: Any
+) -> LiveView:
+    """Return a live reconstruction of a bench's camera, to be used as a context manager.
 
-    ``settings`` are those of :class:`recon.streams.live.LiveReconstructor`.
+    ``settings`` are those of :class:`recon.streams.live.LiveReconstructor`: ``z_um``, ``budget_ms``, ...::
+
+        with live_view(bench, "calibration", budget_ms=33) as live:
+            for result in live:
+                show(result.picture.image, result.picture.quality)
+
+    Parameters
+    ----------
+    bench : Bench
+        Open.
+    calibration : Calibration or path
+        A calibration, its folder, or the run that it was made of.
+    n_buffers : int
+        Frames that the camera's ring holds.
 
     Raises
     ------
@@ -272,8 +290,5 @@ def live_view(stream: FrameStream, calibration: Calibration | Path | str, **sett
         When the calibration cannot be used.
     """
     if not isinstance(calibration, Calibration):
-        from instrument.files.calibration_file import load_calibration
-        from instrument.reconstruction.job import find_calibration
-
         calibration = load_calibration(find_calibration(Path(calibration)))
-    return LiveView(stream, LiveReconstructor(calibration, **settings))
+    return LiveView(bench.camera.stream(n_buffers), LiveReconstructor(calibration, **settings))

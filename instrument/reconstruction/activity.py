@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import BenchError, FileError
-from instrument.files.plain_json import plain
+from instrument.files.record import plain
 from instrument.reconstruction.video_mp4 import DEFAULT_FPS, levels_of, write_mp4
 from instrument.reconstruction.video_output import VideoPictures, create_output
+from recon.base.declare import option
 from recon.streams.baseline import Motion, aligned, baseline, change, fading, motion
 from recon.streams.regions import Region, find_regions, local_correlation
 
@@ -30,6 +31,9 @@ COPIES = 8
 
 RED_PERCENTILE = 99.9
 """Of dF/F that is shown fully red."""
+
+TRACES_SHOWN = 20
+"""Traces drawn; more would not be told apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,11 +52,29 @@ class ActivitySettings:
         As :func:`recon.streams.regions.find_regions`.
     """
 
-    window_s: float = WINDOW_S
-    percentile: float = 20.0
-    align: bool = False
-    least_correlation: float = 0.5
-    radius_px: float = 8.0
+    window_s: float = option(
+        WINDOW_S, help="Of the sliding baseline.", unit="s", least=0, flags=("--window",), group="Activity"
+    )
+    percentile: float = option(
+        20.0, help="Of a window that is the baseline.", least=0, most=100, group="Activity"
+    )
+    align: bool = option(False, help="Move frames back to one place first.", group="Activity")
+    least_correlation: float = option(
+        0.5,
+        help="Local correlation from which a region begins.",
+        least=0,
+        most=1,
+        flags=("--correlation",),
+        group="Activity",
+    )
+    radius_px: float = option(
+        8.0,
+        help="As far as a region reaches.",
+        unit="px",
+        least=1,
+        flags=("--radius",),
+        group="Activity",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +177,13 @@ def write_activity(
 
     ``traces.csv``, ``regions.csv``, ``activity.png``, ``dff.ome.zarr``, ``activity.mp4``, ``activity.json``.
     """
-    from instrument.reconstruction.activity_figure import write_figure
-
     folder.mkdir(parents=True, exist_ok=True)
     made = [folder / name for name in ("traces.csv", "regions.csv", "activity.png", "dff.ome.zarr")]
     write_text(made[0], _traces_csv(activity, video))
     write_text(made[1], _regions_csv(activity))
     simulated = bool(video.attributes.get("diffuserbench", {}).get("simulated"))
     with whole_file(made[2]) as temporary:
-        write_figure(temporary, activity, simulated=simulated)
+        write_activity_figure(temporary, activity, simulated=simulated)
     origin = video.attributes.get("diffuserbench", {})
     create_output(
         made[3],
@@ -198,6 +218,50 @@ def write_activity(
         ),
     )
     return [*made, film, record]
+
+
+def write_activity_figure(path: Path, activity: Activity, *, simulated: bool) -> None:
+    """Draw mean fluorescence with the regions, local correlation, traces, and motion; PNG."""
+    from matplotlib.figure import Figure  # costs half a second; only who draws pays
+
+    figure = Figure(figsize=(12, 7.5), layout="constrained")
+    mark = "   SIMULATED" if simulated else ""
+    figure.suptitle(
+        f"{len(activity.regions)} regions in {len(activity.indices)} frames; frames off their place by up to "
+        f"{activity.motion.largest_px:.2f} pixels{mark}"
+    )
+    grid = figure.add_gridspec(3, 2, height_ratios=(3, 2.4, 0.8))
+    mean = activity.frames.mean(axis=0)
+    for place, (image, title, colours) in enumerate(
+        (
+            (mean, "mean fluorescence, regions", "gray"),
+            (activity.correlation, "local correlation of dF/F", "magma"),
+        )
+    ):
+        axes = figure.add_subplot(grid[0, place])
+        shown = axes.imshow(image, cmap=colours, vmax=float(np.percentile(image, 99.8)))
+        figure.colorbar(shown, ax=axes)
+        axes.set_title(title)
+        axes.set_axis_off()
+        for number, region in enumerate(activity.regions):
+            row, column = region.centre
+            radius = max(float(np.sqrt(len(region.rows) / np.pi)), 2.0) + 1
+            colour = f"C{number % 10}"
+            turn = np.linspace(0, 2 * np.pi, 40)
+            axes.plot(column + radius * np.cos(turn), row + radius * np.sin(turn), color=colour, lw=1)
+            axes.annotate(str(number), (column + radius, row - radius), color=colour, fontsize=7)
+    axes = figure.add_subplot(grid[1, :])
+    step = 1.1 * float(np.max(activity.traces, initial=0.1))
+    for number, trace in enumerate(activity.traces[:TRACES_SHOWN]):
+        axes.plot(activity.times_s, trace + number * step, color=f"C{number % 10}", lw=0.9)
+    axes.set_ylabel(f"dF/F, {step:.2g} apart")
+    axes.set_xlim(float(activity.times_s[0]), float(activity.times_s[-1]))
+    below = figure.add_subplot(grid[2, :], sharex=axes)
+    below.plot(activity.times_s, activity.motion.shifts, lw=0.9, label=["rows", "columns"])
+    below.set_ylabel("off by (px)")
+    below.set_xlabel("time (s), or frame number")
+    below.legend(fontsize=7, loc="upper right")
+    figure.savefig(path, dpi=110, format="png")
 
 
 def red_over_grey(activity: Activity) -> Any:

@@ -49,9 +49,8 @@ from instrument.reconstruction.record import (
     slices_record,
     source_record,
 )
-from recon.base.noise import NoiseModel
+from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.refocus import at_depth
-from recon.reconstruction.measurement import binned_noise
 from recon.types import Calibration
 
 
@@ -131,7 +130,7 @@ class Job:
         factor: float = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
         if factor > 1 and self.provenance.get("mosaic"):
             factor /= 2  # red and blue have a quarter of the pixels
-        return binned_noise(noise, factor)
+        return averaged_noise(noise, factor**2)
 
 
 def job_from_files(

@@ -17,7 +17,7 @@ import numpy as np
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
-from instrument.files.plain_json import plain
+from instrument.files.record import plain
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.preparation import Crop
@@ -323,7 +323,7 @@ def _job(request: VideoRequest, plan: VideoPlan, force: bool) -> tuple[VideoJob 
     begun = None
     if not force and (folder / "job.json").exists() and request.out.exists():
         begun = VideoJob(folder)
-        if VideoPlan.from_json(plan.to_json()) == begun.plan:
+        if plain(plan) == plain(begun.plan):
             return begun, True
     if request.out.exists() and not force:
         if begun is not None:
@@ -368,7 +368,7 @@ def _require_spared(request: VideoRequest) -> None:
 
 
 def _difference(plan: VideoPlan, begun: VideoPlan) -> str:
-    mine, other = ({**p.__dict__, **p.settings} for p in (VideoPlan.from_json(plan.to_json()), begun))
+    mine, other = ({**p, **p["settings"]} for p in (plain(plan), plain(begun)))
     names = [name for name in mine if name != "settings" and mine[name] != other.get(name)]
     return ", ".join(names) or "settings"
 

@@ -13,9 +13,8 @@ the disk already are left as they are.
 
 from __future__ import annotations
 
-import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,15 +22,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import sync_folder, whole_file, write_text
+from instrument.files.atomic import sync_folder, whole_file
 from instrument.files.errors import FileError
-from instrument.files.plain_json import plain
+from instrument.files.record import RecordFormat, plain
 from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.preparation import Crop
 from recon.streams.joint import OverTimeName
 from recon.streams.video import VideoCamera, blocks_of
 
-FORMAT = 1
+_VIDEO_JOB = RecordFormat(
+    "diffuserbench video job", "video job", restore="Begin anew with --force.", numbered_before=True
+)
 _JSON, _CAMERA, _DONE = "job.json", "camera.npz", "done"
 
 
@@ -71,19 +72,6 @@ class VideoPlan:
     picture_shape: tuple[int, ...]
     settings: dict[str, Any]
 
-    def to_json(self) -> str:
-        """Return the plan as text."""
-        return json.dumps({"format": FORMAT, **plain(asdict(self))}, indent=1, sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> VideoPlan:
-        """Read :meth:`to_json`'s text."""
-        values = json.loads(text)
-        if values.pop("format") != FORMAT:
-            raise ValueError("another format")
-        values["frames"], values["picture_shape"] = tuple(values["frames"]), tuple(values["picture_shape"])
-        return cls(**values)
-
 
 class VideoJob:
     """A job's folder.
@@ -101,12 +89,9 @@ class VideoJob:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        try:
-            self.plan = VideoPlan.from_json((folder / _JSON).read_text())
-        except FileNotFoundError:
-            raise FileError(folder, "holds no unfinished video.", "Was it completed meanwhile?") from None
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileError(folder / _JSON, f"is damaged: {error!r}.", "Begin anew with --force.") from error
+        if not (folder / _JSON).exists():
+            raise FileError(folder, "holds no unfinished video.", "Was it completed meanwhile?")
+        self.plan = _VIDEO_JOB.value(VideoPlan, _VIDEO_JOB.read(folder / _JSON), folder / _JSON)
 
     @staticmethod
     def folder_of(output: Path) -> Path:
@@ -132,7 +117,7 @@ class VideoJob:
         }
         with whole_file(folder / _CAMERA) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
-        write_text(folder / _JSON, plan.to_json())
+        _VIDEO_JOB.write(folder / _JSON, plain(plan))
         return cls(folder)
 
     def remove(self) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.frame import FrameMetadata
+from instrument.files.record import plain, value_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,8 @@ class FrameRecord:
     average : int
         Number of exposures whose mean it is.
     metadata : FrameMetadata
+    unknown : mapping
+        Metadata that a newer version of this program has added: kept, and not used.
     """
 
     index: int
@@ -30,33 +32,30 @@ class FrameRecord:
     crc32: int
     average: int
     metadata: FrameMetadata
+    unknown: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the log line."""
-        metadata = asdict(self.metadata)
-        metadata["utc"] = self.metadata.utc.isoformat()
-        metadata["stage_position"] = dict(self.metadata.stage_position)
         return {
             "kind": "frame",
             "index": self.index,
             "n_bytes": self.n_bytes,
             "crc32": f"{self.crc32:08x}",
             "average": self.average,
-            "metadata": metadata,
+            "metadata": {**plain(self.metadata), **self.unknown},
         }
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> FrameRecord:
         """Return what :meth:`to_json` wrote."""
-        metadata = dict(line["metadata"])
-        metadata["utc"] = datetime.fromisoformat(metadata["utc"])
-        metadata["roi"] = tuple(metadata["roi"])
+        unknown: dict[str, Any] = {}
         return cls(
             index=int(line["index"]),
             n_bytes=int(line["n_bytes"]),
             crc32=int(line["crc32"], 16),
             average=int(line["average"]),
-            metadata=FrameMetadata(**metadata),
+            metadata=value_of(FrameMetadata, line["metadata"], unknown),
+            unknown=unknown,
         )
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-FORMAT = 1
-"""Version of the run folder's format."""
 PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
 BENCH_TOML, LOG, FRAMES, LOCK = "bench.toml", "log.jsonl", "frames.ome.zarr", "lock"
 SLM_IMAGES = "slm"

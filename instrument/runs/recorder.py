@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from drivers.common.stream import FrameStream
 from drivers.common.stream_reader import StreamReader
@@ -206,12 +206,7 @@ class Recorder:
         """Add stage, LEDs and SLM, which stay as they are during a recording and so are asked once."""
         if self._surroundings is None:
             self._surroundings = self._bench.with_surroundings(metadata)
-        return replace(
-            metadata,
-            stage_position=self._surroundings.stage_position,
-            led_pattern=self._surroundings.led_pattern,
-            slm_image_hash=self._surroundings.slm_image_hash,
-        )
+        return metadata.among(self._surroundings)
 
     def _store(self, batch: list[FrameToStore], gaps: list[Gap], reader: StreamReader) -> None:
         for gap in gaps:

@@ -19,13 +19,13 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.errors import FileError
+from instrument.files.record import RecordFormat
 from instrument.plan import Plan, Step
 from instrument.runs.durable import read_lines
 from instrument.runs.frame_array import FrameArray, StoredChunk
 from instrument.runs.frame_record import FrameRecord, Gap
 from instrument.runs.layout import (
     BENCH,
-    FORMAT,
     FRAMES,
     LOCK,
     LOG,
@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 
 class RunError(FileError):
     """A run folder that cannot be used as asked."""
+
+
+RUN_STATE = RecordFormat("diffuserbench run", "run's state", error=RunError, numbered_before=True)
+"""``state.json``; its version is that of the whole folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,18 +73,14 @@ class Run:
     events : tuple of mapping
         The log's other lines: started, paused, resumed, finished ...
     state : mapping
-        The contents of ``state.json``.
+        The fields of ``state.json``.
     torn_bytes : int
         Length of the half line that a crash left at the end of the log.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.state: Mapping[str, Any] = self._json(STATE)
-        if self.state.get("format") != FORMAT:
-            raise RunError(
-                path / STATE, f"format {self.state.get('format')!r}; this version reads format {FORMAT}."
-            )
+        self.state: Mapping[str, Any] = RUN_STATE.read(path / STATE)
         size = (path / LOG).stat().st_size
         lines, whole = read_lines(path / LOG)
         self.torn_bytes = max(0, size - whole)
@@ -95,6 +95,9 @@ class Run:
                 gaps.append(Gap.from_json(line))
             else:
                 events.append(line)
+        RUN_STATE.tell_unknown(
+            path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
+        )
         self.gaps = tuple(gaps)
         self.events = tuple(events)
 

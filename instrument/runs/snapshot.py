@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from drivers.frame import FrameMetadata
 from drivers.led_array import LedPattern
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.files.atomic import check_writable
 from instrument.files.errors import FileError
-from instrument.files.images import check_suffix, side_car, write_image
+from instrument.files.images import check_suffix, read_image, side_car, write_image
+from instrument.files.record import plain, value_of
 
 
 class Light(enum.StrEnum):
@@ -125,6 +127,24 @@ def snapshot_facts(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any
         "light": light.value,
         "average": taken.average,
         "full_scale": taken.full_scale,
-        "noise": None if noise is None else asdict(noise),
-        **asdict(taken.metadata),
+        "noise": plain(noise),
+        **plain(taken.metadata),
     }
+
+
+def read_snapshot(path: Path | str) -> Snapshot:
+    """Read a photograph that :func:`write_snapshot` wrote, with its metadata.
+
+    Raises
+    ------
+    FileError
+        When it cannot be read, or is no photograph of this program's: nothing is known about it.
+    """
+    image = read_image(path)
+    try:
+        metadata, average = value_of(FrameMetadata, image.metadata), int(image.metadata["average"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise FileError(path, f"tells not how it was photographed: {error}.") from None
+    pixels = image.pixels
+    pixels.flags.writeable = False
+    return Snapshot(pixels, metadata, average)

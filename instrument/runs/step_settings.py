@@ -8,8 +8,8 @@ from pathlib import Path
 from drivers.led_array import LedPattern
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
+from instrument.files.slm_image import read_slm_levels
 from instrument.plan import Light, SourcePosition, Step
-from instrument.plan.slm_images import read_slm_image
 
 
 class StepSettings:
@@ -74,7 +74,7 @@ class StepSettings:
         slm = self._bench.slm
         if slm is None:
             raise BenchError(f"SLM image {path}: this bench has no SLM.")
-        slm.display(read_slm_image(path))
+        slm.display(read_slm_levels(path))
         self._slm_image = path
 
     def _set_scene(self, lit: bool) -> None:

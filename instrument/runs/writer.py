@@ -24,7 +24,6 @@ from instrument.runs.frame_record import FrameRecord, Gap
 from instrument.runs.layout import (
     BENCH,
     BENCH_TOML,
-    FORMAT,
     FRAMES,
     LOCK,
     LOG,
@@ -34,7 +33,7 @@ from instrument.runs.layout import (
     FinishReason,
 )
 from instrument.runs.provenance import provenance
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import RUN_STATE, Run, RunError
 
 _FIRST_CAPACITY = 256
 """Frames that a recording's array is made for at first; it doubles as needed."""
@@ -132,14 +131,13 @@ class RunWriter:
                 }
                 write_json(draft / PROVENANCE, origin)
                 state = {
-                    "format": FORMAT,
                     "label": label,
                     "simulated": bench.simulated,
                     "state": "running",
                     "started_utc": now.isoformat(),
                     "pid": os.getpid(),
                 }
-                write_json(draft / STATE, state)
+                write_json(draft / STATE, RUN_STATE.stamped(state))
                 write_bytes(draft / LOG, b"")
                 write_bytes(draft / LOCK, b"")
                 lock = lock_run(draft)
@@ -286,7 +284,7 @@ class RunWriter:
 
     def _set_state(self, **changes: Any) -> None:
         try:
-            write_json(self.path / STATE, self._state | changes)
+            write_json(self.path / STATE, RUN_STATE.stamped(self._state | changes))
         except OSError as error:
             raise RunError(
                 self.path, f"its state could not be written: {error.strerror}.", disk_remedy(error)

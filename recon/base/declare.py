@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import enum
 import math
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +20,12 @@ from typing import Any, TypeVar
 from recon.errors import InputError
 
 _KEY = "declared"
+_LINE = 100
+RARE = "Rarely needed"
+"""The group that help and forms show last."""
 _T = TypeVar("_T")
+Made = Callable[[Any, "Imports"], str]
+"""Returns the Python that makes a value, and adds what must be imported for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +55,14 @@ class Declaration:
     applies : tuple of str
         What it is about ("picture", "volume", "video", "live", ...); empty: everything.
     recorded : bool
-        Whether it belongs to the record beside a result and to a checkpoint's identity.
+        Whether it belongs to the record beside a result.
+    identifies : bool
+        Whether work that was kept with another value is other work; False for what only says when to stop.
+    parse : callable, optional
+        Makes the value of the words that people type, where the type does not tell how; raises InputError or
+        ValueError with a sentence. Given once for each word of a repeated option.
+    none_word : str
+        What people type for None ("auto", say); empty: None cannot be typed.
     """
 
     help: str
@@ -68,9 +81,12 @@ class Declaration:
     default_words: str = ""
     applies: tuple[str, ...] = ()
     recorded: bool = True
+    identifies: bool = True
+    parse: Callable[[str], Any] | None = None
+    none_word: str = ""
 
     def words(self) -> tuple[str, ...]:
-        """Return the words that it can be; empty where it is no choice of words."""
+        """Return the words that it is declared to be; empty where it is no choice of words."""
         return tuple(self.choices() if callable(self.choices) else self.choices)
 
 
@@ -91,6 +107,50 @@ class Option:
         return tuple(k for k in (inside if is_union else (self.type,)) if k is not type(None))
 
     @property
+    def is_required(self) -> bool:
+        """Whether it has no default."""
+        return self.default is dataclasses.MISSING
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words that it can be: as declared, else of its Literal and enumeration types."""
+        if said := self.declaration.words():
+            return said
+        found: list[str] = []
+        for kind in self.kinds:
+            if typing.get_origin(kind) is typing.Literal:
+                found += [word for word in typing.get_args(kind) if isinstance(word, str)]
+            elif isinstance(kind, type) and issubclass(kind, enum.Enum):
+                found += [str(member.value) for member in kind]
+        return tuple(found)
+
+    @property
+    def item(self) -> Any:
+        """Of a repeated option (``tuple[X, ...]``) the type X of one; else None."""
+        for kind in self.kinds:
+            if typing.get_origin(kind) is tuple and typing.get_args(kind)[1:] == (...,):
+                return typing.get_args(kind)[0]
+        return None
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Its names on the command line, with both of a switch as ``--on/--off``; empty: not offered."""
+        if self.declaration.flags:
+            return tuple(flag for flag in self.declaration.flags if flag)
+        said, name = self.declaration, self.name
+        if said.shown_unit and name.endswith(f"_{said.unit}"):
+            name = f"{name.removesuffix(f'_{said.unit}')}_{said.shown_unit}"
+        name = name.replace("_", "-")
+        return (
+            (f"--{name}/--no-{name}",) if bool in self.kinds and self.default is not False else (f"--{name}",)
+        )
+
+    @property
+    def flag(self) -> str:
+        """The name that people are told: the first long one, of a switch what turns it on."""
+        return next((flag.partition("/")[0] for flag in self.flags if flag.startswith("--")), self.name)
+
+    @property
     def label(self) -> str:
         """How a form names it, with the unit that people read."""
         said = self.declaration
@@ -98,45 +158,65 @@ class Option:
         name = said.label or self.name.removesuffix(f"_{said.unit}").replace("_", " ").capitalize()
         return f"{name} ({unit})" if unit else name
 
-    def mistake(self, value: object) -> str | None:
-        """Say what is wrong with a value; None where nothing is."""
-        said = self.declaration
+    def mistake(self, value: object, *, typed: bool = False) -> str | None:
+        """Say what is wrong with a value; None where nothing is.
+
+        With ``typed`` in the words of the command line: its flag, and the unit that people type.
+        """
+        name = self.flag if typed else self.name
         if value is None:
-            return None if self.default is None else f"{self.name} must be given, not None."
-        if (words := said.words()) and isinstance(value, str) and value not in words:
+            return None if self.default is None else f"{name} must be given, not None."
+        if self.item is not None and isinstance(value, Sequence) and not isinstance(value, str):
+            one = dataclasses.replace(self, type=self.item, default=0)
+            return next((wrong for v in value if (wrong := one.mistake(v, typed=typed))), None)
+        if (words := self.words) and isinstance(value, str) and value not in words:
             near = difflib.get_close_matches(value, words, 1)
             meant = f"; {near[0]!r}?" if near else "."
-            return f"{self.name} must be one of {', '.join(words)}, not {value!r}{meant}"
-        if not {int, float} & set(self.kinds) or not _is_only_number(self.kinds):
+            return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
+        if not {int, float} & set(self.kinds) or isinstance(value, str | Path):
             return None
-        whole = float not in self.kinds
-        kind = Integral if whole else Real
+        said = self.declaration
+        kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
         # A NaN fails every comparison.
         if is_number and said.least <= value <= said.most and said.above < value < said.below:  # type: ignore[operator]
             return None
-        return f"{self.name} must be {self.expected(whole=whole)}, not {value!r}."
+        shown = f"{value / said.shown_factor:g}" if typed and is_number else repr(value)  # type: ignore[operator]
+        return f"{name} must be {self.expected(typed=typed)}, not {shown}."
 
-    def expected(self, *, whole: bool | None = None) -> str:
+    @property
+    def is_whole(self) -> bool:
+        """Whether of the numbers only whole ones will do."""
+        return float not in self.kinds
+
+    def limits(self, *, typed: bool = False) -> tuple[str, ...]:
+        """Return its limits in words; with ``typed`` in the unit that people type."""
+        said = self.declaration
+        factor = said.shown_factor if typed else 1.0
+        limits = (
+            f"{said.least / factor:g} or more" if said.least > -math.inf else "",
+            f"above {said.above / factor:g}" if said.above > -math.inf else "",
+            f"{said.most / factor:g} or less" if said.most < math.inf else "",
+            f"below {said.below / factor:g}" if said.below < math.inf else "",
+        )
+        return tuple(limit for limit in limits if limit)
+
+    def expected(self, *, typed: bool = False) -> str:
         """Say which values are allowed."""
         said = self.declaration
-        whole = float not in self.kinds if whole is None else whole
-        limits = [
-            f"{said.least:g} or more" if said.least > -math.inf else "",
-            f"above {said.above:g}" if said.above > -math.inf else "",
-            f"{said.most:g} or less" if said.most < math.inf else "",
-            f"below {said.below:g}" if said.below < math.inf else "",
-        ]
-        parts = ["a whole number" if whole else "a number", *(limit for limit in limits if limit)]
-        return f"{', '.join(parts)}{f' ({said.unit})' if said.unit else ''}"
+        words = [*self.words, *((said.none_word,) if said.none_word and typed else ())]
+        if not {int, float} & set(self.kinds):
+            return f"one of {', '.join(words)}" if words else "given"
+        number = ", ".join(["a whole number" if self.is_whole else "a number", *self.limits(typed=typed)])
+        unit = (said.shown_unit if typed else "") or said.unit
+        number += f" ({unit})" if unit else ""
+        if Path in self.kinds:
+            words.append("the name of a file")
+        return f"{', '.join(words)} or {number}" if words else number
 
 
-def _is_only_number(kinds: tuple[Any, ...]) -> bool:
-    return all(kind in (int, float) for kind in kinds)
-
-
-def option(default: Any, **declaration: Any) -> Any:
-    """Declare a field of an options class; keywords as :class:`Declaration`."""
+def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
+    """Declare a field of an options class, required without a default; keywords as :class:`Declaration`."""
     return dataclasses.field(default=default, metadata={_KEY: Declaration(**declaration)})
 
 
@@ -195,12 +275,25 @@ def _same(one: Any, other: Any) -> bool:
         return False
 
 
+def inapplicable(options: object, subject: str) -> list[Option]:
+    """Return the options that differ from their defaults and do not apply to a subject ("video", say)."""
+    return [o for o, _ in changed(options) if o.declaration.applies and subject not in o.declaration.applies]
+
+
 def record(options: object) -> dict[str, Any]:
     """Return what is recorded of options, JSON-compatible: the same for the same work."""
     return {o.name: _plain(getattr(options, o.name)) for o in options_of(options) if o.declaration.recorded}
 
 
+def identity(options: object) -> dict[str, Any]:
+    """Return, JSON-compatible, what must be the same for kept work to be gone on with."""
+    kept = (o for o in options_of(options) if o.declaration.recorded and o.declaration.identifies)
+    return {o.name: _plain(getattr(options, o.name)) for o in kept}
+
+
 def _plain(value: Any) -> Any:
+    if isinstance(value, enum.Enum):
+        return value.value
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Path):
@@ -216,7 +309,77 @@ def _plain(value: Any) -> Any:
     return repr(value)
 
 
-def expression(options: object) -> str:
-    """Return the Python expression that makes these options, without what is default."""
-    given = ", ".join(f"{o.name}={value!r}" for o, value in changed(options))
-    return f"{type(options).__name__}({given})"
+@dataclass
+class Imports:
+    """What lines of Python need: ``from module import name`` pairs and plain modules."""
+
+    names: set[tuple[str, str]] = field(default_factory=set)
+    modules: set[str] = field(default_factory=set)
+
+    def lines(self) -> list[str]:
+        """Return the import lines: the standard library, an empty line, the project's."""
+        standard = [f"import {name}" for name in sorted(self.modules)]
+        standard += [
+            f"from pathlib import {name}" for module, name in sorted(self.names) if module == "pathlib"
+        ]
+        own = [f"from {module} import {name}" for module, name in sorted(self.names) if module != "pathlib"]
+        return [*standard, *([""] if standard and own else []), *own]
+
+
+def expression(
+    value: Any,
+    imports: Imports | None = None,
+    *,
+    special: Mapping[type, Made] | None = None,
+    indent: str = "",
+) -> str:
+    """Return the Python that makes a value, without what is default: "Copy as Python".
+
+    Parameters
+    ----------
+    value
+        Plain values, paths, enumerations, sequences of them, dataclasses.
+    imports : Imports, optional
+        Gets what must be imported.
+    special : mapping of type to callable, optional
+        How values of other types are made.
+    indent : str
+        Of the line that the expression stands in; a dataclass that does not fit into it is folded.
+    """
+    imports = Imports() if imports is None else imports
+    for kind, made in (special or {}).items():
+        if isinstance(value, kind):
+            return made(value, imports)
+    if isinstance(value, Path):
+        imports.names.add(("pathlib", "Path"))
+        return f"Path({str(value)!r})"
+    if isinstance(value, enum.Enum):
+        imports.names.add((type(value).__module__, type(value).__name__))
+        return f"{type(value).__name__}.{value.name}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        imports.names.add((type(value).__module__, type(value).__name__))
+        inner = indent + "    "
+        parts = [
+            f"{f.name}={expression(getattr(value, f.name), imports, special=special, indent=inner)}"
+            for f in dataclasses.fields(value)
+            if f.init and not _is_default(f, getattr(value, f.name))
+        ]
+        line = f"{type(value).__name__}({', '.join(parts)})"
+        if len(line) + len(indent) < _LINE and "\n" not in line:
+            return line
+        listed = "".join(f"{inner}{part},\n" for part in parts)
+        return f"{type(value).__name__}(\n{listed}{indent})"
+    if isinstance(value, list | tuple):
+        inside = [expression(one, imports, special=special, indent=indent) for one in value]
+        if isinstance(value, list):
+            return f"[{', '.join(inside)}]"
+        return f"({inside[0]},)" if len(inside) == 1 else f"({', '.join(inside)})"
+    return repr(value)
+
+
+def _is_default(f: dataclasses.Field[Any], value: Any) -> bool:
+    made = f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
+    try:
+        return value is made or bool(value == made)
+    except ValueError:  # arrays
+        return False

@@ -20,16 +20,17 @@ from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.holography.display import Display
 from recon.holography.judge import compare
+from recon.holography.losses import LOSSES
 from recon.holography.mask import random_mask
 from recon.holography.model import HologramModel
-from recon.holography.optimise import Budget, HologramRecord, HologramStop, Method, compute_hologram
-from recon.holography.target import Loss, LossKind, Target, foveal_weights
+from recon.holography.optimise import HologramRecord, HologramStop, compute_hologram
+from recon.holography.options import HologramOptions, Method
+from recon.holography.target import Target, foveal_weights
 
 Array = npt.NDArray[Any]
 
 COUNTS = (1, 3, 5, 10, 20, 40, 80, 160)
 """Iterations at which a run is scored."""
-LOSSES: tuple[LossKind, ...] = ("none", "frequency", "spatial")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +44,23 @@ class HologramSetting:
     method : str
         As :func:`recon.holography.compute_hologram`.
     loss : str
-        The one-step method has none; ``"frequency"`` stands for that.
+        Of :data:`recon.holography.losses.LOSSES`; the one-step method has none: ``"frequency"`` stands
+        for that.
     frames : int
         Shown one after the other.
     """
 
     expansion: int
     method: Method = "lbfgs"
-    loss: LossKind = "frequency"
+    loss: str = "frequency"
     frames: int = 1
 
     @property
     def family(self) -> str:
         """Loss and method."""
-        if self.method == "one_step":
+        if self.method == "one-step":
             return "one-step"
-        loss = "no constraint" if self.loss == "none" else f"{self.loss} loss"
+        loss = LOSSES.named(self.loss).title
         return f"{loss}, Nesterov" if self.method == "nesterov" else loss
 
     @property
@@ -85,7 +87,7 @@ class HologramProblem:
         For each display, one a plane.
     frames : tuple of int
     weights : ndarray
-        Of the spatial loss.
+        Of the losses that take them.
     seed : int
         Of the random start.
     """
@@ -113,7 +115,7 @@ class HologramProblem:
         for display in self.displays:
             q = display.expansion
             for frames in self.frames:
-                found.append(HologramSetting(q, "one_step", "frequency", frames))
+                found.append(HologramSetting(q, "one-step", "frequency", frames))
                 found += [HologramSetting(q, "lbfgs", loss, frames) for loss in LOSSES]
             found += [HologramSetting(q, "nesterov", loss) for loss in LOSSES]
         return tuple(sorted(found, key=_cost))
@@ -137,12 +139,21 @@ class HologramProblem:
             raise InputError(f"The setting '{setting.name}' does not apply to this problem.")
         place = [d.expansion for d in self.displays].index(setting.expansion)
         display, targets = self.displays[place], self.targets[place]
-        loss = Loss(setting.loss, self.weights if setting.loss == "spatial" else None)
-        model = HologramModel(display, targets, loss, frames=setting.frames)
+        options = HologramOptions(
+            loss=setting.loss,
+            weights=self.weights if LOSSES.named(setting.loss).takes_weights else None,
+            frames=setting.frames,
+            method=setting.method,
+            iterations=counts[-1],
+            time_s=limit_s,
+            tolerance=0.0,
+            seed=self.seed,
+        )
+        model = HologramModel(display, targets, options)
         points: list[Point] = []
         # The optimiser's clock starts after its first evaluation; here all of its time counts.
         first_s = 0.0
-        if setting.method != "one_step":
+        if setting.method != "one-step":
             slm = np.ones((setting.frames, *display.slm_shape), model.dtype)
             began = time.perf_counter()
             model.evaluate(slm)
@@ -156,13 +167,7 @@ class HologramProblem:
             if record.iteration in counts:
                 score(record, slm)
 
-        found = compute_hologram(
-            model,
-            method=setting.method,
-            budget=Budget(counts[-1], time_s=limit_s, tolerance=0.0),
-            seed=self.seed,
-            callback=note,
-        )
+        found = compute_hologram(model, callback=note)
         last = found.history[-1]
         stuck = found.stop_reason is HologramStop.CONVERGED and last.iteration not in counts
         if found.stop_reason is HologramStop.ONE_STEP or stuck:
@@ -195,9 +200,8 @@ class HologramProblem:
 
 def _cost(setting: HologramSetting) -> float:
     """Rough order of time."""
-    method = {"one_step": 0.01, "lbfgs": 1.0, "nesterov": 1.2}[setting.method]
-    loss = {"frequency": 1.0, "none": 1.3, "spatial": 1.4}[setting.loss]
-    return method * loss * setting.frames * setting.expansion
+    method = {"one-step": 0.01, "lbfgs": 1.0, "nesterov": 1.2}[setting.method]
+    return method * LOSSES.named(setting.loss).cost * setting.frames * setting.expansion
 
 
 def _point(setting: HologramSetting, model: HologramModel, record: HologramRecord, slm: Array) -> Point:

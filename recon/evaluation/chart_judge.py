@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean, blocks_about_axis, enlarged
 from recon.camera.background import BackgroundRemoval
 from recon.evaluation.chart_settings import Setting, binnings_of
 from recon.evaluation.scene_score import score
 from recon.evaluation.scored import Point
-from recon.reconstruction.block_means import binned, blocks, enlarged
 from recon.reconstruction.measurement import Measurement, channel_noise
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
@@ -59,16 +59,16 @@ class Judge:
         held[tuple(slice(first, first + count * block) for first, count in spans)] = np.repeat(
             np.repeat(chosen, block, 0), block, 1
         )
-        self.measurement = binned(problem.measurement, factor)
+        self.measurement = block_mean(problem.measurement, factor, about_axis=True)
         self.calibration = reduced_calibration(problem.calibration, factor, None)
-        self.held = binned((held & kept).astype(np.float32), factor) > 0.5
-        self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
+        self.held = block_mean((held & kept).astype(np.float32), factor, about_axis=True) > 0.5
+        self.kept = block_mean(kept.astype(np.float32), factor, about_axis=True) > 1 - 1e-6
         self.erasures = self.held | ~self.kept
         pixel_noise = channel_noise(problem.measurement, kept, problem.noise)
         self.noise = pixel_noise / factor
         self._block_noise = pixel_noise / block
         starts = [
-            blocks(n, self._together)[1] // 2 - (whole // 2 - first) // block
+            blocks_about_axis(n, self._together)[1] // 2 - (whole // 2 - first) // block
             for n, whole, (first, _) in zip(self.held.shape, shape, spans, strict=True)
         ]
         self._common = tuple(
@@ -81,7 +81,9 @@ class Judge:
 
     def _blocks(self, image: Array) -> Array:
         """Average over the coarsest binning's blocks, those that every binning has."""
-        return np.asarray(binned(np.asarray(image, np.float32), self._together)[self._common])
+        return np.asarray(
+            block_mean(np.asarray(image, np.float32), self._together, about_axis=True)[self._common]
+        )
 
     @property
     def central(self) -> Calibration:
@@ -178,6 +180,6 @@ def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:
     block = binnings[-1]
     before, behind = n, n
     for factor in binnings:
-        _, count = blocks(blocks(n, factor)[1], block // factor)
+        _, count = blocks_about_axis(blocks_about_axis(n, factor)[1], block // factor)
         before, behind = min(before, count // 2), min(behind, count - count // 2)
     return n // 2 - before * block, before + behind

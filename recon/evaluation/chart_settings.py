@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from recon.base.namespace import array_namespace
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.errors import InputError
+from recon.priors import PRIORS
 from recon.reconstruction.overrides import PRECISIONS, Precision
 from recon.reconstruction.solvers import VOLUME_PRIORS
-from recon.reconstruction.weights import PRIORS
 
 if TYPE_CHECKING:
     from recon.evaluation.chart_reconstruction import ChartProblem

@@ -3,29 +3,30 @@
 In short::
 
     display = Display((540, 960), random_mask((2160, 3840)))
-    model = HologramModel(display, [Target(image)], Loss("frequency"))
-    hologram = compute_hologram(model, budget=Budget(iterations=100))
+    model = HologramModel(display, [Target(image)], HologramOptions(loss="frequency"))
+    hologram = compute_hologram(model)
     print(judge(hologram.slm, display, Target(image)).psnr_db)
 """
 
 from recon.holography.display import DcTerm, Display
 from recon.holography.etendue import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
 from recon.holography.judge import Scores, judge
+from recon.holography.losses import LOSSES, Loss
 from recon.holography.lowpass import Grid
 from recon.holography.mask import ScatteringMask, random_mask
 from recon.holography.model import Evaluation, HologramModel
 from recon.holography.optimise import (
-    Budget,
     Hologram,
     HologramRecord,
     HologramStop,
     compute_hologram,
     one_step,
 )
-from recon.holography.target import Loss, Target, foveal_weights, painted_weights
+from recon.holography.options import HologramOptions
+from recon.holography.target import Target, foveal_weights, painted_weights
 
 __all__ = [
-    "Budget",
+    "LOSSES",
     "DcTerm",
     "Display",
     "Etendue",
@@ -33,6 +34,7 @@ __all__ = [
     "Grid",
     "Hologram",
     "HologramModel",
+    "HologramOptions",
     "HologramRecord",
     "HologramStop",
     "Loss",

@@ -273,15 +273,14 @@ def copy_kept(source: Any, target: Any, kept: int, columns_kept: int, top: int) 
 
 
 @njit(nogil=True, cache=True)
-def weigh(image: Any, weights: Any, scale: float) -> Any:
-    """Return the mean of ``(image scale)^2 weights`` and replace ``image`` by ``image weights scale``."""
+def weigh(image: Any, weights: Any) -> Any:
+    """Return the mean of ``(image weights)^2`` and replace ``image`` by ``image weights^2 / size``."""
     total = 0.0
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
-            value = image[y, x] * scale
-            weighted = value * weights[y, x]
-            total += float(value) * float(weighted)
-            image[y, x] = weighted
+            weighted = image[y, x] * weights[y, x]
+            total += float(weighted) * float(weighted)
+            image[y, x] = weighted * weights[y, x] / image.size
     return total / float(image.size)
 
 

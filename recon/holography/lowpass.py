@@ -18,7 +18,7 @@ import numpy.typing as npt
 from recon.base.fft import fast_length
 from recon.errors import InputError
 
-Grid = Literal["alias_free", "dissertation"]
+Grid = Literal["alias-free", "dissertation"]
 
 CUT = 1.58
 """Radius, in units of the cut-off, beyond which the filter (then 0.010) counts as zero."""
@@ -84,7 +84,7 @@ class Band:
 def make_band(slm_shape: tuple[int, int], factor: int, grid: Grid, *, unfiltered: bool = False) -> Band:
     """Choose the grid for an SLM and a mask with ``factor`` pixels per SLM pixel along each axis.
 
-    ``"alias_free"`` pads by the filter's radius; ``"dissertation"`` takes the aperture's own grid and keeps
+    ``"alias-free"`` pads by the filter's radius; ``"dissertation"`` takes the aperture's own grid and keeps
     all of its (aliased) lags. ``unfiltered`` keeps every lag of the grid, for a loss without low-pass.
     """
     if factor < 1 or min(slm_shape) < 4:

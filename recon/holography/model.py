@@ -22,12 +22,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.declare import with_overrides
 from recon.base.fft import irfft, rfft
 from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
 from recon.holography.display import Display
-from recon.holography.lowpass import Grid, make_band
-from recon.holography.target import Loss, Target
+from recon.holography.losses import loss_of
+from recon.holography.lowpass import make_band
+from recon.holography.options import HologramOptions
+from recon.holography.target import Target, weights_on
 
 ComplexArray = npt.NDArray[Any]
 
@@ -64,63 +67,67 @@ class HologramModel:
     display : Display
     targets : sequence of Target
         One per plane; planes share the loss.
-    loss : Loss
-    grid : "alias_free" or "dissertation"
-        See :mod:`recon.holography.lowpass`.
-    frames : int
-        Time-multiplexed SLM frames whose intensities average.
+    options : HologramOptions
+        Loss, weights, grid and frames make the model; the search takes the rest.
     dtype : complex64 or complex128
+    **overrides
+        Single options.
     """
 
     def __init__(
         self,
         display: Display,
         targets: Sequence[Target],
-        loss: Loss | None = None,
+        options: HologramOptions | None = None,
         *,
-        grid: Grid = "alias_free",
-        frames: int = 1,
         dtype: npt.DTypeLike = np.complex64,
+        **overrides: Any,
     ) -> None:
-        if not targets or frames < 1:
-            raise InputError("A hologram needs at least one target and one frame.")
+        if not targets:
+            raise InputError("A hologram needs at least one target.")
+        options = with_overrides(options or HologramOptions(), overrides)
         self.display = display
         self.targets = tuple(targets)
-        self.loss = Loss() if loss is None else loss
-        self.grid = grid
-        self.frames = frames
+        self.options = options
+        self.loss = loss_of(options.loss)
+        self.frames = options.frames
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self._real: np.dtype[Any] = np.empty(0, self.dtype).real.dtype
-        unfiltered = self.loss.kind == "none"
-        self.band = make_band(display.slm_shape, display.factor, grid, unfiltered=unfiltered)
+        unfiltered = not self.loss.low_passed
+        self.band = make_band(display.slm_shape, display.factor, options.grid, unfiltered=unfiltered)
         # What needs room to be computed comes before the large arrays, one after the other.
         spectra = [self._spectrum_of(target) for target in self.targets]
         self._wanted = [spectrum for spectrum, _ in spectra]
         self.peaks = tuple(peak for _, peak in spectra)
+        self._cutoff = 0.0 if unfiltered else self.band.cutoff
         self._weights: npt.NDArray[Any] | None = None
-        if self.loss.kind == "spatial":
+        self._wanted_images: list[npt.NDArray[Any] | None] = [None] * len(self.targets)
+        if not self.loss.mean_square:
             height, width = self.band.seen_shape
-            self._weights = (self.loss.weights_on((height, width)) ** 2).astype(self._real)
+            if (weights := options.field_weights()) is not None:
+                self._weights = weights_on(weights, (height, width)).astype(self._real)
             self._small = np.empty((height, width // 2 + 1), self.dtype)
             self._seen = np.empty((height, width), self._real)
-        self._field = np.zeros((frames, *self.band.shape), self.dtype)
+            if self.loss.takes_wanted:
+                self._wanted_images = [self._image_of(s, self._cutoff) for s in self._wanted]
+        self._field = np.zeros((self.frames, *self.band.shape), self.dtype)
         self._spectrum = np.empty((self.band.shape[0], self.band.kept[1]), self.dtype)
         nodes = display.displacement
         self._nodes = None if nodes is None else np.ascontiguousarray(nodes, dtype=self._real)
-        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / frames / self._mean_power())
+        aperture = np.sqrt(1.0 / np.prod(display.mask.shape) / self.frames / self._mean_power())
         response = display.mask.response(display.wavelength_nm) * aperture
         self._table = response.astype(self.dtype)
         self._defocus = [tuple(h.astype(self.dtype) for h in display.defocus(t.z_mm)) for t in self.targets]
         ey, ex = display.envelope(self.band.shape)
         self._ey, self._ex = ey.astype(self._real), ex.astype(self._real)
-        self._cutoff = 0.0 if unfiltered else self.band.cutoff
 
     @property
     def nbytes(self) -> int:
         """Bytes in the work arrays, without the mask itself and the optimiser's vectors."""
         arrays = [self._field, self._spectrum, *self._wanted]
-        if self._weights is not None:
-            arrays += [self._weights, self._small, self._seen]
+        if not self.loss.mean_square:
+            optional = [self._weights, *self._wanted_images]
+            arrays += [self._small, self._seen, *(a for a in optional if a is not None)]
         return sum(a.nbytes for a in arrays)
 
     def evaluate(self, slm: ComplexArray) -> Evaluation:
@@ -254,26 +261,32 @@ class HologramModel:
         if self._cutoff == 0:
             error = _kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
         _kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)
-        if self._weights is not None:
-            size = float(self._seen.size)
+        loss = error / 2
+        if not self.loss.mean_square:
             _kernels.copy_kept(spectrum, self._small, *band.kept, band.top)
             irfft(self._small, self._seen.shape[1], out=self._seen)
-            error = _kernels.weigh(self._seen, self._weights, size)
-            rfft(self._seen, out=self._small)
-            self._small /= self._real.type(size)
+            self._seen *= self._real.type(self._seen.size)
+            loss, gradient = self.loss.evaluate(self._seen, self._wanted_images[plane], self._weights)
+            rfft(np.ascontiguousarray(gradient, self._real), out=self._small)
             _kernels.copy_kept(self._small, spectrum, *band.kept, band.top)
         _kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
-        return error / 2
+        return loss
 
     def _image(self, spectrum: ComplexArray) -> npt.NDArray[Any]:
         """Return the low-passed image of a half spectrum, the field's centre in the middle."""
+        return np.fft.fftshift(self._image_of(spectrum, self.band.cutoff))
+
+    def _image_of(self, spectrum: ComplexArray, cutoff: float) -> npt.NDArray[Any]:
+        """Return the image of a half spectrum in FFT order, low-passed where the cut-off is above 0."""
         from recon.holography import _kernels
 
         height, width = self.band.seen_shape
         small = np.empty((height, width // 2 + 1), self.dtype)
         _kernels.copy_kept(spectrum, small, *self.band.kept, self.band.top)
-        _kernels.low_pass(small, self.band.kept[0], self.band.cutoff, self.band.top)
-        return np.fft.fftshift(irfft(small, width) * self._real.type(height * width))
+        _kernels.low_pass(small, self.band.kept[0], cutoff, self.band.top)
+        image = irfft(small, width)
+        image *= self._real.type(height * width)
+        return image
 
     def _backward(self, frame: int, plane: int, out: ComplexArray) -> None:
         from recon.holography import _kernels

@@ -12,17 +12,20 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.declare import with_overrides
 from recon.errors import InputError
 from recon.holography.model import HologramModel
+from recon.holography.options import HologramOptions
 
 Array = npt.NDArray[Any]
-Method = Literal["lbfgs", "nesterov", "one_step"]
+
+_OF_THE_MODEL = ("loss", "centre", "radius", "periphery", "weights", "grid", "frames")
 
 
 class HologramStop(enum.StrEnum):
@@ -46,32 +49,6 @@ class HologramRecord:
     loss: float
     psnr_db: float
     """Of the low-passed image over the whole field, as the model sees it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """When to stop; whichever comes first.
-
-    Attributes
-    ----------
-    iterations : int
-    time_s : float or None
-    psnr_db : float or None
-        Stop when the low-passed image is that good over the whole field.
-    tolerance : float
-        Stop when the loss fell by less than this fraction in each of five iterations in a row.
-    """
-
-    iterations: int = 200
-    time_s: float | None = None
-    psnr_db: float | None = None
-    tolerance: float = 1e-5
-
-    def __post_init__(self) -> None:
-        if self.iterations < 0 or (self.time_s is not None and self.time_s <= 0):
-            raise InputError(
-                f"A budget needs iterations >= 0 and a time above 0, not {self.iterations}, {self.time_s}."
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,67 +81,63 @@ Callback = Callable[[HologramRecord, Array], object]
 def compute_hologram(
     model: HologramModel,
     *,
-    method: Method = "lbfgs",
-    budget: Budget | None = None,
-    complex_slm: bool = False,
-    phase_levels: int | None = None,
     initial: Array | None = None,
-    seed: int = 0,
     callback: Callback | None = None,
     cancel: threading.Event | None = None,
+    **overrides: Any,
 ) -> Hologram:
-    """Compute SLM patterns for a model's targets.
+    """Compute SLM patterns for a model's targets, as its options say.
 
     Parameters
     ----------
     model : HologramModel
-    method : "lbfgs", "nesterov" or "one_step"
-    budget : Budget, optional
-    complex_slm : bool
-        The SLM sets the amplitude too.
-    phase_levels : int, optional
-        The SLM shows so many equidistant phases only (L-BFGS): the last iterations round more and more
-        pixels and let the others make up for it.
     initial : ndarray, complex, (n_frames, height, width), optional
         Warm start, e.g. the last video frame's ``slm``; by default a random phase.
-    seed : int
-        Of the random phases.
     callback : callable, optional
         ``callback(record, slm)`` after each iteration; its time is not counted.
     cancel : threading.Event, optional
         Set it from any thread, or from the callback, to end after the iteration in progress.
+    **overrides
+        Single options of the search.
+
+    Raises
+    ------
+    InputError
+        For options that contradict each other, and for an override of what made the model.
     """
+    if made := [name for name in _OF_THE_MODEL if name in overrides]:
+        raise InputError(f"{', '.join(made)}: this is the model's; make another HologramModel.")
+    options = with_overrides(model.options, overrides)
+    method, complex_slm = options.method, options.complex_slm
     shape = (model.frames, *model.display.slm_shape)
     if initial is not None and initial.shape != shape:
         raise InputError(f"The start must be {shape}, not {initial.shape}.")
-    if phase_levels is not None and (phase_levels < 2 or complex_slm or method != "lbfgs"):
-        raise InputError("Phase levels are 2 or more, of a phase SLM, and need the method 'lbfgs'.")
-    if method == "one_step":
+    if options.phase_levels is not None and (complex_slm or method != "lbfgs"):
+        raise InputError("Phase levels are of a phase SLM and need the method 'lbfgs'.")
+    if method == "one-step":
         if complex_slm or initial is not None:
             raise InputError("The one-step method takes no start and has no form for a complex SLM.")
-        return one_step(model, seed=seed)
-    search: _Search
-    budget = budget or Budget()
-    if phase_levels is not None:
+        return one_step(model, seed=options.seed)
+    watch = _Watch(options, callback, cancel)
+    if options.phase_levels is not None:
         phase = _Phase(model)
-        start = phase.pack(_start(initial, shape, seed, complex_slm))
-        return _on_levels(phase, start, phase_levels, budget, callback, cancel)
+        return _on_levels(phase, phase.pack(_start(initial, model, options)), options.phase_levels, watch)
+    search: _Search
     if method == "lbfgs":
         variable = _Complex(model) if complex_slm else _Phase(model)
-        search = _Lbfgs(variable, variable.pack(_start(initial, shape, seed, complex_slm)))
-    elif method == "nesterov":
-        search = _Nesterov(model, _start(initial, shape, seed, complex_slm), complex_slm)
+        search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
     else:
-        raise InputError(f"The method is 'lbfgs', 'nesterov' or 'one_step', not {method!r}.")
-    history, reason = _run(search, budget, callback, cancel)
+        search = _Nesterov(model, _start(initial, model, options), complex_slm)
+    history, reason = watch.run(search, options.iterations, options.psnr_db)
     slm = search.slm / max(float(np.abs(search.slm).max()), 1.0) if complex_slm else search.slm
     return Hologram(slm.astype(np.complex64), history, reason, history[-1].seconds)
 
 
-def _start(initial: Array | None, shape: tuple[int, ...], seed: int, complex_slm: bool) -> Array:
+def _start(initial: Array | None, model: HologramModel, options: HologramOptions) -> Array:
     if initial is not None:
-        return initial if complex_slm else _unit(initial)
-    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, shape).astype(np.float32)
+        return initial if options.complex_slm else _unit(initial)
+    shape = (model.frames, *model.display.slm_shape)
+    phases = np.random.default_rng(options.seed).uniform(0, 2 * np.pi, shape).astype(np.float32)
     return np.asarray(np.exp(1j * phases))
 
 
@@ -389,14 +362,7 @@ FINE = 32
 """So many levels or more are rounded to at the end only: stages would cost more than they make up for."""
 
 
-def _on_levels(
-    variable: _Phase,
-    x: Array,
-    levels: int,
-    budget: Budget,
-    callback: Callback | None,
-    cancel: threading.Event | None,
-) -> Hologram:
+def _on_levels(variable: _Phase, x: Array, levels: int, watch: _Watch) -> Hologram:
     """Find phases on levels; the last record is theirs, all others are of phases that are partly rounded."""
     step = x.dtype.type(2 * np.pi / levels)
     history: tuple[HologramRecord, ...] = ()
@@ -412,8 +378,8 @@ def _on_levels(
         if reason is HologramStop.CANCELLED or reason is HologramStop.TIME:
             continue
         search = _Lbfgs(variable, x)
-        limit = replace(budget, iterations=round(budget.iterations * float(part)), psnr_db=None)
-        history, reason = _run(search, limit, callback, cancel, history)
+        iterations = round(watch.options.iterations * float(part))
+        history, reason = watch.run(search, iterations, None, history)
         x = search.x
     variable.held = None
     point, _ = variable.evaluate(np.rint(x / step) * step)
@@ -423,34 +389,49 @@ def _on_levels(
     return Hologram(slm.astype(np.complex64), (*history[:-1], rounded), reason, last.seconds)
 
 
-def _run(
-    search: _Search,
-    budget: Budget,
-    callback: Callback | None,
-    cancel: threading.Event | None,
-    before: tuple[HologramRecord, ...] = (),
-) -> tuple[tuple[HologramRecord, ...], HologramStop]:
-    """Step until the budget is spent; ``before`` is the history so far."""
-    history = [*before] or [HologramRecord(0, 0.0, *search.point)]
-    seconds, calm = history[-1].seconds, 0
-    while True:
-        last = history[-1]
-        if cancel is not None and cancel.is_set():
-            return tuple(history), HologramStop.CANCELLED
-        if budget.psnr_db is not None and last.psnr_db >= budget.psnr_db:
-            return tuple(history), HologramStop.QUALITY
-        if last.iteration >= budget.iterations:
-            return tuple(history), HologramStop.ITERATIONS
-        if budget.time_s is not None and seconds >= budget.time_s:
-            return tuple(history), HologramStop.TIME
-        began = time.perf_counter()
-        found = search.step()
-        seconds += time.perf_counter() - began
-        if found is None:
-            return tuple(history), HologramStop.CONVERGED
-        calm = calm + 1 if last.loss - found.loss < budget.tolerance * last.loss else 0
-        history.append(HologramRecord(last.iteration + 1, seconds, found.loss, found.psnr_db))
-        if callback is not None:
-            callback(history[-1], search.slm)
-        if calm >= 5:
-            return tuple(history), HologramStop.CONVERGED
+@dataclass(frozen=True, slots=True)
+class _Watch:
+    """Steps a search until what was asked for is reached or spent."""
+
+    options: HologramOptions
+    callback: Callback | None
+    cancel: threading.Event | None
+
+    def run(
+        self,
+        search: _Search,
+        iterations: int,
+        psnr_db: float | None,
+        before: tuple[HologramRecord, ...] = (),
+    ) -> tuple[tuple[HologramRecord, ...], HologramStop]:
+        """Step on; ``before`` is the history so far, whose iterations count."""
+        history = [*before] or [HologramRecord(0, 0.0, *search.point)]
+        seconds, calm = history[-1].seconds, 0
+        while True:
+            last = history[-1]
+            if (reason := self._ended(last, seconds, iterations, psnr_db)) is not None:
+                return tuple(history), reason
+            began = time.perf_counter()
+            found = search.step()
+            seconds += time.perf_counter() - began
+            if found is None:
+                return tuple(history), HologramStop.CONVERGED
+            calm = calm + 1 if last.loss - found.loss < self.options.tolerance * last.loss else 0
+            history.append(HologramRecord(last.iteration + 1, seconds, found.loss, found.psnr_db))
+            if self.callback is not None:
+                self.callback(history[-1], search.slm)
+            if calm >= 5:
+                return tuple(history), HologramStop.CONVERGED
+
+    def _ended(
+        self, last: HologramRecord, seconds: float, iterations: int, psnr_db: float | None
+    ) -> HologramStop | None:
+        if self.cancel is not None and self.cancel.is_set():
+            return HologramStop.CANCELLED
+        if psnr_db is not None and last.psnr_db >= psnr_db:
+            return HologramStop.QUALITY
+        if last.iteration >= iterations:
+            return HologramStop.ITERATIONS
+        if self.options.time_s is not None and seconds >= self.options.time_s:
+            return HologramStop.TIME
+        return None

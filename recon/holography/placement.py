@@ -18,7 +18,7 @@ from recon.holography.display import Display
 from recon.holography.judge import low_pass
 from recon.holography.lowpass import make_band
 from recon.holography.model import HologramModel
-from recon.holography.optimise import Budget, compute_hologram
+from recon.holography.optimise import compute_hologram
 from recon.holography.pose import Pose
 from recon.holography.target import Target
 
@@ -57,7 +57,7 @@ class PlacedHologram:
             self.displacement += rest
         placed = replace(display, displacement=self.displacement)
         model = HologramModel(placed, [target])
-        self.slm = compute_hologram(model, budget=Budget(iterations)).slm[0]
+        self.slm = compute_hologram(model, iterations=iterations).slm[0]
         self._wanted = np.fft.ifftshift(np.asarray(model.wanted(), float))
         self._peak = model.peaks[0]
 
@@ -100,7 +100,7 @@ def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Arra
         height,
     )
     field = _propagate(field, display, pose) * display.mask.field(display.wavelength_nm).astype(np.complex64)
-    band = make_band(display.slm_shape, display.factor, "alias_free")
+    band = make_band(display.slm_shape, display.factor, "alias-free")
     far = scipy.fft.fft2(field, band.shape)
     ey, ex = display.envelope(band.shape)
     image = (far.real**2 + far.imag**2) * (ey[:, None] * ex)

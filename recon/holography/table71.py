@@ -14,13 +14,14 @@ from recon.holography.judge import Scores, judge
 from recon.holography.lowpass import Grid
 from recon.holography.mask import random_mask
 from recon.holography.model import HologramModel
-from recon.holography.optimise import Budget, compute_hologram
-from recon.holography.target import Loss, Target, foveal_weights
+from recon.holography.optimise import compute_hologram
+from recon.holography.options import HologramOptions
+from recon.holography.target import Target, foveal_weights
 
 Image = npt.NDArray[Any]
 
 METHODS = ("one-step", "none", "frequency", "spatial")
-GRIDS: tuple[Grid, Grid] = ("dissertation", "alias_free")
+GRIDS: tuple[Grid, Grid] = ("dissertation", "alias-free")
 
 DISSERTATION: Mapping[tuple[int, str], Scores] = {
     (4, "one-step"): Scores(12.059, 0.064, 12.163, 0.069),
@@ -61,13 +62,17 @@ def run_cell(
     display: Display, image: Image, method: str, grid: Grid, *, picture: str = "", iterations: int = 100
 ) -> Cell:
     """Compute and judge one hologram; ``image`` is on the mask's grid."""
-    kind = "frequency" if method == "one-step" else method
-    loss = Loss(kind, table_weights() if kind == "spatial" else None)  # type: ignore[arg-type]
-    target = Target(image, white=1.0)
-    model = HologramModel(display, [target], loss, grid=grid)
-    found = compute_hologram(
-        model, method="one_step" if method == "one-step" else "lbfgs", budget=Budget(iterations, tolerance=0)
+    one_step = method == "one-step"
+    options = HologramOptions(
+        method="one-step" if one_step else "lbfgs",
+        loss="frequency" if one_step else method,
+        weights=table_weights() if method == "spatial" else None,
+        grid=grid,
+        iterations=iterations,
+        tolerance=0,
     )
+    target = Target(image, white=1.0)
+    found = compute_hologram(HologramModel(display, [target], options))
     clean = judge(found.slm, display, target)
     own = judge(found.slm, display, target, padding=1) if grid == "dissertation" else clean
     return Cell(display.expansion, grid, method, picture, own, clean, found.seconds)

@@ -1,10 +1,10 @@
-"""What a hologram is asked to show, and what is counted against it."""
+"""What a hologram is asked to show, and where it counts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +12,6 @@ import numpy.typing as npt
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.lowpass import Band
-
-LossKind = Literal["none", "frequency", "spatial"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,44 +68,14 @@ class Target:
         return kept, peak
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Which differences count (Kuo 2020, Eqs. 7.16, 7.17, 7.19).
+def weights_on(weights: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """Return weights over the field on another grid over it, in FFT order, greatest value 1."""
+    from scipy.ndimage import map_coordinates
 
-    Attributes
-    ----------
-    kind : "none", "frequency" or "spatial"
-        Without constraint; only what passes the eye's low-pass; that, weighted over the field.
-    weights : ndarray, real, (height, width), or None
-        For ``"spatial"``: non-negative weights over the whole field, any size; see :func:`foveal_weights`.
-    """
-
-    kind: LossKind = "frequency"
-    weights: npt.NDArray[Any] | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in ("none", "frequency", "spatial"):
-            raise InputError(f"The loss is 'none', 'frequency' or 'spatial', not {self.kind!r}.")
-        if (self.weights is not None) != (self.kind == "spatial"):
-            raise InputError("Weights are needed with the loss 'spatial', and only with it.")
-        weights = self.weights
-        if weights is not None and (
-            weights.ndim != 2 or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() <= 0
-        ):
-            raise InputError("Weights must be a (height, width) image, finite, not negative, not all zero.")
-
-    def weights_on(self, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-        """Return the weights on a grid over the field, in FFT order, greatest value 1."""
-        from scipy.ndimage import map_coordinates
-
-        if self.weights is None:
-            return np.ones(shape)
-        weights = np.asarray(self.weights, float)
-        at = [
-            (np.fft.fftfreq(n) * m + m // 2).clip(0, m - 1) for n, m in zip(shape, weights.shape, strict=True)
-        ]
-        smooth = map_coordinates(weights, np.meshgrid(*at, indexing="ij"), order=1)
-        return np.asarray(smooth / weights.max(), np.float64)
+    weights = np.asarray(weights, float)
+    at = [(np.fft.fftfreq(n) * m + m // 2).clip(0, m - 1) for n, m in zip(shape, weights.shape, strict=True)]
+    smooth = map_coordinates(weights, np.meshgrid(*at, indexing="ij"), order=1)
+    return np.asarray(smooth / weights.max(), np.float64)
 
 
 def foveal_weights(

@@ -1,4 +1,4 @@
-"""What every prior offers."""
+"""What every prior offers, and what a sum of priors is."""
 
 from __future__ import annotations
 
@@ -7,37 +7,76 @@ from typing import Any
 
 import numpy.typing as npt
 
+from recon.errors import StructureError
+
 Array = npt.NDArray[Any]
 
 
 class Prior(ABC):
-    """A convex function that is small for likely objects.
+    """A convex function that is small for likely objects. One of your own needs ``value`` and ``prox``.
 
-    Solvers pick what they need: proximal gradient methods take ``prox``; splitting methods look at the
-    structure of the sum (:meth:`terms`).
+    Objects are whole: (n_channels, height, width) of a picture, (1, n_z, height, width) of one channel of a
+    volume, on the grid of the camera's FFT. Proximal gradient methods take the ``prox`` of the whole prior;
+    splitting methods take that of each of a sum's :meth:`terms` on its own.
 
     Attributes
     ----------
     memory : ndarray or None
         What an iterative prox starts from next time; part of the state of the solver that calls it.
+    exact : bool
+        Whether ``prox`` is that of ``value``, for every step. Splitting methods ask for it.
     """
 
     memory: Array | None = None
+    exact: bool = True
 
     @abstractmethod
     def value(self, x: Array) -> float:
         """Return the prior's value at ``x``; infinity outside its domain."""
 
     @abstractmethod
-    def prox(self, x: Array, step: float, out: Array | None = None) -> Array:
-        """Return ``argmin_p  step * value(p) + 1/2 ||p - x||^2``; ``out`` may be ``x``."""
+    def prox(self, x: Array, step: float) -> Array:
+        """Return ``argmin_p  step * value(p) + 1/2 ||p - x||^2``. ``x`` is left as it is."""
 
     def terms(self) -> tuple[Prior, ...]:
         """Return the summands; a simple prior is its own only one."""
         return (self,)
 
-    def __add__(self, other: Prior) -> Prior:
-        """Sum of two priors; raises TypeError where no exact prox of the sum is known."""
-        from recon.priors.sums import sum_of
+    def joined(self, other: Prior) -> Prior | None:
+        """Return the sum with one other term as one prior where its prox is known; None where it is not."""
+        return None
 
-        return sum_of(*self.terms(), *other.terms())
+    def __add__(self, other: Prior) -> Prior:
+        """Return the sum of two priors: one prior where the prox of the sum is known, else a :class:`Sum`."""
+        parts: list[Prior] = []
+        for term in (*self.terms(), *other.terms()):
+            for i, part in enumerate(parts):
+                together = part.joined(term) or term.joined(part)
+                if together is not None:
+                    parts[i] = together
+                    break
+            else:
+                parts.append(term)
+        return parts[0] if len(parts) == 1 else Sum(*parts)
+
+
+class Sum(Prior):
+    """A sum of priors of which no common prox is known: for splitting solvers, which take its terms."""
+
+    def __init__(self, *parts: Prior) -> None:
+        self.parts = parts
+
+    def terms(self) -> tuple[Prior, ...]:
+        """Return the summands' terms."""
+        return tuple(term for part in self.parts for term in part.terms())
+
+    def value(self, x: Array) -> float:
+        """Return the sum of the values."""
+        return sum(part.value(x) for part in self.parts)
+
+    def prox(self, x: Array, step: float) -> Array:
+        """Raise StructureError: the prox of a sum is not the proxes one after the other."""
+        names = ", ".join(type(part).__name__ for part in self.parts)
+        raise StructureError(
+            f"The prox of this sum is not known: {names}. Splitting solvers (admm) take its terms one by one."
+        )

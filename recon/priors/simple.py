@@ -23,20 +23,29 @@ class Separable(Prior):
         self.lower = float(lower)
         self.upper = float(upper)
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether it asks for nothing."""
+        return self.weight == 0 and self.lower == -np.inf and self.upper == np.inf
+
     def value(self, x: Array) -> float:
         """Return ``weight * sum |x|`` inside the box, infinity outside."""
         if x.min() < self.lower or x.max() > self.upper:
             return np.inf
         return self.weight * float(np.sum(np.abs(x), dtype=np.float64)) if self.weight else 0.0
 
-    def prox(self, x: Array, step: float, out: Array | None = None) -> Array:
+    def prox(self, x: Array, step: float) -> Array:
         """Soft threshold at ``weight * step``, then clip to the box."""
         threshold = x.dtype.type(self.weight * step)
         # x - clip(x, -t, t) is the soft threshold without a sign or a branch.
-        result: Array = np.subtract(x, np.clip(x, -threshold, threshold), out=out)
+        result: Array = x - np.clip(x, -threshold, threshold)
         return np.clip(result, self.lower, self.upper, out=result)
 
-    def together_with(self, other: Separable) -> Separable:
+    def joined(self, other: Prior) -> Separable | None:
+        """Return the sum with another separable prior."""
+        return self.with_separable(other) if isinstance(other, Separable) else None
+
+    def with_separable(self, other: Separable) -> Separable:
         """Return the sum with another separable prior."""
         return Separable(
             self.weight + other.weight, max(self.lower, other.lower), min(self.upper, other.upper)

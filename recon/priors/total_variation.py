@@ -56,6 +56,12 @@ class TotalVariation(Prior):
         """Return the total variation on its own and the separable part."""
         return (self.with_separable(Zero()), self.separable)
 
+    def joined(self, other: Prior) -> Prior | None:
+        """Return the sum with a separable prior."""
+        if not isinstance(other, Separable):
+            return None
+        return self.with_separable(self.separable.with_separable(other))
+
     def with_separable(self, separable: Separable) -> TotalVariation:
         """Return the same total variation with another separable part."""
         return TotalVariation(
@@ -76,7 +82,7 @@ class TotalVariation(Prior):
         """Return ``weight * TV(x) + separable(x)``."""
         return self.weight * self._norm(self.differences(x).forward(x)) + self.separable.value(x)
 
-    def prox(self, x: Array, step: float, out: Array | None = None) -> Array:
+    def prox(self, x: Array, step: float) -> Array:
         """Prox by accelerated projected gradient on the dual (Beck & Teboulle 2009), warm-started.
 
         The prox of the separable part enters where they project onto the constraint, which keeps the method
@@ -85,7 +91,7 @@ class TotalVariation(Prior):
         strength = x.dtype.type(self.weight * step)
         psi = self.differences(x)
         if strength == 0:
-            return self.separable.prox(x, step, out)
+            return self.separable.prox(x, step)
         if self.memory is None or self.memory.shape != psi.range_shape or self.memory.dtype != x.dtype:
             self.memory = np.zeros(psi.range_shape, x.dtype)
         dual = ahead = self.memory
@@ -103,10 +109,7 @@ class TotalVariation(Prior):
             dual, t = new, t_next
         # A start that is no number would spoil every later call.
         self.memory = dual if np.isfinite(np.sum(dual, dtype=np.float64)) else None
-        if out is None:
-            return p
-        out[...] = p
-        return out
+        return p
 
     def _gap(self, p: Array, dp: Array, dual: Array, x: Array, strength: float, step: float) -> float:
         """Bound the prox's suboptimality: primal objective at ``p`` less dual objective.
@@ -146,6 +149,8 @@ class HaarTotalVariation(Prior):
     open): cheap, with a fixed point slightly off the exact minimiser. A separable part is applied after it.
     """
 
+    exact = False
+
     def __init__(self, weight: float, *, n_axes: int = 2, separable: Separable | None = None) -> None:
         if not weight >= 0:
             raise ValueError(f"A prior's weight must not be negative; got {weight}.")
@@ -156,6 +161,12 @@ class HaarTotalVariation(Prior):
     def terms(self) -> tuple[Prior, ...]:
         """Return the Haar total variation on its own and the separable part."""
         return (self.with_separable(Zero()), self.separable)
+
+    def joined(self, other: Prior) -> Prior | None:
+        """Return the sum with a separable prior."""
+        if not isinstance(other, Separable):
+            return None
+        return self.with_separable(self.separable.with_separable(other))
 
     def with_separable(self, separable: Separable) -> HaarTotalVariation:
         """Return the same total variation with another separable part."""
@@ -168,7 +179,7 @@ class HaarTotalVariation(Prior):
         )
         return self.weight * total + self.separable.value(x)
 
-    def prox(self, x: Array, step: float, out: Array | None = None) -> Array:
+    def prox(self, x: Array, step: float) -> Array:
         """Threshold the differences along each axis, invert, average; then the separable prox."""
         threshold = x.dtype.type(2 * self.n_axes * self.weight * step)
         share = x.dtype.type(0.5 / self.n_axes)
@@ -179,7 +190,7 @@ class HaarTotalVariation(Prior):
             taken *= share
             result += taken
             result -= np.roll(taken, 1, axis)
-        return self.separable.prox(result, step, result if out is None else out)
+        return self.separable.prox(result, step)
 
     def _axes(self) -> range:
         return range(-self.n_axes, 0)

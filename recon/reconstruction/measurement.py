@@ -123,13 +123,6 @@ def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: Noise) -> f
     return max(deviation, LEAST_NOISE * size) or 1.0
 
 
-def binned_noise(noise: Noise, factor: float) -> Noise:
-    """Return the noise of means of ``factor x factor`` pixels, given that of single ones."""
-    if isinstance(noise, NoiseModel):
-        return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
-    return None if noise is None else noise / factor
-
-
 def require_same_pixels(psfs: Array, data: Array) -> None:
     """Raise InputError when PSFs and data (n_channels, height, width) differ in size."""
     if psfs.shape[1:] != data.shape[1:]:

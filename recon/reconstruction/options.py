@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.base.declare import option
 from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import MODELS, ModelName
-from recon.priors import Prior
+from recon.priors import PRIORS, Prior
 from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
 
 Field = Literal["sensor", "full"]
@@ -20,8 +20,6 @@ _MAIN, _STOP, _CHOICE, _COMPUTE, _RARE = "Scene", "When to stop", "Camera model"
 
 
 def _priors() -> tuple[str, ...]:
-    from recon.reconstruction.weights import PRIORS
-
     return tuple(PRIORS)
 
 

@@ -273,7 +273,7 @@ class Problem:
 
     # Scales ------------------------------------------------------------------------------------------
     @cached_property
-    def energy(self) -> Floats:
+    def energy(self) -> Array:
         """What the PSFs are divided by, (n_channels or 1,): each its own where channels have one PSF each.
 
         Of many PSFs it is their root mean square, which keeps how bright they are beside one another.
@@ -281,15 +281,13 @@ class Problem:
         psfs = self.depths.central
         if self.is_plain:
             own = np.sqrt(np.sum(psfs[0].astype(np.float64) ** 2, axis=(1, 2)))
-        else:
-            own = np.sqrt([np.mean(energies(psfs))])
-        return np.asarray(own, np.float32)
+            return np.asarray(own, np.float32)
+        return np.asarray([float(np.sqrt(np.mean(energies(psfs))))])
 
     @property
     def image_scale(self) -> Floats:
         """From the scaled problem's object to measurement units, (n_channels, 1, 1, 1)."""
-        scale: Floats = self.noise[: self.n_channels] / self.energy
-        return scale[:, None, None, None]
+        return np.asarray(self.noise[: self.n_channels] / self.energy, np.float32)[:, None, None, None]
 
     @cached_property
     def levelled(self) -> tuple[Depths, Floats]:

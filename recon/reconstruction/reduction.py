@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean, enlarged
 from recon.base.declare import record
+from recon.base.noise import averaged_noise
 from recon.camera.camera_model import Extent, members_of_depths
 from recon.camera.field_registration import NOT_ON_AXIS
 from recon.reconstruction.between import with_planes_between
-from recon.reconstruction.block_means import binned, enlarged
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import Colours, merged_input
-from recon.reconstruction.measurement import Measurement, binned_noise
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.problem import Problem, central
 from recon.reconstruction.result import Reconstruction
@@ -106,8 +107,8 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     small = tuple(min(w, n) for w, n in zip(window, calibration.psfs.shape[2:], strict=True))
     erased = None
     if not valid.all():
-        erased = binned(valid.astype(np.float32), factor) < 1 - 1e-6
-    kept = binned(np.where(valid, data, 0), factor)
+        erased = block_mean(valid.astype(np.float32), factor, about_axis=True) < 1 - 1e-6
+    kept = block_mean(np.where(valid, data, 0), factor, about_axis=True)
     warnings = problem.warnings
     single = choice.n_planes == 1 and choice.model == "convolution"
     if single:
@@ -118,7 +119,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     made = Problem.of(
         Measurement(
             kept[0] if flat else np.moveaxis(kept, 0, -1),
-            binned_noise(noise, factor),
+            averaged_noise(noise, factor**2),
             erasures=None if erased is None else (erased[0] if flat else np.moveaxis(erased, 0, -1)),
         ),
         calibration,
@@ -193,7 +194,7 @@ def reduced_start(problem: Problem, before: Reconstruction) -> Reconstruction:
         volume = np.mean(volume / reduction.tint.spread(np.ones(())), axis=-1)
     if choice.binning > 1:
         first = volume if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
-        first = binned(first, choice.binning) * choice.binning**2
+        first = block_mean(first, choice.binning, about_axis=True) * choice.binning**2
         volume = first if volume.ndim == 3 else np.moveaxis(first, 0, -1)
     # Light of planes between is on the calibrated ones: there it begins.
     planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
@@ -210,7 +211,7 @@ def reduced_calibration(calibration: Calibration, factor: int, planes: tuple[int
         psfs, positions = psfs[kept], positions[kept]
     geometry = calibration.geometry
     if factor > 1:
-        psfs = binned(psfs, factor)
+        psfs = block_mean(psfs, factor, about_axis=True)
         pitch = geometry.pixel_pitch_um
         geometry = replace(geometry, pixel_pitch_um=None if pitch is None else pitch * factor)
     return replace(calibration, psfs=psfs, source_positions_um=positions, background=None, geometry=geometry)

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean
 from recon.camera.camera_model import ModelName
 from recon.errors import InputError
 from recon.reconstruction.between import between_of
-from recon.reconstruction.block_means import binned
 from recon.reconstruction.choice import Choice, Decision
 from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.extent import binning_of, field_of
@@ -212,7 +212,10 @@ def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | N
     factor = max(1, max(data.shape[1:]) // COARSE_PX) if whole else 1
     return [
         Problem.of(
-            Measurement(binned(data[c], factor), erasures=None if whole else ~np.asarray(valid[c], bool)),
+            Measurement(
+                block_mean(data[c], factor, about_axis=True),
+                erasures=None if whole else ~np.asarray(valid[c], bool),
+            ),
             reduced_calibration(_one_channel(calibration, c), factor, None),
             ReconstructionOptions(z_um=z_um, estimate_background=False),
         )

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
+from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.positive_background import in_turns, is_negative, may_go_on
@@ -20,7 +21,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.reconstruction.unmodelled_planes import limit_of, signs_in_words, signs_of_light
-from recon.reconstruction.weights import PRIORS, is_weighted
+from recon.reconstruction.weights import is_weighted
 from recon.solvers import Outcome, StoppingRules, StopReason
 from recon.solvers.base import Callback, Keeper
 from recon.solvers.douglas_rachford import DouglasRachford
@@ -338,7 +339,7 @@ def _verdict(
         f"the {what} {name}"
         for what, name, own in (
             ("solver", result.solver, SOLVERS.is_own(result.solver)),
-            ("prior", result.prior, result.prior in PRIORS),
+            ("prior", result.prior, PRIORS.is_own(result.prior)),
         )
         if not own
     ]

@@ -1,23 +1,12 @@
-"""Priors by name, and how heavy each is where nobody says: one table by prior and camera."""
+"""How heavy a prior is where nobody says: one table by prior and camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from recon.errors import InputError
-from recon.priors import L1, HaarTotalVariation, NonNegativity, Prior, TotalVariation, Zero
-
-PRIORS: dict[str, Callable[[float], Prior]] = {
-    "tv": lambda weight: TotalVariation(weight) + NonNegativity(),
-    "tv-isotropic": lambda weight: TotalVariation(weight, isotropic=True) + NonNegativity(),
-    "tv-haar": lambda weight: HaarTotalVariation(weight) + NonNegativity(),
-    "l1": lambda weight: L1(weight) + NonNegativity(),
-    "nonnegative": lambda _: NonNegativity(),
-    "none": lambda _: Zero(),
-}
-"""Priors by name, as functions of their weight."""
+from recon.priors import PRIORS, Prior
 
 CameraClass = Literal["picture", "planes", "varying", "varying, with a background"]
 """One PSF for one plane without a background; one PSF a depth; PSFs that vary over the field."""
@@ -66,13 +55,13 @@ DEFAULT_WEIGHTS: Mapping[tuple[str, CameraClass], DefaultWeight] = {
 
 
 def kind_of(prior: str) -> Literal["tv", "l1"]:
-    """Return what a prior counts: differences, or light."""
-    return "tv" if prior.startswith("tv") else "l1"
+    """Return what a prior counts: differences, or light; of one without a name differences."""
+    return PRIORS[prior].kind if prior in PRIORS else "tv"
 
 
 def is_weighted(prior: str) -> bool:
-    """Whether a prior has a weight: bounds have none."""
-    return prior not in ("nonnegative", "none")
+    """Whether a prior by name has a weight: bounds have none."""
+    return prior not in PRIORS or PRIORS[prior].weighted
 
 
 def default_tau(prior: str, camera: CameraClass, peak: float) -> float:
@@ -93,9 +82,5 @@ def name_of(prior: str | Prior) -> str:
 
 def require_prior(prior: str | Prior) -> None:
     """Raise InputError for what is neither a prior nor the name of one."""
-    import difflib
-
-    if not isinstance(prior, Prior) and prior not in PRIORS:
-        near = difflib.get_close_matches(str(prior), PRIORS, 1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"The prior {prior!r} is not known. Choose one of {', '.join(PRIORS)}.{hint}")
+    if not isinstance(prior, Prior):
+        PRIORS.named(prior)

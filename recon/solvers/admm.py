@@ -59,7 +59,7 @@ class Admm(Solver):
         A ``PadCropConvolution``, with or without ``Erasures`` after it.
     data : ndarray, ``operator.range_shape``
     prior : Prior
-        At most one (wrapped) :class:`~recon.priors.TotalVariation` plus separable priors.
+        (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
     initial : ndarray, optional
         Starting point on the operator's domain.
     penalties : Penalties, optional
@@ -114,7 +114,10 @@ class Admm(Solver):
         power = float(np.mean(camera.power))
         differences = 1.0 if penalties.differences is None else penalties.differences
         self._mu_data = penalties.data
-        self._mu[...] = np.array([[differences * power], [penalties.separable * power]])
+        mu = np.array([[differences * power], [penalties.separable * power]])
+        if priors.others:
+            priors.set_penalties(np.broadcast_to(mu, self._mu.shape))
+        self._mu[...] = mu
 
     @property
     def solution(self) -> Array:
@@ -137,11 +140,24 @@ class Admm(Solver):
             self._settle_differences(tv.weight)
         # What is known of the iterate that the sweep is about to turn into a right-hand side.
         data = self._data_sums.sum(axis=0)
-        mu_u, mu_w = self._mu.astype(self._y.dtype)
+        if self._priors.others:
+            if self.iteration in SETTLING:
+                self._priors.set_penalties(self._mu)
+            self._priors.meet(self.relax)
+        mu_u, mu_w = self._mu[0].astype(self._y.dtype), self._priors.pixel_penalties.astype(self._y.dtype)
         for c, y in enumerate(self._y):  # one after the other, so that the caches hold it
             self._priors.sweep(self.relax, c)
             self._split.solve(c, y, mu_u[c], mu_w[c])
         return self._record(*data)
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with that of priors known by their prox."""
+        return {**super().checkpoint(copy=copy), **self._priors.checkpoint()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        super().restore(state)
+        self._priors.restore(state)
 
     def _record(
         self, misfit: float, disagreement: float, change: float, norm: float, multiplier: float

@@ -1,12 +1,14 @@
-"""The priors' side of a splitting solver in two dimensions: differences and pixels, one state each.
+"""The priors' side of a splitting solver in two dimensions: differences, pixels, whatever has a prox.
 
 With ``R(t) = 2 prox(t) - t`` and a state ``t = (split variable + scaled dual variable)`` for each split ``K``
 (``Psi`` for total variation, the identity for the separable prior), an iteration is ``t <- t + relax (K y -
-prox(t))``, and the next right-hand side is ``mu_u Psi^T R(t_u) + mu_w R(t_w)``.
+prox(t))``, and the next right-hand side is ``mu_u Psi^T R(t_u) + mu_w R(t_w)``. Any other prior is one more
+split ``z = y`` with its own prox and penalty, which adds to the pixels'.
 """
 
 from __future__ import annotations
 
+from copy import copy as shallow_copy
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,6 @@ from recon.camera.base import Array
 from recon.errors import StructureError
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
-from recon.priors.sums import sum_of
 from recon.priors.total_variation import TotalVariation
 
 STRIPS = 16
@@ -28,13 +29,100 @@ which pixel happens to leave its bound in it (seen to differ tenfold between flo
 nothing about the balance."""
 
 
-class PriorSplits:
-    """States of the splits for total variation plus a separable prior.
+LARGEST_STEP = 10.0
+"""Largest factor by which the penalty of a prior known by its prox changes at once."""
+
+
+class ProxSplit:
+    """The split ``z = y`` of a prior of which nothing is known but ``value`` and ``prox``.
 
     Parameters
     ----------
     prior : Prior
-        At most one :class:`~recon.priors.TotalVariation` (wrapped, equal weights) plus separable priors.
+    start : ndarray
+        Object to begin with.
+
+    Attributes
+    ----------
+    state, split : ndarray
+        ``t`` and ``z = prox(t)``.
+    mu : float
+        Penalty.
+    sums : tuple of float
+        Squared norms of the last :meth:`meet`: primal residual, change and size of ``z``, multiplier / mu.
+    """
+
+    def __init__(self, prior: Prior, start: Array) -> None:
+        # Its own: what a prox keeps from call to call belongs to this run.
+        self.prior = shallow_copy(prior)
+        self.prior.memory = None
+        self.mu = 1.0
+        self.state = start.copy()
+        self.split = self._prox()
+        self.sums = (0.0, 0.0, 0.0, 0.0)
+
+    def _prox(self) -> Array:
+        return np.asarray(self.prior.prox(self.state, 1 / self.mu), self.state.dtype)
+
+    def meet(self, y: Array, relax: float) -> None:
+        """Update from the object."""
+        before = self.split
+        self.state = self.state + self.state.dtype.type(relax) * (y - before)
+        self.split = self._prox()
+        parts = (y - self.split, self.split - before, self.split, self.state - self.split)
+        self.sums = tuple(float(np.vdot(v, v)) for v in parts)  # type: ignore[assignment]
+
+    def pull(self) -> Array:
+        """Return what it adds to the next right-hand side, ``mu R(t)``."""
+        pull: Array = self.state.dtype.type(self.mu) * (2 * self.split - self.state)
+        return pull
+
+    def balanced(self, guess: float) -> float:
+        """Return a penalty that balances the residuals; the guess, as long as nothing is known of them."""
+        if not any(self.sums):
+            return guess
+        primal, change, norm, multiplier = self.sums
+        moving = primal > SETTLED**2 * norm or change > SETTLED**2 * multiplier
+        if not moving or not all(v > 0 and np.isfinite(v) for v in self.sums):
+            return self.mu
+        factor = (primal / change * (multiplier / norm)) ** 0.25
+        return self.mu * float(np.clip(factor, 1 / LARGEST_STEP, LARGEST_STEP))
+
+    def set_penalty(self, mu: float) -> None:
+        """Change the penalty; split variable and (unscaled) multiplier stay what they are."""
+        self.state = self.split + self.state.dtype.type(self.mu / mu) * (self.state - self.split)
+        self.mu = mu
+
+    def restart(self) -> None:
+        """Begin anew from zero."""
+        self.prior.memory = None
+        self.state = np.zeros_like(self.state)
+        self.split = self._prox()
+        self.sums = (0.0, 0.0, 0.0, 0.0)
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return the state, with what the prior's prox keeps."""
+        memory = np.zeros(0) if self.prior.memory is None else self.prior.memory
+        return {
+            "state": self.state, "split": self.split, "mu": self.mu, "sums": np.array(self.sums),
+            "memory": memory,
+        }  # fmt: skip
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.state, self.split, self.mu = np.array(kept["state"]), np.array(kept["split"]), float(kept["mu"])
+        self.sums = tuple(float(v) for v in kept["sums"])  # type: ignore[assignment]
+        self.prior.memory = np.array(kept["memory"]) if kept["memory"].size else None
+
+
+class PriorSplits:
+    """States of the splits for a sum of priors.
+
+    Parameters
+    ----------
+    prior : Prior
+        Total variation (wrapped, equal weights) and separable priors have compiled sweeps; any others need
+        ``value`` and an exact ``prox``.
     start : ndarray, (n_channels, height, width)
         Object whose states to begin with; becomes :attr:`y`.
 
@@ -46,14 +134,17 @@ class PriorSplits:
         States of the differences and of the pixels.
     mu : ndarray, (2, n_channels)
         Penalties of the differences (0 without total variation) and of the pixels.
+    others : tuple of ProxSplit
+        Splits of priors that have no sweep of their own.
     """
 
     def __init__(self, prior: Prior, start: Array) -> None:
         from recon.solvers import _split_kernels
 
         self._kernels: Any = _split_kernels
-        self.tv, self.separable = split_prior(prior)
+        self.tv, self.separable, others = split_prior(prior)
         self.y = start
+        self.others = tuple(ProxSplit(other, start) for other in others)
         self.t_w = start.copy()
         self.tx = np.roll(start, -1, 2) - start
         self.ty = np.roll(start, -1, 1) - start
@@ -64,6 +155,17 @@ class PriorSplits:
         self._below = np.empty((len(start), strips, width), start.dtype)
         self._above = np.empty_like(self._below)
         self._sums = np.zeros((len(start) * height, _split_kernels.N_SUMS))
+
+    @property
+    def pixel_penalties(self) -> Array:
+        """What all splits of the object itself add to the quadratic problem, (n_channels,)."""
+        penalties: Array = self.mu[1] + sum(other.mu for other in self.others)
+        return penalties
+
+    def meet(self, relax: float) -> None:
+        """Update the states of the priors without a sweep from ``y``, the object of all channels."""
+        for other in self.others:
+            other.meet(self.y, relax)
 
     def sweep(self, relax: float, channel: int | None = None) -> None:
         """Update the states from ``y`` and write the next right-hand side over it; of one channel, or all.
@@ -91,9 +193,13 @@ class PriorSplits:
             )  # fmt: skip
 
         in_blocks(strips, len(y) * (len(self._edges) - 1))
+        for other in self.others:
+            y += other.pull()[part]
 
     def solution(self) -> Array:
-        """Return the split variable that obeys the separable prior."""
+        """Return the split variable that obeys the separable prior; without one, the first other prior's."""
+        if self.others and self.separable.is_zero:
+            return self.others[0].split.copy()
         return np.stack([self.separable.prox(t, 1 / mu) for t, mu in zip(self.t_w, self.mu[1], strict=True)])
 
     def channel_sums(self) -> Array:
@@ -109,13 +215,18 @@ class PriorSplits:
         if self.tv:
             primal = max(primal, ratio(s[k.PRIMAL_U], s[k.NORM_U]))
             dual = max(dual, ratio(s[k.CHANGE_U], s[k.MULTIPLIER_U]))
-        return primal, dual, ratio(s[k.CHANGE_W], s[k.NORM_W])
+        moved = ratio(s[k.CHANGE_W], s[k.NORM_W])
+        for disagreement, change, norm, multiplier in (other.sums for other in self.others):
+            primal, dual = max(primal, ratio(disagreement, norm)), max(dual, ratio(change, multiplier))
+            moved = max(moved, ratio(change, norm))
+        return primal, dual, moved
 
     def value(self) -> float:
         """Return the prior's value at the last sweep's iterates (finite: bounds hold by construction)."""
         k, s = self._kernels, self.channel_sums().sum(axis=0)
         weight = self.tv.weight if self.tv else 0.0
-        return float(weight * s[k.TV] + self.separable.weight * s[k.L1])
+        others = sum(other.prior.value(other.split) for other in self.others)
+        return float(weight * s[k.TV] + self.separable.weight * s[k.L1] + others)
 
     def balanced_penalties(self) -> Array:
         """Return penalties that balance the last sweep's relative residuals, (2, n_channels).
@@ -155,6 +266,26 @@ class PriorSplits:
             for t, split, factor in states:
                 t[c] = split + factor * (t[c] - split)
         self.mu[...] = mu
+        for other in self.others:
+            other.set_penalty(other.balanced(float(np.mean(mu[1]))))
+
+    def restart(self) -> None:
+        """Begin anew from zero; penalties are to be set again."""
+        for array in (self.y, self.tx, self.ty, self.t_w):
+            array[...] = 0
+        for other in self.others:
+            other.restart()
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return what :attr:`others` keep, by name."""
+        kept = enumerate(other.checkpoint() for other in self.others)
+        return {f"prior_{i}_{name}": value for i, part in kept for name, value in part.items()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        for i, other in enumerate(self.others):
+            prefix = f"prior_{i}_"
+            other.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
     def _thresholds(self) -> Array:
         weights = np.array([[self.tv.weight if self.tv else 0.0], [self.separable.weight]])
@@ -162,25 +293,34 @@ class PriorSplits:
         return thresholds
 
 
-def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable]:
-    """Take a prior apart into total variation and separable part.
+def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable, tuple[Prior, ...]]:
+    """Take a prior apart: total variation in two dimensions, the separable part, and all others.
 
     Raises
     ------
     StructureError
-        When there is something else in it.
+        When a prior's prox is not that of its value.
     """
-    terms = prior.terms()
-    separable = sum_of(*(t for t in terms if isinstance(t, Separable)))
-    assert isinstance(separable, Separable)
-    others = [t for t in terms if not isinstance(t, Separable)]
-    if not others:
-        return None, separable
-    tv = others[0]
-    if len(others) > 1 or not isinstance(tv, TotalVariation) or tv.axis_weights != (1.0, 1.0):
-        names = ", ".join(type(t).__name__ for t in others)
-        raise StructureError(f"ADMM takes one TotalVariation in two dimensions, not {names}; fista may.")
-    return tv, separable
+    separable, tv, others = Separable(), None, []
+    for term in prior.terms():
+        if isinstance(term, Separable):
+            separable = separable.with_separable(term)
+        elif tv is None and isinstance(term, TotalVariation) and term.axis_weights == (1.0, 1.0):
+            tv = term
+        else:
+            others.append(term)
+    require_exact(*others)
+    return tv, separable, tuple(others)
+
+
+def require_exact(*priors: Prior) -> None:
+    """Refuse priors whose prox is not that of their value: no splitting method finds their minimiser."""
+    for prior in priors:
+        if not prior.exact:
+            raise StructureError(
+                f"The prox of {type(prior).__name__} is only near that of its value for small steps, and "
+                "splitting methods take large ones: they would settle somewhere else. Take fista."
+            )
 
 
 def soft_pair(tx: Array, ty: Array, threshold: Any, isotropic: bool) -> tuple[Array, Array]:

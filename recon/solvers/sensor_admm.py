@@ -78,7 +78,7 @@ class SensorAdmm(Solver):
         A ``PadCropConvolution``, with or without ``Erasures`` after it.
     data : ndarray, ``operator.range_shape``
     prior : Prior
-        At most one (wrapped) :class:`~recon.priors.TotalVariation` plus separable priors.
+        (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
     initial : ndarray, optional
         Starting point on the operator's domain. To go on where a run ended, use :meth:`checkpoint`, which
         keeps the dual variables too.
@@ -165,7 +165,8 @@ class SensorAdmm(Solver):
         """Begin anew from zero with other data, in the memory that the solver has."""
         self.iteration = 0
         self.set_data(data)
-        for array in (self._y, self._tx, self._ty, self._t_w, self._e, self._E):
+        self._splits.restart()
+        for array in (self._e, self._E):
             array[...] = 0
         self._splits.set_penalties(self._first_penalties())
         self._adapt()
@@ -200,14 +201,24 @@ class SensorAdmm(Solver):
     def _update(self, steps: int) -> float:
         """Update objects and splits; return the squared data residual."""
         misfit = 0.0
+        if self._splits.others:  # which see all channels at once
+            misfit += sum(self._solve(channel, steps) for channel in range(len(self._y)))
+            self._splits.meet(self.relax)
+            self._splits.sweep(self.relax)
+            return misfit
         for channel in range(len(self._y)):  # one after the other, so that the caches hold it
             misfit += self._solve(channel, steps)
             self._splits.sweep(self.relax, channel)
         return misfit
 
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with that of priors known by their prox."""
+        return {**super().checkpoint(copy=copy), **self._splits.checkpoint()}
+
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint taken from a solver of the same problem."""
         super().restore(state)
+        self._splits.restore(state)
         self._adapt()
 
     def _solve(self, channel: int, steps: int) -> float:
@@ -268,8 +279,8 @@ class SensorAdmm(Solver):
 
     def _quadratic(self, channel: int) -> Array:
         """Return the penalties of differences and of pixels in the quadratic problem."""
-        penalties: Array = self._mu[:, channel] + np.array([0.0, self._extra_penalty()])
-        return penalties
+        pixels = self._splits.pixel_penalties[channel] + self._extra_penalty()
+        return np.array([self._mu[0, channel], pixels])
 
     def _extra_penalty(self) -> float:
         """Return what a subclass' split of the object itself adds to the pixels' penalty."""

@@ -32,7 +32,7 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 
 PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
-"""The priors of :data:`recon.reconstruction.weights.PRIORS` that the exact-data ADMM solves."""
+"""The priors of :data:`recon.priors.PRIORS` that the exact-data ADMM solves."""
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
 """Iterations of a block's first frame and of the others: as good as independent frames at their best where

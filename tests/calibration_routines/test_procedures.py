@@ -13,9 +13,9 @@ import pytest
 from calibration_routines import CalibrationError
 from calibration_routines.errors import RunEndedError
 from calibration_routines.optics.optics_procedures import AngularProcedure
+from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
 from calibration_routines.procedure import Listener, Outcome
-from calibration_routines.psf.axial_exposure import SweepExposures
-from calibration_routines.psf.plan_procedures import PlanProcedure, ResumeProcedure
+from calibration_routines.psf.exposure import SweepExposures
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
 from instrument.bench.bench import Bench, open_bench

@@ -21,7 +21,7 @@ from drivers.registry import buses, listing
 from drivers.registry.claim import Claim
 from drivers.registry.discovery import FoundDevice
 from drivers.registry.listing import Listing, list_devices
-from instrument.cli.devices import _words
+from instrument.cli.bench import _listing_words
 
 
 def usb_device(**changes: Any) -> SimpleNamespace:
@@ -258,7 +258,7 @@ def test_a_note_is_a_comment_after_the_lines() -> None:
 
 def test_the_command_tells_nothing_found_from_not_looked_at(capsys: pytest.CaptureFixture[str]) -> None:
     found = FoundDevice("serial", "/dev/ttyUSB0", "FT232R", usb_id="0403:6001", serial_number="A5")
-    print(_words(Listing((found,), ("USB: libusb is not installed. Install it.",))))
+    print(_listing_words(Listing((found,), ("USB: libusb is not installed. Install it.",))))
     shown = capsys.readouterr().out
     assert "USB: could not be looked at, see below\nHID: none found\n" in shown
     assert "serial:\n  /dev/ttyUSB0  FT232R, 0403:6001, serial A5\n" in shown

@@ -23,11 +23,9 @@ import numpy.typing as npt
 import recon
 from recon.base import threads
 from recon.holography import (
-    Budget,
     DcTerm,
     Display,
     HologramModel,
-    Loss,
     Target,
     compute_hologram,
     foveal_weights,
@@ -234,8 +232,6 @@ def command(*words: str) -> tuple[int, str]:
 
 def command_names() -> list[tuple[str, ...]]:
     """Return every command and subcommand."""
-    import importlib
-
     import typer
 
     from instrument.cli import COMMANDS
@@ -243,7 +239,7 @@ def command_names() -> list[tuple[str, ...]]:
     found: list[tuple[str, ...]] = [()]
     for name, entry in COMMANDS.items():
         found.append((name,))
-        parsed = typer.main.get_command(importlib.import_module(entry.module).app)
+        parsed = typer.main.get_command(entry.load())
         found += [(name, inner) for inner in sorted(getattr(parsed, "commands", {}))]
     return found
 
@@ -255,7 +251,7 @@ def hologram(
     pixels: int = 2,
     loss: str = "frequency",
     frames: int = 1,
-    grid: Any = "alias_free",
+    grid: Any = "alias-free",
     dc: tuple[float, float] | None = None,
     mask_fill: float = 0.0,
     bent: float = 0.0,
@@ -277,12 +273,13 @@ def hologram(
     model = HologramModel(
         display,
         shown,
-        Loss(loss, weights),  # type: ignore[arg-type]
+        loss=loss,
+        weights=weights,
         grid=grid,
         frames=frames,
         dtype=np.complex128 if precise else np.complex64,
     )
-    found = compute_hologram(model, budget=Budget(iterations=iterations, tolerance=0), **options)
+    found = compute_hologram(model, iterations=iterations, tolerance=0, **options)
     seen = np.stack([model.seen(found.slm, plane) for plane in range(len(shown))])
     # The judge knows no displacement: it says what is shown where the mask lies as it should.
     scores = judge(found.slm, replace(display, displacement=None), shown[0])

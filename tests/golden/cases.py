@@ -369,7 +369,7 @@ near[10:20, 10:30], far[40:50, 45:60] = 1, 1
 _add("hologram", adapter.hologram, shown, SLM, within=CHAOTIC)
 _add("hologram-none", adapter.hologram, shown, SLM, loss="none", within=CHAOTIC)
 _add("hologram-spatial", adapter.hologram, shown, SLM, loss="spatial", within=CHAOTIC)
-_add("hologram-one-step", adapter.hologram, shown, SLM, method="one_step", within=CHAOTIC)
+_add("hologram-one-step", adapter.hologram, shown, SLM, method="one-step", within=CHAOTIC)
 _add("hologram-nesterov", adapter.hologram, shown, SLM, method="nesterov", within=CHAOTIC)
 _add("hologram-dissertation-grid", adapter.hologram, shown, SLM, grid="dissertation", within=CHAOTIC)
 _add("hologram-frames", adapter.hologram, shown, SLM, frames=2, within=CHAOTIC)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,8 @@ import pytest
 
 from calibration_routines.display.display_procedures import AlignmentProcedure
 from calibration_routines.optics.optics_procedures import BeadProcedure
+from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook
-from calibration_routines.psf.plan_procedures import PlanProcedure
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT
@@ -45,8 +46,8 @@ def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
     assert procedure == form.make(values_of(form))
     for field in form.fields:
         assert field.label
-        assert field.tip
-        assert field.default is not None or field.optional or field.name in Z
+        assert field.declaration.help
+        assert field.default not in (None, MISSING) or field.declaration.default_words or field.name in Z
     compile(script(procedure, None), form.name, "exec")
 
 

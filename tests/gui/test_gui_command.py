@@ -13,7 +13,7 @@ from PySide6.QtCore import QSettings, QTimer
 from PySide6.QtWidgets import QApplication
 
 from gui.main_window import MainWindow
-from gui.widgets.message import TextWindow
+from gui.widgets.dialogues import TextWindow
 from instrument.cli import main
 
 

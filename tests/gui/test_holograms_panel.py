@@ -19,7 +19,7 @@ import instrument
 from gui.jobs import JobState
 from gui.panels.holograms import HologramsPanel
 from gui.session import BenchSession
-from gui.widgets.view_grid import best_columns
+from gui.widgets.result_views import best_columns
 from instrument.bench.config_file import parse_config
 from instrument.bench.display_setup import bench_display, depth_limit_mm
 from instrument.files.images import read_image, write_image
@@ -171,7 +171,7 @@ def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: Hol
     assert x < 0.49
     after = panel.target.weights()
     assert np.abs(after - before).max() > 0.1
-    np.testing.assert_array_equal(panel.order().request.weights, after)
+    np.testing.assert_array_equal(panel.order().options.weights, after)
 
 
 def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:

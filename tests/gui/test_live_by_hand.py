@@ -15,8 +15,8 @@ from PySide6.QtWidgets import QSplitter
 from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
-from gui.panels import record_bar
 from gui.panels.live import LivePanel
+from gui.widgets import record_bar
 from instrument.files.errors import FileError
 from instrument.runs.acquire import free_bytes
 from instrument.runs.run import Run

@@ -17,8 +17,7 @@ from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES
-from gui.widgets.message import TextWindow
-from gui.widgets.question import choose_path
+from gui.widgets.dialogues import TextWindow, choose_path
 from instrument.runs.snapshot import Light
 
 WAIT_MS = 60_000

@@ -17,7 +17,7 @@ from gui.jobs import JobState
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
-from gui.widgets.question import Question
+from gui.widgets.dialogues import Question
 from gui.widgets.reconstruct_form import PSF, VOLUME
 from instrument.files.images import read_image, write_image
 from instrument.files.volume_source import VolumeSource

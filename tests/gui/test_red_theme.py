@@ -13,8 +13,7 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels import PANELS
 from gui.panels.log import LogPanel
-from gui.theme import DARK, RED, colours
-from gui.widgets.colour_maps import as_shown
+from gui.theme import DARK, RED, as_shown, colours
 from gui.widgets.image_view import ImageView
 
 WAIT_MS = 60_000

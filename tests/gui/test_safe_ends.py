@@ -8,8 +8,8 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from gui.jobs import JobContext, JobState
-from gui.operator_request import OperatorRequest
 from gui.session import BenchSession
+from gui.session_news import OperatorRequest
 
 WAIT_MS = 60_000
 

@@ -145,9 +145,9 @@ def edit(path: Path, **changes: Any) -> None:
     [
         ({"format": "holiday photos"}, "'format' is 'holiday photos'"),
         ({"version": 99}, "version 99 is not known.*Update"),
-        ({"source_positions_um": [[0, 0, 1]]}, "does not describe the arrays"),
-        ({"geometry": {"colour": "blue"}}, "does not describe the arrays"),
-        ({"sha256": {}}, "does not describe the arrays"),
+        ({"source_positions_um": [[0, 0, 1]]}, "is a damaged calibration"),
+        ({"geometry": {"pixel_pitch_um": "blue"}}, "is a damaged calibration"),
+        ({"sha256": {}}, "is a damaged calibration: lacks 'psfs"),
     ],
 )
 def test_a_changed_description_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

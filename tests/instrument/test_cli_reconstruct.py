@@ -23,8 +23,8 @@ from instrument.cli import main
 from instrument.cli.reconstruct_options import Method, PriorName
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
+from recon.priors import PRIORS
 from recon.reconstruction.solvers import SOLVERS
-from recon.reconstruction.weights import PRIORS
 from recon.types import Calibration, Geometry
 
 RNG = np.random.default_rng(3)

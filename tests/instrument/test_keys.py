@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from instrument.cli.keys import keys
+from instrument.cli.progress import keys
 
 
 @pytest.fixture

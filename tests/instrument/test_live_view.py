@@ -149,7 +149,7 @@ def test_frames_that_do_not_fit_end_the_view_with_the_reason() -> None:
     calibration = Calibration(
         np.random.default_rng(0).random((1, 1, 32, 32), np.float32), np.full((1, 3), np.nan)
     )
-    view = live_view(FrameStream(camera, 3), calibration).start()
+    view = LiveView(FrameStream(camera, 3), LiveReconstructor(calibration)).start()
     with pytest.raises(InputError, match="PSF 32 x 32"):
         view.wait_newer(None, 5.0)
     with pytest.raises(InputError, match="PSF 32 x 32"):
@@ -175,7 +175,7 @@ def test_a_bench_shows_its_scene_live() -> None:
         psf = np.zeros(shape, np.float32)
         psf[tuple(n // 2 for n in shape)] = 1.0
         calibration = replace(Calibration(psf[None, None], np.full((1, 3), np.nan)), geometry=bench.geometry)
-        with bench.live(calibration, budget_ms=50.0) as live:
+        with live_view(bench, calibration, budget_ms=50.0) as live:
             result = live.wait_newer(None, 60.0)
     assert result is not None
     assert result.picture.budget_ms == 50.0

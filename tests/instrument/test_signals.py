@@ -162,14 +162,14 @@ def test_an_object_half_made_when_interrupted_shows_no_traceback(here: Path) -> 
     """As a library's, interrupted while it compiles: it fails once more when the interruption is let go."""
     code = """
 import sys
-import instrument.cli.snap as snap
+import instrument.cli.capture as snap
 from instrument.cli import main
 class Handle:
     def __init__(self):
         raise KeyboardInterrupt
     def __del__(self):
         del self.never_set
-snap.app.registered_commands[0].callback = lambda: Handle()
+snap.snap_app.registered_commands[0].callback = lambda: Handle()
 sys.exit(main(["snap"]))
 """
     process = program(code, here)

@@ -9,8 +9,9 @@ from recon.base import fft
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
-from recon.solvers import Admm, Fista, LiteralAdmm, Penalties, StoppingRules, StopReason
+from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
 from recon.solvers.prior_splits import split_prior
+from tests.recon.solvers.literal_admm import LiteralAdmm
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
@@ -62,7 +63,7 @@ def test_is_the_textbook_s_admm_step_by_step(name, relax):
     """Boyd et al. 2011, scaled form with over-relaxation, on dense matrices."""
     operator, data = problem(erased=True)
     data = masked(operator, data)
-    tv, separable = split_prior(PRIORS[name])
+    tv, separable, _ = split_prior(PRIORS[name])
     camera, size = operator.inner, int(np.prod(operator.domain_shape))
     points = np.eye(size).reshape(size, *operator.domain_shape)
     M = np.stack([camera.circular(p).ravel() for p in points], axis=1)

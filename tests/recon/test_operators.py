@@ -124,3 +124,81 @@ def test_a_larger_grid_changes_no_measurement():
     np.testing.assert_allclose(plain.forward(x), wide.forward(larger), rtol=1e-5)
     with pytest.raises(ValueError, match="does not hold"):
         PadCropConvolution(psf, (12, 10), grid_shape=(19, 24))
+
+
+def two_cameras(dtype=np.float64):
+    rng = np.random.default_rng(7)
+    first, second = (PadCropConvolution(rng.random((2, 4, 5)), (6, 5), dtype=dtype) for _ in range(2))
+    return first, second, Erasures(rng.random((2, 6, 5)) > 0.3, (2, 6, 5), dtype)
+
+
+COMPOSITIONS = {
+    "adjoint": lambda A, B, E: (A.H, lambda a, b, e: a.T),
+    "scaled": lambda A, B, E: (2.5 * A, lambda a, b, e: 2.5 * a),
+    "scaled from the right": lambda A, B, E: (A * np.float32(-0.5), lambda a, b, e: -0.5 * a),
+    "NumPy's number": lambda A, B, E: (np.float64(3) * A, lambda a, b, e: 3 * a),
+    "scaled twice": lambda A, B, E: (2 * (3 * A), lambda a, b, e: 6 * a),
+    "negated": lambda A, B, E: (-A, lambda a, b, e: -a),
+    "sum": lambda A, B, E: (A + B, lambda a, b, e: a + b),
+    "difference": lambda A, B, E: (A - B, lambda a, b, e: a - b),
+    "composition": lambda A, B, E: (E @ A, lambda a, b, e: e @ a),
+    "normal operator": lambda A, B, E: (A.H @ A, lambda a, b, e: a.T @ a),
+    "all of it": lambda A, B, E: ((E @ (2 * A - B)).H @ E, lambda a, b, e: (e @ (2 * a - b)).T @ e),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("case", COMPOSITIONS.values(), ids=COMPOSITIONS)
+def test_compositions_have_their_adjoint_their_matrix_and_a_safe_bound(case, dtype):
+    parts = two_cameras(dtype)
+    operator, of_matrices = case(*parts)
+    assert operator.dtype == dtype
+    assert operator.forward(np.ones(operator.domain_shape, dtype)).dtype == dtype
+    assert dot_test(operator) < (1e-5 if dtype == np.float32 else 1e-13)
+    expected = of_matrices(*(matrix(part) for part in parts))
+    np.testing.assert_allclose(matrix(operator), expected, atol=1e-5 if dtype == np.float32 else 1e-12)
+    assert np.linalg.norm(expected, 2) <= operator.norm_bound * (1 + 1e-5)
+    out = np.empty(operator.range_shape, dtype)
+    x = np.random.default_rng(0).random(operator.domain_shape).astype(dtype)
+    assert operator.forward(x, out) is out
+    np.testing.assert_array_equal(out, operator @ x)
+
+
+def test_the_adjoints_adjoint_is_the_operator():
+    camera, *_ = two_cameras()
+    assert camera.H.H is camera
+
+
+def test_an_operator_is_called_as_scipy_calls_it():
+    from scipy.sparse.linalg import aslinearoperator, lsqr
+
+    camera, _, erasures = two_cameras()
+    operator = erasures @ camera
+    x = np.random.default_rng(1).random(operator.domain_shape)
+    np.testing.assert_array_equal(operator(x), operator @ x)
+    for scipys in (operator.as_scipy(), aslinearoperator(operator)):
+        assert scipys.shape == operator.shape == matrix(operator).shape
+        np.testing.assert_array_equal(scipys @ x.ravel(), operator(x).ravel())
+        np.testing.assert_array_equal(scipys.rmatvec(operator(x).ravel()), (operator.H @ operator(x)).ravel())
+    found, *_ = lsqr(operator.as_scipy(), operator(x).ravel(), atol=1e-12, btol=1e-12)
+    np.testing.assert_allclose(operator(found.reshape(x.shape)), operator(x), atol=1e-8)
+
+
+def test_what_does_not_fit_is_refused_by_shape():
+    camera, _, erasures = two_cameras()
+    with pytest.raises(
+        ValueError, match=r"PadCropConvolution takes arrays of shape \(2, 9, 10\), not \(3,\)"
+    ):
+        camera(np.zeros(3))
+    with pytest.raises(ValueError, match="takes arrays of shape"):
+        camera.H @ np.zeros(camera.domain_shape)
+    with pytest.raises(ValueError, match="domains"):
+        camera + erasures
+    with pytest.raises(ValueError, match="Cannot compose"):
+        camera @ erasures
+    with pytest.raises(ValueError, match="dtypes are float64 and float32"):
+        camera - two_cameras(np.float32)[1]
+    with pytest.raises(TypeError):
+        1j * camera
+    with pytest.raises(TypeError):
+        camera + 1

@@ -144,7 +144,7 @@ def test_differences_adjoint(shape, wrap, dtype):
 
 def test_sums_that_are_not_known_are_refused():
     with pytest.raises(TypeError, match="TotalVariation, TotalVariation"):
-        TotalVariation(1.0) + TotalVariation(1.0)
+        (TotalVariation(1.0) + TotalVariation(1.0)).prox(np.ones((1, 4, 4)), 1.0)
     total = NonNegativity() + L1(0.5) + L1(0.25)
     assert isinstance(total, Separable)
     assert (total.weight, total.lower) == (0.75, 0.0)

@@ -10,9 +10,9 @@ import pytest
 
 import recon
 from recon import InputError
+from recon.base.blocks import block_mean, enlarged
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scene_score import score
-from recon.reconstruction.block_means import binned, enlarged
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.precision import drift, precision_of
@@ -338,7 +338,7 @@ def test_binned_and_enlarged_keep_place_and_light(n, factor):
     place = n // 2 + factor
     image[place, n // 2] = 1.0
     # A point two blocks' worth off the axis: the binned camera finds it at its binned place.
-    small_psf, small = binned(psf, factor), binned(image, factor)
+    small_psf, small = (block_mean(i, factor, about_axis=True) for i in (psf, image))
     m = small.shape[0]
     camera = PadCropConvolution(small_psf / small_psf.sum(), (m, m))
     x = np.zeros(camera.domain_shape, np.float32)

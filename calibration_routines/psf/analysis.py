@@ -1,0 +1,277 @@
+"""From the frames of a sweep to PSFs: average, dark, hot pixels, stray light, binning, quality."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import fft, ndimage
+
+from calibration_routines.psf.exposure import hot_pixels
+from calibration_routines.psf.psf_quality import (
+    PsfQuality,
+    measure_psf,
+    remove_low_frequencies,
+    temporal_noise,
+)
+from calibration_routines.psf.stage_fit import StageFit, judge_points
+from recon.base.blocks import block_mean
+from recon.types import Geometry
+
+Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Float = npt.NDArray[np.float32]
+
+_NOISE_PX = 250_000
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneFrames:
+    """The raw frames of one point of a sweep.
+
+    Attributes
+    ----------
+    source_um : (x, y, z)
+        Where the stage said the source was.
+    exposure_ms : float
+    frames : ndarray, uint8 or uint16, (n_frames, height, width) or (n_frames, height, width, 3)
+        All of the same light.
+    full_scale : int
+        The largest count the camera can report.
+    off_axis : bool
+        Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the pattern.
+    brightness : float
+        The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
+        PSF.
+    """
+
+    source_um: tuple[float, float, float]
+    exposure_ms: float
+    frames: Counts
+    full_scale: int
+    off_axis: bool = False
+    brightness: float = 1.0
+
+
+class DarkModel:
+    """What the camera shows without light, at any exposure.
+
+    Dark current adds counts in proportion to time, so two exposures tell each pixel's offset and rate; one
+    exposure tells only itself, and is used for all.
+
+    Parameters
+    ----------
+    exposures_ms : sequence of float
+        One or two different exposures.
+    frames : sequence of ndarray
+        For each exposure its dark frames, (n_frames, height, width) or (n_frames, height, width, 3).
+    full_scale : int
+    """
+
+    def __init__(self, exposures_ms: Sequence[float], frames: Sequence[Counts], full_scale: int) -> None:
+        if len(exposures_ms) not in (1, 2) or len(frames) != len(exposures_ms):
+            raise ValueError("Dark frames are needed at one or two exposures.")
+        self._exposures_ms = tuple(exposures_ms)
+        self._means: list[Float] = [_mean(stack) for stack in frames]
+        self.n_frames = min(len(stack) for stack in frames)
+        longest = int(np.argmax(self._exposures_ms))
+        self.hot = hot_pixels(np.min(frames[longest], axis=0), full_scale)
+        """Pixels that are bright without light at the longer exposure, in every frame."""
+
+    def at(self, exposure_ms: float) -> Float:
+        """Return the expected dark frame, float32 counts."""
+        if len(self._means) == 1:
+            return self._means[0]
+        (short, long), (first, second) = self._exposures_ms, self._means
+        weight = np.float32((exposure_ms - short) / (long - short))
+        return first + weight * (second - first)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepAnalysis:
+    """PSFs with what was found out about them, sorted as the planes came.
+
+    Attributes
+    ----------
+    psfs : ndarray, float32, (n_planes, n_channels, height, width)
+        Non-negative, in counts at ``reference_exposure_ms``, so that planes compare in brightness.
+    background : ndarray, float32, (n_channels, height, width)
+        What was subtracted at the reference exposure, mean over the planes: dark frame and stray light.
+    quality : tuple of PsfQuality
+    """
+
+    psfs: Float
+    background: Float
+    quality: tuple[PsfQuality, ...]
+    reference_exposure_ms: float
+    stages: tuple[StageFit, ...] = ()
+    """For each depth with several points: the measured shifts against the stage's."""
+
+
+def analyse_sweep(
+    planes: Iterable[PlaneFrames],
+    dark: DarkModel,
+    geometry: Geometry,
+    *,
+    dct_order: int = 0,
+    binning: int = 1,
+) -> SweepAnalysis:
+    """Turn the raw frames of a sweep into PSFs and judge them.
+
+    Parameters
+    ----------
+    planes : iterable of PlaneFrames
+        Read one after the other, so that a lazily loaded sweep needs the memory of one plane.
+    dark : DarkModel
+    geometry : Geometry
+        Its ``diffuser_distance_mm``, where known, is held against the support's scaling and the shifts.
+    dct_order : int
+        Lowest DCT coefficients set to zero along each axis (Kuo 2020, Sec. 6.4: 10); 0 keeps them.
+    binning : int
+        Blocks of ``binning x binning`` pixels are averaged, after hot pixels were replaced.
+
+    Raises
+    ------
+    ValueError
+        When there is no plane, or the frames' shapes differ.
+    """
+    psfs: list[Float] = []
+    quality: list[PsfQuality] = []
+    removed_in_all: Float | None = None
+    reference_ms = 0.0
+    for plane in planes:
+        reference_ms = reference_ms or plane.exposure_ms
+        scale = np.float32(reference_ms / plane.exposure_ms / plane.brightness)
+        light = block_mean(channels_first(plane_light(plane, dark)), binning)
+        cleaned, stray = remove_low_frequencies(light, dct_order)
+        measured = measure_psf(
+            light - stray,
+            z_um=plane.source_um[2],
+            noise=noise_of_mean(plane.frames) / binning,
+            saturated_pixels=saturated_pixels(plane, dark.hot),
+            may_be_clipped=plane.off_axis,
+        )
+        quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
+        psfs.append(cleaned * scale)
+        removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
+        background = block_mean(removed, binning) + stray * scale
+        removed_in_all = background if removed_in_all is None else removed_in_all + background
+    if removed_in_all is None:
+        raise ValueError("A sweep needs at least one point.")
+    stacked = np.stack(psfs)
+    judged, stages = judge_points(quality, stacked, binned(geometry, binning))
+    return SweepAnalysis(
+        psfs=stacked,
+        background=removed_in_all / np.float32(len(psfs)),
+        quality=judged,
+        reference_exposure_ms=reference_ms,
+        stages=stages,
+    )
+
+
+def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
+    """Return the mean of a point's frames without dark frame and hot pixels, float32 counts.
+
+    Raises
+    ------
+    ValueError
+        When the dark frames have another shape.
+    """
+    dark_frame = dark.at(plane.exposure_ms)
+    if dark_frame.shape != plane.frames.shape[1:]:
+        raise ValueError(
+            f"The frames at z = {plane.source_um[2] / 1e3:g} mm are {plane.frames.shape[1:]}, "
+            f"the dark frames {dark_frame.shape}."
+        )
+    return replace_hot(_mean(plane.frames) - dark_frame, dark.hot)
+
+
+def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
+    """Replace hot pixels by the median of the 3 x 3 pixels around them.
+
+    Parameters
+    ----------
+    image : ndarray, float32, (height, width) or (height, width, 3)
+    hot : ndarray of bool, shape of ``image``
+    """
+    if not hot.any():
+        return image
+    median = cv2.medianBlur(np.ascontiguousarray(image), 3)
+    return np.where(hot, median, image)
+
+
+def channels_first(image: Float) -> Float:
+    """Return (height, width) or (height, width, n_channels) as (n_channels, height, width)."""
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0)) if image.ndim == 3 else image[np.newaxis]
+
+
+def binned(geometry: Geometry, binning: int) -> Geometry:
+    """Return the geometry with the pixel pitch after binning by ``binning``."""
+    pitch = geometry.pixel_pitch_um
+    return geometry if pitch is None else replace(geometry, pixel_pitch_um=pitch * binning)
+
+
+def _mean(frames: Counts) -> Float:
+    """Return the mean over the first axis, float32; sums of up to 65,536 frames of 16 bit stay exact."""
+    mean: Float = (frames.sum(axis=0, dtype=np.uint32) / np.float32(len(frames))).astype(np.float32)
+    return mean
+
+
+def noise_of_mean(frames: Counts) -> float:
+    """Return the noise of one pixel of the frames' mean; a dark average adds little and is left out."""
+    frames = frames[:, :: max(1, frames[0].size // _NOISE_PX)]  # rows enough to tell a noise by
+    if len(frames) > 1:
+        return temporal_noise(frames)
+    # one frame: the photon noise is unknown, so differences between neighbouring pixels stand in for it; they
+    # contain the pattern itself, which makes this an upper bound
+    step = np.diff(frames[0].astype(np.float32), axis=1)
+    return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
+
+
+def saturated_pixels(plane: PlaneFrames, hot: npt.NDArray[np.bool_]) -> int:
+    """Count the pixels at full scale in any of a point's frames, hot ones excepted."""
+    ever = (plane.frames >= plane.full_scale).any(axis=0)
+    return int(np.count_nonzero(ever & ~hot))
+
+
+FEATURE_PX = 2.0
+"""Binned pixels that the finest structure must still cover: Nyquist (Kuo 2020, Sec. 4.3)."""
+_LOCAL_MEAN_PX = 16.0  # structure coarser than this does not count
+_REACH_PX = 24
+
+
+def feature_size_px(first: npt.NDArray[np.floating], second: npt.NDArray[np.floating]) -> float:
+    """Full width at half maximum of a PSF's finest structure, pixels.
+
+    The half width of the correlation of two frames of the same light (their noise does not correlate), less
+    their local mean; a Gaussian's auto-correlation is wider than itself by the square root of two.
+
+    Parameters
+    ----------
+    first, second : ndarray, (height, width)
+        Two frames of the same light, dark frame subtracted. The same frame twice overrates noise as
+        structure.
+    """
+    spectra = []
+    for image in (first, second):
+        fine = image - ndimage.gaussian_filter(image, _LOCAL_MEAN_PX)
+        spectra.append(fft.rfft2(fine.astype(np.float32)))
+    correlation = fft.irfft2(spectra[0] * np.conj(spectra[1]), s=first.shape)
+    lags = np.arange(-_REACH_PX, _REACH_PX + 1)
+    near = correlation[np.ix_(lags, lags)]
+    radius = np.hypot(lags[:, None], lags)
+    rings = [float(near[(radius > r - 0.5) & (radius <= r + 0.5)].mean()) for r in range(_REACH_PX)]
+    profile = np.array(rings) / rings[0]
+    below = int(np.argmax(profile < 0.5))
+    if not profile[below] < 0.5:
+        return float(2 * _REACH_PX)
+    inner = below - 1
+    half = inner + (profile[inner] - 0.5) / (profile[inner] - profile[below])
+    return float(2 * half / np.sqrt(2))
+
+
+def optical_binning(first: npt.NDArray[np.floating], second: npt.NDArray[np.floating]) -> int:
+    """Return the largest binning that leaves the finest structure two pixels wide; arguments as above."""
+    return max(1, int(feature_size_px(first, second) / FEATURE_PX))

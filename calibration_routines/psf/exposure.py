@@ -1,0 +1,395 @@
+"""Auto-exposure for a point spread function: bright, and never saturated.
+
+A PSF is the reference that every later photograph is explained with, so a saturated pixel in it is an error
+that no reconstruction can undo. Two rules decide, and the stricter one wins:
+
+* the ``percentile`` (99.9th) of the frame, above the black level, is brought to ``target`` of full scale;
+* the brightest pixel stays at or below ``ceiling`` of full scale. Its margin to full scale covers the photon
+  noise of the frames that follow. Known hot pixels (see :func:`hot_pixels`) are excepted: they saturate
+  without any light and are erased from the reconstruction instead.
+
+An exposure is returned as reached only after a frame taken with exactly that exposure kept both rules.
+A sweep's exposures are found before it starts: :func:`expose_sweep`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration_routines.errors import CalibrationError, TooDarkError
+from calibration_routines.psf.sweep_plan import Position, Sweep, axis_point, depths_um
+from drivers.frame import Frame
+from instrument.bench.bench import Bench
+from instrument.runs.run_control import RunControl
+
+Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+class ExposingCamera(Protocol):
+    """What auto-exposure needs of a :class:`drivers.camera.Camera`."""
+
+    @property
+    def exposure_ms(self) -> float:
+        """Exposure time, milliseconds."""
+
+    @property
+    def exposure_limits_ms(self) -> tuple[float, float]:
+        """Shortest and longest exposure, milliseconds."""
+
+    def set_exposure_ms(self, exposure_ms: float) -> float:
+        """Set the exposure; returns what the device made of it, milliseconds."""
+
+    def snap(self) -> Frame:
+        """Take one frame whose exposure begins after this call."""
+
+
+class ExposureOutcome(Enum):
+    """How an auto-exposure ended."""
+
+    REACHED = "reached"
+    """The percentile is at its target and nothing saturates."""
+    HELD_BY_BRIGHTEST_PIXEL = "held by the brightest pixel"
+    """Nothing saturates, but the percentile stays below its target: a longer exposure would saturate."""
+    TOO_DARK = "too dark"
+    """The longest exposure that the camera allows leaves the percentile below its target."""
+    TOO_BRIGHT = "too bright"
+    """The shortest exposure that the camera allows still brings a pixel above the ceiling."""
+    UNSTEADY = "unsteady"
+    """The brightness changes between frames faster than the exposure can follow."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureTrial:
+    """One frame of an auto-exposure."""
+
+    exposure_ms: float
+    level: float
+    """The percentile above black, as a fraction of full scale above black."""
+    brightest: float
+    """The brightest pixel that is not known as hot, likewise."""
+    saturated_pixels: int
+    """Pixels at full scale that are not known as hot."""
+
+
+@dataclass(frozen=True, slots=True)
+class AutoExposure:
+    """The result: the exposure now set, how it was found, and whether it is good."""
+
+    exposure_ms: float
+    outcome: ExposureOutcome
+    trace: tuple[ExposureTrial, ...]
+    target: float
+    ceiling: float
+    percentile: float
+    hot_pixels: int
+    """Pixels excepted from both rules because a dark frame showed them as hot."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether no pixel saturates at ``exposure_ms`` and there is light in the frame to work with."""
+        return self.outcome in (ExposureOutcome.REACHED, ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL)
+
+    @property
+    def message(self) -> str:
+        """What happened and what to do about it, one or two sentences."""
+        last = self.trace[-1]
+        frames = "1 frame" if len(self.trace) == 1 else f"{len(self.trace)} frames"
+        found = (
+            f"{self.exposure_ms:.4g} ms after {frames}: "
+            f"{self.percentile:g}th percentile at {last.level:.0%} of full scale (target {self.target:.0%}), "
+            f"brightest pixel at {last.brightest:.0%}"
+        )
+        advice = {
+            ExposureOutcome.REACHED: "",
+            ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL: (
+                f" The brightest pixel's ceiling of {self.ceiling:.0%} sets the exposure."
+            ),
+            ExposureOutcome.TOO_DARK: (
+                " This is the camera's longest exposure: raise the source's brightness or the gain, "
+                "or bring the source nearer."
+            ),
+            ExposureOutcome.TOO_BRIGHT: (
+                f" This is the camera's shortest exposure, and {last.saturated_pixels} pixels saturate: "
+                "dim the source or lower the gain."
+            ),
+            ExposureOutcome.UNSTEADY: (
+                " No exposure held from one frame to the next: check the source's driver (pulsed supply, "
+                "loose contact), stray light, and whether the camera's exposure steps are fine enough."
+            ),
+        }[self.outcome]
+        return f"Auto-exposure {self.outcome.value}: {found}.{advice}"
+
+
+def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
+    """Find the pixels that are bright without light.
+
+    A pixel is hot when it stands above the dark frame's median by more than 8 standard deviations of its
+    noise (estimated robustly from the median absolute deviation) and by more than 1 % of full scale.
+
+    Parameters
+    ----------
+    dark : ndarray, uint8 or uint16, (height, width) or (height, width, 3)
+        A frame taken without light, with about the exposure that will be used (dark current grows with it).
+    full_scale : int
+        The largest count the camera can report.
+
+    Returns
+    -------
+    ndarray, bool, shape of ``dark``
+    """
+    median = float(np.median(dark))
+    sigma = 1.4826 * float(np.median(np.abs(dark.astype(np.float32) - median)))
+    return dark > median + max(8.0 * sigma, 0.01 * full_scale)
+
+
+def auto_expose(
+    camera: ExposingCamera,
+    *,
+    target: float = 0.7,
+    tolerance: float = 0.1,
+    ceiling: float = 0.9,
+    percentile: float = 99.9,
+    hot: npt.NDArray[np.bool_] | None = None,
+    start_ms: float | None = None,
+    max_frames: int = 20,
+) -> AutoExposure:
+    """Set the camera's exposure for a PSF: ``percentile`` to ``target`` of full scale, nothing saturated.
+
+    The response of a sensor is linear, so one unsaturated frame with signal predicts the exposure and a
+    second one confirms it. A saturated frame says only "shorter": the exposure is halved, then quartered,
+    and so on, until nothing saturates. The camera is left at the exposure returned.
+
+    Parameters
+    ----------
+    camera : ExposingCamera
+        Open, with the source on.
+    target, tolerance : float
+        Wanted fraction of full scale above black, and the relative deviation from it that is accepted.
+    ceiling : float
+        Largest fraction of full scale for the brightest pixel.
+    percentile : float
+        Percentile of the frame's pixels that is brought to ``target``.
+    hot : ndarray of bool, optional
+        Known hot pixels, in the shape of a frame; excepted from all rules.
+    start_ms : float, optional
+        Exposure to begin with; the present one by default.
+    max_frames : int
+        Frames after which an unsteady source is given up.
+
+    Returns
+    -------
+    AutoExposure
+        ``usable`` says whether a PSF can be taken; ``message`` says why not, and what to do.
+
+    Raises
+    ------
+    ValueError
+        When the fractions make no sense or ``hot`` does not fit the frames.
+    """
+    if not 0.0 < target <= ceiling < 1.0:
+        raise ValueError(f"0 < target <= ceiling < 1 must hold, not target={target}, ceiling={ceiling}.")
+    shortest, longest = camera.exposure_limits_ms
+    exposure = camera.set_exposure_ms(float(np.clip(start_ms or camera.exposure_ms, shortest, longest)))
+    known_dark, known_saturated = 0.0, float("inf")  # bracket: longest without, shortest with saturation
+    saturated_in_a_row = 0
+    trace: list[ExposureTrial] = []
+
+    def result(outcome: ExposureOutcome) -> AutoExposure:
+        n_hot = 0 if hot is None else int(np.count_nonzero(hot))
+        return AutoExposure(exposure, outcome, tuple(trace), target, ceiling, percentile, n_hot)
+
+    while True:
+        trial = measure_exposure(camera.snap(), exposure, percentile, hot)
+        trace.append(trial)
+        if trial.saturated_pixels or trial.brightest > ceiling:
+            if exposure <= shortest * (1 + 1e-6):
+                return result(ExposureOutcome.TOO_BRIGHT)
+        elif abs(trial.level - target) <= tolerance * target:
+            return result(ExposureOutcome.REACHED)
+        elif trial.level < target and trial.brightest >= ceiling * (1 - tolerance):
+            return result(ExposureOutcome.HELD_BY_BRIGHTEST_PIXEL)
+        elif trial.level < target and exposure >= longest * (1 - 1e-6):
+            return result(ExposureOutcome.TOO_DARK)
+        if len(trace) >= max_frames:
+            return result(ExposureOutcome.UNSTEADY)
+
+        if trial.saturated_pixels:
+            saturated_in_a_row += 1
+            known_saturated = min(known_saturated, exposure)
+            wanted = exposure * 0.5**saturated_in_a_row
+            if known_dark < exposure:
+                wanted = max(wanted, float(np.sqrt(known_dark * exposure)))
+        else:
+            saturated_in_a_row = 0
+            known_dark = max(known_dark, exposure)
+            wanted = exposure * _linear_step(trial, target, ceiling, tolerance)
+            if wanted >= known_saturated:
+                wanted = 0.5 * (exposure + known_saturated)
+        exposure = camera.set_exposure_ms(float(np.clip(wanted, shortest, longest)))
+
+
+def measure_exposure(
+    frame: Frame, exposure_ms: float, percentile: float, hot: npt.NDArray[np.bool_] | None = None
+) -> ExposureTrial:
+    """Judge one frame: its percentile, its brightest pixel and its saturated pixels, hot ones excepted.
+
+    Raises
+    ------
+    ValueError
+        When ``hot`` does not have the frame's shape.
+    """
+    counts = frame.image
+    if hot is not None:
+        if hot.shape != counts.shape:
+            raise ValueError(f"The hot-pixel mask is {hot.shape}, but the frame is {counts.shape}.")
+        counts = counts[~hot]
+    histogram = np.bincount(counts.ravel(), minlength=frame.full_scale + 1)
+    cumulative = np.cumsum(histogram)
+    level = int(np.searchsorted(cumulative, percentile / 100.0 * cumulative[-1]))
+    brightest = int(np.flatnonzero(histogram)[-1])
+    black = frame.metadata.black_level
+    span = frame.full_scale - black
+    return ExposureTrial(
+        exposure_ms=exposure_ms,
+        level=(level - black) / span,
+        brightest=(brightest - black) / span,
+        saturated_pixels=int(histogram[frame.full_scale :].sum()),
+    )
+
+
+def _linear_step(trial: ExposureTrial, target: float, ceiling: float, tolerance: float) -> float:
+    """Return the factor on the exposure that a linear sensor needs to keep both rules."""
+    if trial.brightest < 0.05:  # so near to black that offsets and read noise decide: go up, but not blindly
+        return min(8.0, 0.5 * ceiling / max(trial.brightest, 1e-3))
+    # aim at the middle of the accepted range below the ceiling, so that noise does not undo the step
+    highest = ceiling * (1 - 0.5 * tolerance) / trial.brightest
+    return highest if trial.level < 0.01 else min(target / trial.level, highest)
+
+
+_MOST_BOOST = 10.0  # exposure off the axis over that on it: beyond, a wrong guess would cost too much time
+_CAUTION = 0.7  # of the logarithm: farther out than was asked, a brighter spot may lie on the sensor
+_BESIDE = (2 / 3, 1 / 3, 1 / 6)
+"""Of the field's radius: where the exposure off the axis is asked; farther in while the pattern misses the
+sensor."""
+_DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
+
+
+@dataclass(frozen=True, slots=True)
+class SweepExposures:
+    """The exposure of every point of a sweep and how it was found."""
+
+    exposures_ms: tuple[float, ...]
+    found: tuple[tuple[float, AutoExposure], ...]
+    """``(z_um, auto-exposure)`` where the camera was asked; planes between are interpolated."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Where the light did not suffice for the target, in words."""
+        return tuple(
+            f"z = {z_um / 1e3:g} mm: {exposure.message}"
+            for z_um, exposure in self.found
+            if not exposure.usable
+        )
+
+
+def expose_sweep(bench: Bench, sweep: Sweep, *, control: RunControl | None = None) -> SweepExposures:
+    """Find the exposure of every point: asked at up to three depths, interpolated between them.
+
+    Light through the aperture falls off as a power of distance, so exposure against z is nearly a straight
+    line in logarithms. Where a depth has points off the axis, one of them about two thirds out is asked as
+    well: the logarithm of a Gaussian response goes with the square of the tangent. Ends with the light off.
+
+    Raises
+    ------
+    CalibrationError
+        When a PSF saturates at the shortest exposure, stays too dark at the longest, or flickers.
+    EndedEarlyError
+        When it was ended through ``control``.
+    """
+    depths = depths_um(sweep)
+    asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
+    found: list[tuple[float, AutoExposure]] = []
+    slopes: list[float] = []
+    try:
+        bench.scene_off()
+        for z_um in asked:
+            if control is not None:
+                control.check()
+            axis = axis_point(sweep, z_um)
+            if not sweep.by_hand:
+                bench.place_source(*axis)
+            found.append((z_um, expose_source(bench, target=sweep.target)))
+            slopes.append(_slope(bench, sweep, axis, found[-1][1].exposure_ms, control))
+    finally:
+        bench.source_off()
+    longest = bench.camera.exposure_limits_ms[1]
+    exposures = []
+    for point in sweep.points_um:
+        axis = axis_point(sweep, point[2])
+        on_axis = np.interp(np.log(point[2]), np.log(asked), np.log([one.exposure_ms for _, one in found]))
+        slope = float(np.interp(np.log(point[2]), np.log(asked), slopes))
+        boost = min(_CAUTION * slope * _tangent_squared(point, axis), np.log(_MOST_BOOST))
+        exposures.append(min(float(np.exp(on_axis + boost)), longest))
+    return SweepExposures(tuple(exposures), tuple(found))
+
+
+def _slope(
+    bench: Bench, sweep: Sweep, axis: Position, on_axis_ms: float, control: RunControl | None
+) -> float:
+    """Return how the logarithm of the exposure grows with the squared tangent; 0 where no place tells."""
+    for beside in _beside(sweep, axis):
+        if control is not None:
+            control.check()
+        bench.place_source(*beside)
+        try:
+            dimmer = expose_source(bench, target=sweep.target)
+        except TooDarkError:
+            continue  # lit on the axis, so the source works: from here its light misses the sensor
+        more = np.log(dimmer.exposure_ms / on_axis_ms)
+        return max(0.0, float(more)) / _tangent_squared(beside, axis)
+    return 0.0
+
+
+def _beside(sweep: Sweep, axis: Position) -> list[Position]:
+    """Return points of the axis point's depth, about two thirds out first; none where it is alone."""
+    others = [p for p in sweep.points_um if p[2] == axis[2] and p != axis]
+    farthest = max((_tangent_squared(p, axis) for p in others), default=0.0)
+
+    def nearest(part: float) -> Position:
+        return min(others, key=lambda p: abs(_tangent_squared(p, axis) - part**2 * farthest))
+
+    return list(dict.fromkeys(nearest(part) for part in _BESIDE)) if others else []
+
+
+def _tangent_squared(point: Position, axis: Position) -> float:
+    return ((point[0] - axis[0]) ** 2 + (point[1] - axis[1]) ** 2) / point[2] ** 2
+
+
+def expose_source(bench: Bench, *, target: float = 0.7) -> AutoExposure:
+    """Auto-expose the point source where it stands; hot pixels are known from a dark frame. Leaves it lit.
+
+    Raises
+    ------
+    CalibrationError
+        When no usable exposure exists; the text says why and what to do.
+    """
+    camera = bench.camera
+    for _ in range(3):
+        dark_exposure_ms = camera.exposure_ms
+        bench.source_off()
+        dark = camera.snap()
+        bench.source_on()
+        result = auto_expose(camera, target=target, hot=hot_pixels(dark.image, dark.full_scale))
+        if result.outcome is ExposureOutcome.REACHED or result.exposure_ms <= 2 * dark_exposure_ms:
+            break  # else pixels may be hot that were not at the dark frame's shorter exposure: look again
+    too_dark = result.outcome is ExposureOutcome.TOO_DARK and result.trace[-1].level < _DIMMEST_USABLE
+    if too_dark:
+        raise TooDarkError(result.message)
+    if result.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
+        raise CalibrationError(result.message)
+    return result

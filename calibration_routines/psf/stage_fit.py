@@ -1,0 +1,417 @@
+"""Is the source where the stage says, and does it stay what it was? Shifts and brightness of the pattern.
+
+The pattern of a source at ``(x, y)`` is displaced by ``-(x, y) d / z`` (Kuo 2020, Eq. 3.1), measured by
+registration to the central PSF of the depth. A linear map through all of a depth's points takes up what is
+the same everywhere (a wrong d or z, a rotated stage, a lead screw's scale); what is left is the single
+point's own error: slip, backlash, a source that moved.
+
+A reference point that is visited again and again tells whether the source drifts: a change of brightness is
+corrected, every PSF is divided by the brightness of its moment, a straight line between visits; a change of
+place is only reported, as it may be the source's, the camera's or the stage's
+(docs/decisions/0019-sweep-watch-and-drift.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from calibration_routines.psf.psf_quality import (
+    MAX_STEP_PX,
+    PsfQuality,
+    judge_sweep,
+    with_finding,
+)
+from recon.base.blocks import block_mean
+from recon.camera.registration import Registration, register
+from recon.types import Geometry
+
+Float = npt.NDArray[np.float32]
+Floats = npt.NDArray[np.float64]
+
+MAX_BRIGHTNESS_DRIFT = 0.1
+"""Change of the source's light between two visits beyond which a straight line is not to be relied on."""
+_CORRECTABLE = (0.2, 5.0)  # brightness over the first visit's: beyond, it is another light, not a drift
+MAX_PLACE_DRIFT_PX = 0.5
+"""Shift of the reference's pattern that is called a drift, pixels."""
+LARGEST_PX = 500_000
+"""Larger images are binned before patterns are registered: a twentieth of a pixel is told still."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """The reference point's visits, each against the first.
+
+    Attributes
+    ----------
+    before_point : tuple of int
+        Points of the sweep that had been taken before each visit.
+    brightness : tuple of float
+        Light received, relative to the first visit.
+    shift_px : tuple of float
+        Distance of the pattern from its place at the first visit, pixels of the PSFs.
+    findings : tuple of str
+        Empty when the source stayed what it was.
+    """
+
+    before_point: tuple[int, ...]
+    brightness: tuple[float, ...]
+    shift_px: tuple[float, ...]
+    findings: tuple[str, ...]
+    seconds: tuple[float, ...]
+    """When each visit was, from the first."""
+
+    @property
+    def is_correctable(self) -> bool:
+        """Whether brightness was measured at every visit, one after the other, and is that of one source."""
+        least, most = _CORRECTABLE
+        in_order = bool((np.diff(self.seconds) > 0).all())  # a clock that was set meanwhile tells nothing
+        return in_order and all(least <= brightness <= most for brightness in self.brightness)
+
+    def brightness_at(self, seconds: float) -> float:
+        """Return the source's brightness, relative to the first visit, so long after that.
+
+        After the last visit it stays what it was then; 1 where the drift is not correctable.
+        """
+        return float(np.interp(seconds, self.seconds, self.brightness)) if self.is_correctable else 1.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures as JSON-compatible values."""
+        return {name: list(values) for name, values in asdict(self).items()} | {
+            "corrected": self.is_correctable
+        }
+
+
+def judge_drift(
+    visits: Sequence[Float], before_point: Sequence[int], last_point: int, seconds: Sequence[float]
+) -> Drift:
+    """Compare each visit to the reference with the first.
+
+    Parameters
+    ----------
+    visits : sequence of ndarray, float32, (height, width)
+        Averaged, dark frame subtracted, in the order of time; the first is the reference.
+    before_point : sequence of int
+        How many of the sweep's points had been taken before each.
+    last_point : int
+        How many points the sweep has.
+    seconds : sequence of float
+        When each visit was, from the first.
+    """
+    first = visits[0]
+    brightness, shifts = [1.0], [0.0]
+    for visit in visits[1:]:
+        light, shift_px = compare_visit(visit, first)
+        brightness.append(light)
+        shifts.append(shift_px)
+    findings: list[str] = []
+    for k in range(1, len(visits)):
+        points = (before_point[k - 1], min(before_point[k], last_point))
+        findings += judge_visit(tuple(brightness[k - 1 : k + 1]), tuple(shifts[k - 1 : k + 1]), points)
+    return Drift(tuple(before_point), tuple(brightness), tuple(shifts), tuple(findings), tuple(seconds))
+
+
+def compare_visit(visit: Float, first: Float) -> tuple[float, float]:
+    """Return brightness and shift (pixels of these images) of a visit against the first.
+
+    The shift is infinite where the pattern is not found again; both are nan where there is no light.
+    """
+    factor = max(1, int(np.ceil(np.sqrt(first.size / LARGEST_PX))))
+    light = float(first.sum(dtype=np.float64))
+    brightness = float(visit.sum(dtype=np.float64)) / light if light > 0 else float("nan")
+    if not light > 0 or not np.ptp(visit) > 0:
+        return brightness, float("nan")
+    found = register(block_mean(visit, factor), block_mean(first, factor))
+    shift_px = factor * float(np.hypot(found.rows, found.columns))
+    return brightness, shift_px if found.reliable else float("inf")
+
+
+def judge_visit(
+    brightness: tuple[float, ...], shift_px: tuple[float, ...], points: tuple[int, int]
+) -> tuple[str, ...]:
+    """Return what changed between two visits, in words.
+
+    Parameters
+    ----------
+    brightness, shift_px : (float, float)
+        At the earlier and at the later visit, relative to the first of all.
+    points : (int, int)
+        Points of the sweep that had been taken before each.
+    """
+    findings = []
+    where = f"between points {points[0] + 1} and {points[1]}"
+    change = brightness[1] / brightness[0] - 1 if brightness[0] else float("nan")
+    if not abs(change) <= MAX_BRIGHTNESS_DRIFT:
+        findings.append(
+            f"{where} the source became {abs(change):.1%} {'brighter' if change > 0 else 'dimmer'} "
+            f"(up to {MAX_BRIGHTNESS_DRIFT:.0%} can be corrected for): let it warm up, keep other light out, "
+            "and take the sweep again where PSFs must compare in brightness."
+        )
+    if not abs(shift_px[1] - shift_px[0]) <= MAX_PLACE_DRIFT_PX:
+        findings.append(
+            f"{where} the reference's pattern moved from {shift_px[0]:.1f} to {shift_px[1]:.1f} pixels "
+            f"off its first place (up to {MAX_PLACE_DRIFT_PX:g} expected): the source, the stage or the "
+            "camera moved. Fix it and take the sweep again."
+        )
+    return tuple(findings)
+
+
+MAX_GAIN_ERROR = 0.03
+"""Relative departure of the measured shift per micrometre from d/z that is called wrong."""
+MAX_ROTATION_MRAD = 35.0
+"""Rotation of the stage's axes against the sensor's that is called wrong (2 degrees)."""
+_OUTLIER_PX = 0.3  # residuals beyond this count less and less in the fit
+_LEAST_POINTS = 4  # fewer determine the map exactly: nothing is left to judge
+_NEAR_PX, _NEAR_PART = 40.0, 0.2  # where a pattern is looked for: pixels, and part of its shift
+_FAR_PROMINENCE = 3.0  # a pattern found elsewhere must stand out more: few spots resemble many places
+
+
+@dataclass(frozen=True, slots=True)
+class StageFit:
+    """Measured shifts of one depth against what the stage said.
+
+    Attributes
+    ----------
+    z_um : float
+    points : int
+        Whose shift could be measured.
+    gain_error : float or None
+        Measured shift per micrometre over ``d / z / pitch``, minus one; None where d is not known.
+    rotation_mrad : float
+        Of the stage's axes against the sensor's.
+    anisotropy : float
+        Difference of the gains along x and y over their mean.
+    residual_median_px, residual_95_px : float
+        Of the points about the linear map.
+    findings : tuple of str
+    """
+
+    z_um: float
+    points: int
+    gain_error: float | None
+    rotation_mrad: float
+    anisotropy: float
+    residual_median_px: float
+    residual_95_px: float
+    findings: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures as JSON-compatible values."""
+        return asdict(self) | {"findings": list(self.findings)}
+
+
+def judge_points(
+    quality: Sequence[PsfQuality], psfs: npt.NDArray[np.float32], geometry: Geometry
+) -> tuple[tuple[PsfQuality, ...], tuple[StageFit, ...]]:
+    """Judge the PSFs of a sweep against one another.
+
+    Along the axis (the central PSF of each depth) by
+    :func:`~calibration_routines.psf.psf_quality.judge_sweep`, across it by registration to the central PSF.
+
+    Parameters
+    ----------
+    quality : sequence of PsfQuality
+        Of each point, measured alone.
+    psfs : ndarray, float32, (n_points, n_channels, height, width)
+    geometry : Geometry
+        Of the PSFs' pixels.
+    """
+    judged = list(quality)
+    depths: dict[float, list[int]] = {}
+    for index, point in enumerate(quality):
+        depths.setdefault(point.z_um, []).append(index)
+    central = [min(group, key=lambda i: _off_axis(quality[i])) for group in depths.values()]
+    d_mm = geometry.diffuser_distance_mm
+    along = judge_sweep([quality[i] for i in central], None if d_mm is None else 1e3 * d_mm)
+    for index, plane in zip(central, along, strict=True):
+        judged[index] = plane
+    stages = []
+    for centre, group in zip(central, depths.values(), strict=True):
+        others = [i for i in group if i != centre]
+        if others:
+            stages.append(_judge_depth(judged, psfs, geometry, centre, others))
+    return tuple(judged), tuple(stages)
+
+
+def fit_stage(
+    places_um: Floats, shifts_px: Floats, nominal_px_per_um: float | None
+) -> tuple[Floats, float | None, float, float]:
+    """Fit ``shift = -G (place)`` robustly, with the central point fixed at zero.
+
+    Parameters
+    ----------
+    places_um : ndarray, (n, 2)
+        ``(y, x)`` of each source from the central one.
+    shifts_px : ndarray, (n, 2)
+        ``(row, column)`` of its pattern from the central one.
+    nominal_px_per_um : float, optional
+        ``d / z / pitch``.
+
+    Returns
+    -------
+    residuals_px : ndarray, (n,)
+    gain_error : float or None
+    rotation_mrad, anisotropy : float
+    """
+    offset = len(places_um) >= _LEAST_POINTS  # the central registration's own error, where it can be told
+
+    def missed(p: Floats) -> Floats:
+        model = -(places_um @ p[:4].reshape(2, 2).T) + (p[4:] if offset else 0.0)
+        return np.asarray((shifts_px - model).ravel())
+
+    start = np.zeros(6 if offset else 4)
+    solution, *_ = np.linalg.lstsq(-places_um, shifts_px, rcond=None)
+    start[:4] = solution.T.ravel()
+    scale = float(np.abs(places_um).max())
+    fitted = least_squares(
+        missed, start, loss="soft_l1", f_scale=_OUTLIER_PX, x_scale=[1 / scale] * 4 + [1.0] * (len(start) - 4)
+    )
+    gain = fitted.x[:4].reshape(2, 2)
+    residuals = np.hypot(*missed(fitted.x).reshape(-1, 2).T)
+    mean = 0.5 * (gain[0, 0] + gain[1, 1])
+    rotation = np.arctan2(gain[1, 0] - gain[0, 1], gain[0, 0] + gain[1, 1])
+    error = None if nominal_px_per_um is None else float(mean / nominal_px_per_um - 1)
+    return residuals, error, float(1e3 * rotation), float((gain[1, 1] - gain[0, 0]) / mean)
+
+
+def _fit_line(
+    places_um: Floats, shifts_px: Floats, nominal_px_per_um: float | None
+) -> tuple[Floats, float | None, float]:
+    """Fit one turn and one scale robustly: the median over the points; returned as by :func:`fit_stage`."""
+    place, shift = (v[:, 1] + 1j * v[:, 0] for v in (places_um, shifts_px))
+    ratios = -shift / place
+    gain = complex(np.median(ratios.real), np.median(ratios.imag))
+    error = None if nominal_px_per_um is None else abs(gain) / nominal_px_per_um - 1
+    return np.abs(shift + gain * place), error, float(1e3 * np.angle(gain))
+
+
+def _judge_depth(
+    judged: list[PsfQuality],
+    psfs: npt.NDArray[np.float32],
+    geometry: Geometry,
+    centre: int,
+    others: list[int],
+) -> StageFit:
+    """Register a depth's PSFs to the central one; puts steps, similarities and findings into ``judged``."""
+    here = judged[centre]
+    nominal = nominal_px_per_um(geometry, here.z_um)
+    factor = max(1, int(np.ceil(np.sqrt(psfs[0, 0].size / LARGEST_PX))))
+    reference = block_mean(psfs[centre].mean(axis=0), factor)
+    places, shifts, seen = [], [], []
+    for index in others:
+        point = judged[index]
+        place = np.array([point.y_um - here.y_um, point.x_um - here.x_um])
+        found = find_pattern(block_mean(psfs[index].mean(axis=0), factor), reference, place, nominal, factor)
+        if found is None or not found.reliable:
+            judged[index] = with_finding(
+                point,
+                "its pattern was not found where the stage says, nor does it resemble the central one: "
+                "too little of it is on the sensor, or there is too little light. Bring the point nearer.",
+                retake=False,
+            )
+            continue
+        judged[index] = replace(point, similarity=found.similarity)
+        places.append(place)
+        shifts.append(factor * np.array([found.rows, found.columns]))
+        seen.append(index)
+    return _held_against_stage(judged, here.z_um, seen, np.array(places), np.array(shifts), nominal)
+
+
+def _held_against_stage(
+    judged: list[PsfQuality],
+    z_um: float,
+    seen: list[int],
+    places: Floats,
+    shifts: Floats,
+    nominal: float | None,
+) -> StageFit:
+    spans = len(seen) >= 2 and np.linalg.matrix_rank(places, tol=1e-6 * np.abs(places).max()) == 2
+    if spans:
+        residuals, gain_error, rotation_mrad, anisotropy = fit_stage(places, shifts, nominal)
+    elif seen:  # points on one line through the centre: a turn and a scale, no more, can be told
+        residuals, gain_error, rotation_mrad = _fit_line(places, shifts, nominal)
+        anisotropy = 0.0
+    else:
+        return StageFit(z_um, 0, None, 0.0, 0.0, 0.0, 0.0)
+    for index, residual in zip(seen, residuals, strict=True):
+        judged[index] = replace(judged[index], step_px=float(residual))
+        if residual > MAX_STEP_PX:
+            judged[index] = with_finding(
+                judged[index],
+                f"the pattern lies {residual:.1f} pixels beside where the stage says (up to {MAX_STEP_PX:g} "
+                "expected): the stage or the source slipped. Take it again.",
+                retake=True,
+            )
+    findings = []
+    if gain_error is not None and abs(gain_error) > MAX_GAIN_ERROR:
+        findings.append(
+            f"z = {z_um / 1e3:.4g} mm: the pattern moves {abs(gain_error):.1%} too "
+            f"{'far' if gain_error > 0 else 'little'} for d/z: check d, the source's distance, and the "
+            "stage's steps per millimetre."
+        )
+    if abs(rotation_mrad) > MAX_ROTATION_MRAD:
+        findings.append(
+            f"z = {z_um / 1e3:.4g} mm: the stage's axes are turned by {rotation_mrad / 17.45:.1f} degrees "
+            "against the sensor's: turn the camera, or check which axis is which."
+        )
+    return StageFit(
+        z_um,
+        len(seen),
+        gain_error,
+        rotation_mrad,
+        anisotropy,
+        float(np.median(residuals)),
+        float(np.quantile(residuals, 0.95)),
+        tuple(findings),
+    )
+
+
+def find_pattern(
+    psf: npt.NDArray[np.float32],
+    reference: npt.NDArray[np.float32],
+    place_um: Floats,
+    nominal_px_per_um: float | None,
+    factor: int,
+) -> Registration | None:
+    """Register a PSF near where the stage says; everywhere when it is not there.
+
+    Parameters
+    ----------
+    psf, reference : ndarray, float32, (height, width)
+        Both binned by ``factor``.
+    place_um : ndarray, (2,)
+        ``(y, x)`` of the PSF's source from the reference's.
+    nominal_px_per_um : float, optional
+        :func:`nominal_px_per_um`.
+    factor : int
+
+    Returns
+    -------
+    Registration or None
+        In binned pixels; None when nothing is seen.
+    """
+    if not np.ptp(psf) > 0 or not np.ptp(reference) > 0:
+        return None
+    if nominal_px_per_um is not None:
+        row, column = -place_um * nominal_px_per_um / factor
+        reach = (_NEAR_PX + _NEAR_PART * float(np.hypot(row, column) * factor)) / factor
+        found = register(psf, reference, near=(row, column), within_px=reach)
+        if found.reliable:
+            return found
+    found = register(psf, reference)
+    return found if nominal_px_per_um is None or found.prominence >= _FAR_PROMINENCE else None
+
+
+def nominal_px_per_um(geometry: Geometry, z_um: float) -> float | None:
+    """Return ``d / z / pitch``: the pattern's shift in pixels a micrometre; None where it is not known."""
+    d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    return None if d_mm is None or pitch_um is None else 1e3 * d_mm / z_um / pitch_um
+
+
+def _off_axis(point: PsfQuality) -> float:
+    return float(np.hypot(point.x_um, point.y_um))

@@ -1,0 +1,328 @@
+"""One declared option as a field: the widget that fits its type, with its own words, unit and limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from PySide6.QtCore import QSignalBlocker
+from PySide6.QtGui import QFontDatabase
+from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
+
+from gui.widgets.dialogues import Browse
+from gui.widgets.entry import Entry, PathEntry, existing_path, narrow
+from gui.widgets.number_edit import NumberEdit
+from instrument.files.errors import BenchError
+from recon.base.declare import Option
+from recon.base.option_text import default_shown, metavar, read, shown
+from recon.errors import InputError
+
+AUTOMATIC = "automatic"
+"""Shown for None among words to choose from, where the declaration has no word for it."""
+_TEXT_HEIGHT_PX = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Behaviour:
+    """What a field does besides what its declaration says.
+
+    Attributes
+    ----------
+    browse : "open", "folder" or "save"
+        What the dialogue of a path chooses.
+    filters : str
+        Of that dialogue, as QFileDialog has them.
+    must_exist : bool
+        Whether a path must name something that is there.
+    understand : callable, optional
+        Turns a text into the value in place of the declaration; BenchError with the reason where it cannot.
+    require : callable, optional
+        Called with a value that the declaration allows; returns why it cannot be all the same, empty where
+        it can.
+    enabled_when : callable, optional
+        Called with the form's present values by name; returns why the field does not apply, empty where it
+        does. One that does not apply has its default.
+    """
+
+    browse: Browse = "open"
+    filters: str = ""
+    must_exist: bool = False
+    understand: Callable[[str], Any] | None = None
+    require: Callable[[Any], str] | None = None
+    enabled_when: Callable[[dict[str, Any]], str] | None = None
+
+
+class OptionField:
+    """A declared option on the screen; subclasses are for kinds of values.
+
+    Attributes
+    ----------
+    option : Option
+    behaviour : Behaviour
+    widget : QWidget
+        That is edited, marked when its content is refused.
+    whole : QWidget
+        That goes into the row: ``widget``, or what it is part of.
+    """
+
+    widget: QWidget
+    whole: QWidget
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        self.option = option
+        self.behaviour = behaviour
+        said = option.declaration
+        # What is said of it calls it by its label, as the terminal calls it by its flag.
+        self._spoken = replace(option, name=self.bare_label, declaration=replace(said, flags=("",)))
+
+    @property
+    def unit(self) -> str:
+        """The unit that people read."""
+        said = self.option.declaration
+        unit = said.shown_unit or said.unit
+        return "µm" if unit == "um" else unit
+
+    @property
+    def bare_label(self) -> str:
+        """Its label without the unit."""
+        said = self.option.declaration
+        return self.option.label.removesuffix(f" ({said.shown_unit or said.unit})")
+
+    @property
+    def label(self) -> str:
+        """Its label, with the unit where the widget does not show it by itself."""
+        return f"{self.bare_label} ({self.unit})" if self.unit else self.bare_label
+
+    @property
+    def tip(self) -> str:
+        """What the declaration says of the option, with limits and default."""
+        lines = [self.option.declaration.help]
+        if limits := self.option.limits(typed=True):
+            unit = f" {self.unit}" if self.unit else ""
+            lines.append(f"{', '.join(limits)}{unit}".capitalize() + ".")
+        if default := self.option.declaration.default_words:
+            lines.append(f"Default: {default}.")
+        return "\n".join(lines)
+
+    @property
+    def default(self) -> Any:
+        """The option's default; None where it has none and is needed."""
+        return None if self.option.is_required else self.option.default
+
+    def problem(self, value: Any) -> str:
+        """Say why a value cannot be; empty where it can."""
+        found = self._spoken.mistake(value, typed=True) or ""
+        return found or ("" if self.behaviour.require is None else self.behaviour.require(value))
+
+    def read(self) -> tuple[Any, str]:
+        """Return the value, in the option's own unit, and why it cannot be used; empty where it can."""
+        raise NotImplementedError
+
+    def show(self, value: Any) -> None:
+        """Show a value in the option's own unit; no change is told of."""
+        raise NotImplementedError
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes and refusals told."""
+        raise NotImplementedError
+
+
+class NumberField(OptionField):
+    """A number with its unit."""
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__(option, behaviour)
+        empty = ""
+        if option.default is None:  # an empty field shows no unit by itself
+            said = option.declaration
+            empty = said.default_words or said.none_word or "none"
+            empty += f" ({self.unit})" if self.unit else ""
+        self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
+        self.widget.check = lambda number: self.problem(self._in_own_unit(number))
+        self.whole = self.widget
+
+    @property
+    def label(self) -> str:
+        """Its label; the unit stands behind the number."""
+        return self.bare_label
+
+    def _in_own_unit(self, number: float) -> float | int:
+        # 22 mm are 22000 um, not 22000.000000000004.
+        factor = self.option.declaration.shown_factor
+        return int(number) if self.option.is_whole else float(f"{number * factor:.15g}")
+
+    def read(self) -> tuple[Any, str]:
+        """Return the value, and why it cannot be used."""
+        number, problem = self.widget.typed()
+        return (None, problem) if number is None or problem else (self._in_own_unit(number), "")
+
+    def show(self, value: Any) -> None:
+        """Show a value."""
+        blocked = QSignalBlocker(self.widget)
+        scaled = None if value is None else value / self.option.declaration.shown_factor
+        self.widget.set_value(scaled, overwrite=True)
+        blocked.unblock()
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes told."""
+        self.widget.textChanged.connect(lambda _: edited())
+        self.widget.refused.connect(refused)
+
+
+class SwitchField(OptionField):
+    """Yes or no."""
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__(option, behaviour)
+        self.widget: QCheckBox = QCheckBox()
+        self.whole = self.widget
+        self.widget.setToolTip(self.tip)
+
+    def read(self) -> tuple[Any, str]:
+        """Return the value, and why it cannot be used."""
+        return self.widget.isChecked(), ""
+
+    def show(self, value: Any) -> None:
+        """Show a value."""
+        blocked = QSignalBlocker(self.widget)
+        self.widget.setChecked(bool(value))
+        blocked.unblock()
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes told."""
+        self.widget.toggled.connect(lambda _: edited())
+
+
+class ChoiceField(OptionField):
+    """One of several words; None is one of them where it can be."""
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__(option, behaviour)
+        self.widget: QComboBox = QComboBox()
+        self.whole = self.widget
+        narrow(self.widget)
+        self.widget.setToolTip(self.tip)
+        none_word = option.declaration.none_word
+        if none_word or option.default is None:
+            self.widget.addItem(none_word or AUTOMATIC, None)
+        if bool in option.kinds:
+            self.widget.addItem("yes", True)
+            self.widget.addItem("no", False)
+        for word in option.words:
+            self.widget.addItem(word, read(self._spoken, word))
+
+    def read(self) -> tuple[Any, str]:
+        """Return the value, and why it cannot be used."""
+        value = self.widget.currentData()
+        return value, "" if value is None else self.problem(value)
+
+    def show(self, value: Any) -> None:
+        """Show a value."""
+        blocked = QSignalBlocker(self.widget)
+        at = [self.widget.itemData(i) for i in range(self.widget.count())]
+        self.widget.setCurrentIndex(at.index(value) if value in at else 0)
+        blocked.unblock()
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes told."""
+        self.widget.currentIndexChanged.connect(lambda _: edited())
+
+
+class EntryField(OptionField):
+    """A text that stands for something: a path, a place, a name."""
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__(option, behaviour)
+        empty = default_shown(option) or ("none" if option.default is None else "")
+        self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=empty)
+        self.whole = self.widget
+        if option.kinds == (Path,):
+            browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
+            self.whole = path = PathEntry(self.widget, browse, behaviour.filters)
+            path.button.setAccessibleName(f"Choose {self.bare_label}")
+
+    def _understood(self, text: str) -> Any:
+        if not text:
+            if self.option.is_required:
+                raise BenchError(f"{self.bare_label} is needed here.")
+            return self.option.default
+        try:
+            if self.behaviour.understand is not None:
+                return self.behaviour.understand(text)
+            value = read(self._spoken, self._parts(text))
+        except InputError as error:
+            raise BenchError(str(error)) from error
+        except ValueError:  # not as many parts as are needed
+            raise BenchError(f"{self.bare_label} must be {metavar(self.option)}, not {text!r}.") from None
+        if self.option.kinds == (Path,):
+            value = existing_path(text) if self.behaviour.must_exist else value.expanduser()
+        if problem := self.problem(value):
+            raise BenchError(problem)
+        return value
+
+    def _parts(self, text: str) -> str | list[str]:
+        """Return one text, or the parts of what is repeated or has several words."""
+        has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
+        return text.replace(",", " ").split() if has_parts and not self.option.declaration.parse else text
+
+    def read(self) -> tuple[Any, str]:
+        """Return the value, and why it cannot be used."""
+        try:
+            return self.widget.value(), ""
+        except BenchError as error:
+            return None, str(error)
+
+    def show(self, value: Any) -> None:
+        """Show a value."""
+        blocked = QSignalBlocker(self.widget)
+        self.widget.setText("" if value is None else shown(self.option, value))
+        blocked.unblock()
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes told."""
+        self.widget.textChanged.connect(lambda _: edited())
+        self.widget.refused.connect(refused)
+
+
+class LinesField(OptionField):
+    """A text of several lines, as its default has."""
+
+    def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__(option, behaviour)
+        self.widget: QPlainTextEdit = QPlainTextEdit()
+        self.whole = self.widget
+        self.widget.setFont(QFontDatabase.systemFont(QFontDatabase.SystemFont.FixedFont))
+        self.widget.setLineWrapMode(QPlainTextEdit.LineWrapMode.NoWrap)
+        self.widget.setMinimumHeight(_TEXT_HEIGHT_PX)
+        self.widget.setToolTip(self.tip)
+        self.widget.setTabChangesFocus(True)
+
+    def read(self) -> tuple[Any, str]:
+        """Return the text."""
+        return self.widget.toPlainText(), ""
+
+    def show(self, value: Any) -> None:
+        """Show a text."""
+        blocked = QSignalBlocker(self.widget)
+        self.widget.setPlainText(str(value or ""))
+        blocked.unblock()
+
+    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+        """Have changes told."""
+        self.widget.textChanged.connect(edited)
+
+
+def field_for(option: Option, behaviour: Behaviour) -> OptionField:
+    """Return the field that fits an option's type."""
+    numbers = {int, float} & set(option.kinds)
+    if option.kinds == (bool,) and option.default is not None:
+        return SwitchField(option, behaviour)
+    if (option.words and not numbers and Path not in option.kinds) or bool in option.kinds:
+        return ChoiceField(option, behaviour)
+    if numbers == set(option.kinds) and option.declaration.parse is None:
+        return NumberField(option, behaviour)
+    if isinstance(option.default, str) and "\n" in option.default:
+        return LinesField(option, behaviour)
+    return EntryField(option, behaviour)

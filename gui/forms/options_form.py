@@ -1,0 +1,328 @@
+"""The one form: declared options on the screen: labels, units, tips, and the reason where one is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+from PySide6.QtCore import Qt, QTimer, Signal
+from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QVBoxLayout, QWidget
+
+from gui.forms.fields import Behaviour, LinesField, OptionField, field_for
+from instrument.files.errors import BenchError
+from recon.base.declare import Option, options_of
+from recon.errors import InputError
+
+FOLDED = ("Rarely needed", "Advanced")
+"""Groups that are folded away, wherever they are declared."""
+
+_T = TypeVar("_T")
+
+
+class OptionsForm(QWidget):
+    """Shows declared options. ``values`` reads them; what cannot be read is marked where it stands.
+
+    Everything that a field says comes from the declaration: label, unit, tool tip, limits, choices, what an
+    empty field means, its group's heading. Options that the declaration keeps from people (no flag) are not
+    shown. Folded, what is set holds all the same.
+
+    Signals
+    -------
+    changed
+        Something was typed, ticked or chosen.
+    refused : object, str
+        A field's widget and why its content is refused.
+
+    Parameters
+    ----------
+    declared : iterable of Option or of types
+        Options, or classes whose options are all shown; names must differ.
+    behaviour : mapping
+        By name, what a field does besides what its declaration says.
+    folded : collection of str
+        Groups that are folded away.
+    parent : QWidget, optional
+    """
+
+    changed = Signal()
+    refused = Signal(object, str)
+
+    def __init__(
+        self,
+        declared: Iterable[Option | type],
+        behaviour: Mapping[str, Behaviour] | None = None,
+        *,
+        folded: Collection[str] = FOLDED,
+        parent: QWidget | None = None,
+    ) -> None:
+        super().__init__(parent)
+        options = [o for d in declared for o in ((d,) if isinstance(d, Option) else options_of(d))]
+        offered = [o for o in options if o.declaration.flags != ("",)]
+        given = behaviour or {}
+        self.fields: dict[str, OptionField] = {
+            o.name: field_for(o, given.get(o.name, Behaviour())) for o in offered
+        }
+        self.widgets: dict[str, QWidget] = {name: field.widget for name, field in self.fields.items()}
+        self._folded = frozenset(folded)
+        self._reasons: dict[str, QLabel] = {}
+        self._headings: dict[str, QLabel] = {}
+        self._rows: dict[str, QFormLayout] = {}
+        self._hidden: set[str] = set()
+        self._disabled: dict[str, str] = {}
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        usual, seldom = QWidget(), QWidget()
+        self._fill(usual, [f for f in self.fields.values() if not self._is_folded(f)])
+        self._fill(seldom, [f for f in self.fields.values() if self._is_folded(f)])
+        layout.addWidget(usual)
+        self.more = QToolButton()
+        self.more.setText(FOLDED[0])
+        self.more.setCheckable(True)
+        self.more.setAutoRaise(True)
+        self.more.setArrowType(Qt.ArrowType.RightArrow)
+        self.more.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
+        self.more.setToolTip(", ".join(f.bare_label for f in self.fields.values() if self._is_folded(f)))
+        self._seldom = seldom
+        self.more.toggled.connect(self._fold)
+        seldom.hide()
+        layout.addWidget(self.more, 0, Qt.AlignmentFlag.AlignLeft)
+        layout.addWidget(seldom)
+        self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
+        layout.addStretch(1)
+        for name, field in self.fields.items():
+            field.show(field.default)
+            field.listen(self._edited, partial(self._refused_itself, name))
+        self._state = self._read()
+        self._update_enabled()
+
+    # Values --------------------------------------------------------------------------------------
+    def values(self) -> dict[str, Any] | None:
+        """Return the options in their own units; None when one cannot be read.
+
+        Of those that are not shown or do not apply, the default.
+        """
+        self.clear_reasons()
+        found: dict[str, Any] = {}
+        readable = True
+        for name, field in self.fields.items():
+            if not self.applies(name):
+                found[name] = field.default
+                continue
+            value, problem = field.read()
+            if problem:
+                self.refuse(name, problem)
+                readable = False
+            found[name] = value
+        return found if readable else None
+
+    def value(self, name: str) -> Any:
+        """Return one option's value.
+
+        Raises
+        ------
+        BenchError
+            When it cannot be read.
+        """
+        if not self.applies(name):
+            return self.fields[name].default
+        value, problem = self.fields[name].read()
+        if problem:
+            raise BenchError(problem)
+        return value
+
+    def make(self, declared: type[_T]) -> _T:
+        """Return the options of one class, as they stand here.
+
+        Raises
+        ------
+        BenchError
+            When one cannot be read, or they do not go together.
+        """
+        names = [o.name for o in options_of(declared) if o.name in self.fields]
+        try:
+            return declared(**{name: self.value(name) for name in names})
+        except InputError as error:
+            raise BenchError(str(error)) from error
+
+    def set_values(self, values: Mapping[str, Any]) -> None:
+        """Show values; names that the form does not have are left out."""
+        for name, value in values.items():
+            if name in self.fields:
+                self.fields[name].show(value)
+        self._edited()
+
+    def begin_with(self, values: Mapping[str, Any]) -> None:
+        """Show values in the fields that are empty."""
+        empty = {
+            name
+            for name, widget in self.widgets.items()
+            if isinstance(widget, QLineEdit) and not widget.text() and not widget.placeholderText()
+        }
+        self.set_values({name: value for name, value in values.items() if name in empty})
+
+    # What applies --------------------------------------------------------------------------------
+    def applies(self, name: str) -> bool:
+        """Whether a field is shown for what is asked for, and goes with the others."""
+        return name not in self._hidden and name not in self._disabled
+
+    def show_for(self, *subjects: str) -> None:
+        """Show what is declared to apply to one of these subjects, or to everything."""
+        self.hide_fields(
+            name
+            for name, field in self.fields.items()
+            if (about := field.option.declaration.applies) and not set(about) & set(subjects)
+        )
+
+    def hide_fields(self, names: Iterable[str]) -> None:
+        """Hide these fields and no others; they have their defaults."""
+        self._hidden = set(names)
+        for name, field in self.fields.items():
+            self._rows[name].setRowVisible(field.whole, name not in self._hidden)
+            if name in self._hidden:
+                self._reasons[name].hide()
+        for group, heading in self._headings.items():
+            heading.setVisible(any(self._group(f) == group for f in self._shown_fields()))
+        self.more.setVisible(any(map(self._is_folded, self._shown_fields())))
+        self._edited()
+
+    # Reasons -------------------------------------------------------------------------------------
+    def check(self) -> bool:
+        """Tell whether all can be read; the first that cannot is brought into sight, with the reason."""
+        if self.values() is not None:
+            return True
+        name = next(name for name, reason in self._reasons.items() if reason.text())
+        self.show_field(name)
+        self.widgets[name].setFocus()
+        self.refused.emit(self.widgets[name], self._reasons[name].text())
+        return False
+
+    def refuse(self, name: str, why: str) -> bool:
+        """Mark a field as wrong, with the reason below it; returns whether there is such a field."""
+        widget = self.widgets.get(name)
+        if widget is None:
+            return False
+        reason = self._reasons[name]
+        text = why[:1].upper() + why[1:] + ("" if why.endswith((".", "?")) else ".")
+        reason.setText(text)
+        reason.show()
+        widget.setToolTip(text)
+        _mark(widget, refused=True)
+        return True
+
+    def show_field(self, name: str) -> None:
+        """Bring a field into sight, also from among those that are folded away."""
+        if self._is_folded(self.fields[name]):
+            self.more.setChecked(True)
+        scroll = self.parent()
+        while scroll is not None and not isinstance(scroll, QScrollArea):
+            scroll = scroll.parent()
+        if scroll is not None:
+            # After the layout has made room for the reason.
+            reason = self._reasons[name]
+            QTimer.singleShot(0, reason, lambda: scroll.ensureWidgetVisible(reason))
+
+    def clear_reasons(self) -> None:
+        """Take all reasons away."""
+        for name in self._reasons:
+            self._clear_reason(name)
+
+    def reason(self, name: str) -> str:
+        """Return why a field was refused; empty when it was not."""
+        return self._reasons[name].text()
+
+    # Inside --------------------------------------------------------------------------------------
+    def _fill(self, box: QWidget, fields: list[OptionField]) -> None:
+        rows = QFormLayout(box)
+        rows.setContentsMargins(0, 0, 0, 0)
+        rows.setVerticalSpacing(4)
+        rows.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        rows.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
+        groups = list(dict.fromkeys(map(self._group, fields)))
+        for group in groups:
+            if group and (len(groups) > 1) and group not in FOLDED:
+                self._headings[group] = heading = QLabel(group)
+                heading.setProperty("role", "heading")
+                rows.addRow(heading)
+            for field in (f for f in fields if self._group(f) == group):
+                self._add(rows, field)
+
+    def _add(self, rows: QFormLayout, field: OptionField) -> None:
+        name = field.option.name
+        self._rows[name] = rows
+        self._reasons[name] = reason = QLabel()
+        reason.setObjectName("reason")
+        reason.setWordWrap(True)
+        reason.hide()
+        label = QLabel(field.label)
+        label.setToolTip(field.tip)
+        label.setBuddy(field.widget)
+        field.widget.setAccessibleName(field.bare_label)
+        if isinstance(field, LinesField):
+            rows.addRow(field.whole)
+        else:
+            rows.addRow(label, field.whole)
+        rows.addRow(reason)
+
+    def _fold(self, opened: bool) -> None:
+        self.more.setArrowType(Qt.ArrowType.DownArrow if opened else Qt.ArrowType.RightArrow)
+        self._seldom.setVisible(opened)
+
+    def _group(self, field: OptionField) -> str:
+        return field.option.declaration.group
+
+    def _is_folded(self, field: OptionField) -> bool:
+        return self._group(field) in self._folded
+
+    def _shown_fields(self) -> list[OptionField]:
+        return [field for name, field in self.fields.items() if name not in self._hidden]
+
+    def _read(self) -> dict[str, tuple[Any, str]]:
+        return {name: field.read() for name, field in self.fields.items()}
+
+    def _edited(self) -> None:
+        """Tell of a change; a field that is merely left, and shows its number anew, has not changed."""
+        state = self._read()
+        if state == self._state:
+            return
+        for name in state:
+            if state[name] != self._state[name]:
+                self._clear_reason(name)
+        self._state = state
+        self._update_enabled()
+        self.changed.emit()
+
+    def _update_enabled(self) -> None:
+        """Disable what does not go with the others, with the reason as its tool tip."""
+        present = {name: value for name, (value, _) in self._state.items() if name not in self._hidden}
+        for name, field in self.fields.items():
+            rule = field.behaviour.enabled_when
+            why = "" if rule is None else rule(present)
+            if why == self._disabled.get(name, ""):
+                continue
+            if why:
+                self._disabled[name] = why
+                self._clear_reason(name)
+            else:
+                del self._disabled[name]
+            field.whole.setEnabled(not why)
+            field.widget.setToolTip(why or field.tip)
+
+    def _refused_itself(self, name: str, why: str) -> None:
+        if self.applies(name):
+            self.refuse(name, why)
+            self.refused.emit(self.widgets[name], self._reasons[name].text())
+
+    def _clear_reason(self, name: str) -> None:
+        reason = self._reasons[name]
+        if reason.text():
+            reason.clear()
+            reason.hide()
+            self.widgets[name].setToolTip(self.fields[name].tip)
+            _mark(self.widgets[name], refused=False)
+
+
+def _mark(widget: QWidget, *, refused: bool) -> None:
+    widget.setProperty("refused", refused)
+    widget.style().unpolish(widget)
+    widget.style().polish(widget)

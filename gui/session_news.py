@@ -1,0 +1,105 @@
+"""What a session tells the window: how devices do, what is logged, what the operator is asked to do."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.device import Device
+from drivers.errors import DeviceError, DeviceLostError, DeviceNotOpenError, DeviceTimeoutError
+
+
+class OperatorRequest:
+    """Something that the operator is asked to do by hand; a job waits for the answer."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.answered: Callable[[], None] | None = None
+        self.withdrawn: Callable[[], object] | None = None
+        """Takes the question from the screen when STOP has answered it."""
+        self._done = threading.Event()
+        self._refused = False
+
+    def confirm(self) -> None:
+        """Say that it is done."""
+        self._answer()
+
+    def refuse(self) -> None:
+        """Say that it will not be done: the job ends."""
+        self._refused = True
+        self._answer()
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the operator (or STOP) has answered."""
+        return self._done.is_set()
+
+    def _answer(self) -> None:
+        if not self._done.is_set():
+            self._done.set()
+            if self.answered is not None:
+                self.answered()
+
+    def wait(self) -> None:
+        """Wait for the answer, in the job's thread; KeyboardInterrupt when it is no."""
+        self._done.wait()
+        if self._refused:
+            raise KeyboardInterrupt
+
+
+DeviceCondition = Literal["closed", "opening", "open", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """How a device is doing.
+
+    Attributes
+    ----------
+    condition : str
+        ``"closed"``, ``"opening"``, ``"open"`` or ``"failed"``.
+    text : str
+        Who the device says it is, or why it failed and what to check.
+    simulated : bool
+    """
+
+    condition: DeviceCondition
+    text: str = ""
+    simulated: bool = False
+
+
+def is_gone(device: Device, error: DeviceError) -> bool:
+    """Whether an error means that a device cannot be used any more."""
+    if isinstance(error, DeviceLostError | DeviceNotOpenError | DeviceTimeoutError) or not device.is_open:
+        return True
+    try:
+        _ = device.identity
+    except DeviceError:
+        return True
+    return False
+
+
+class LogBridge(logging.Handler):
+    """Hands on what is logged, in whatever thread, as a level of the log panel and a text.
+
+    Parameters
+    ----------
+    tell : callable
+        Called with both, in the thread that logs.
+    """
+
+    def __init__(self, tell: Callable[[str, str], object]) -> None:
+        super().__init__(logging.INFO)
+        self._tell = tell
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hand on a record."""
+        level = {logging.WARNING: "warning", logging.ERROR: "error", logging.CRITICAL: "error"}.get(
+            record.levelno, "info"
+        )
+        with contextlib.suppress(RuntimeError):  # the window is gone
+            self._tell(level, f"{record.name}: {record.getMessage()}")

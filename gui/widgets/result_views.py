@@ -1,0 +1,278 @@
+"""Views of results: what is known of one, its picture, how the solver converged, a grid of views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QResizeEvent
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QTextBrowser,
+    QVBoxLayout,
+    QWidget,
+)
+
+from gui.theme import colours
+from gui.widgets.image_view import ImageView
+from gui.widgets.levels_bar import LevelsBar
+from gui.widgets.plot import curve_pen, plot_widget, restyle
+from recon.solvers.stopping import IterationRecord
+
+
+class FactsView(QTextBrowser):
+    """Names and values, warnings in plain words above them."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setOpenLinks(False)
+        self.setMinimumSize(120, 60)
+        self._shown: tuple[Sequence[tuple[str, str]], Sequence[str], bool] = ((), (), False)
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        facts, warnings, simulated = self._shown
+        self.show_facts(facts, warnings, simulated=simulated)
+
+    def show_facts(
+        self, facts: Sequence[tuple[str, str]], warnings: Sequence[str] = (), *, simulated: bool = False
+    ) -> None:
+        """Show warnings and facts; SIMULATED where it came from the simulated bench."""
+        self._shown = facts, warnings, simulated
+        now = colours()
+        parts = []
+        if simulated:
+            parts.append(f'<p style="color:{now.warning}"><b>SIMULATED</b></p>')
+        parts += [f'<p style="color:{now.warning}">Warning: {escape(text)}</p>' for text in warnings]
+        rows = "".join(
+            f'<tr><td style="color:{now.dim};padding-right:10px">{escape(name)}</td>'
+            f"<td>{escape(value)}</td></tr>"
+            for name, value in facts
+        )
+        self.setHtml("".join([*parts, f"<table>{rows}</table>"]))
+
+
+class PictureView(QWidget):
+    """Shows one picture, (height, width) or (height, width, 3)."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.picture: npt.NDArray[np.float32] | None = None
+        self.turned_deg = 0
+        self.pitch_um: float | None = None
+        self.image = _ScaledImage()
+        self.levels = LevelsBar()
+        self.levels.changed.connect(self._show)
+        self.turn = QPushButton("Turn 90°")
+        self.turn.setToolTip(
+            "Turn the picture counter-clockwise; a picture on the sensor's grid is upside down"
+        )
+        self.turn.clicked.connect(self.turn_by_90)
+        self.whole = QPushButton("Whole")
+        self.whole.setToolTip("Show the whole picture (the wheel zooms, dragging moves)")
+        self.whole.clicked.connect(self.image.whole)
+        self.image.setMinimumSize(70, 50)
+        self.hovered = self.image.hovered
+        below = QHBoxLayout()
+        below.addStretch()
+        below.addWidget(self.whole)
+        below.addWidget(self.turn)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.image, 1)
+        layout.addLayout(below)
+        layout.addWidget(self.levels)
+
+    @property
+    def shown(self) -> npt.NDArray[np.float32] | None:
+        """The picture as it is turned now."""
+        return None if self.picture is None else np.rot90(self.picture, self.turned_deg // 90)
+
+    def show_picture(
+        self, picture: npt.NDArray[np.float32], *, pitch_um: float | None = None, keep_levels: bool = False
+    ) -> None:
+        """Show a picture; ``pitch_um`` is a pixel's size in the object's plane."""
+        self.picture = picture
+        self.image.pitch_um = pitch_um
+        self.levels.set_image(picture, keep_levels=keep_levels)
+        self._show()
+
+    def turn_by_90(self) -> None:
+        """Turn it counter-clockwise; exports are turned alike."""
+        self.turned_deg = (self.turned_deg + 90) % 360
+        self._show()
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        self.image.graphics.setBackground(colours().window)
+        self.levels.restyle()
+
+    def _show(self) -> None:
+        if (shown := self.shown) is not None:
+            self.image.set_colour_map(self.levels.colour_map)
+            self.image.show_image(shown, *self.levels.levels)
+
+
+class _ScaledImage(ImageView):
+    """An image whose places under the mouse are also told in micrometres from the middle."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pitch_um: float | None = None
+
+    def describe(self, column: int, row: int) -> str:
+        """Return a pixel's place and value in words."""
+        words = super().describe(column, row)
+        if self.pitch_um is None or self.image is None:
+            return words
+        height, width = self.image.shape[:2]
+        x_um, y_um = ((p - n // 2) * self.pitch_um for p, n in ((column, width), (row, height)))
+        return f"{words}   ({_length(x_um)}, {_length(y_um)} from the middle)"
+
+
+def _length(um: float) -> str:
+    return f"{um:.3g} µm" if abs(um) < 1000 else f"{um / 1000:.3g} mm"
+
+
+Histories = tuple[tuple[IterationRecord, ...], ...]
+
+
+class ConvergenceView(QWidget):
+    """Plots histories, one a channel, both quantities on one logarithmic axis."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.plot: Any = plot_widget("iteration")
+        self.plot.setLogMode(y=True)
+        self.plot.setMinimumSize(120, 80)
+        self.plot.setToolTip(
+            "Residual in units of what the noise explains (1: nothing is left to explain), "
+            "and relative change of the result an iteration"
+        )
+        self.legend = QLabel()
+        self.legend.setMinimumWidth(10)
+        self.against_time = QCheckBox("seconds")
+        self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")
+        self.against_time.toggled.connect(self._draw)
+        self.curves: dict[str, Any] = {}
+        self._numbers: dict[int, str] = {}
+        self._histories: Histories = ()
+        self._noise_norm: float | None = None
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(0)
+        row = QHBoxLayout()
+        row.addWidget(self.legend, 1)
+        row.addWidget(self.against_time)
+        layout.addLayout(row)
+        layout.addWidget(self.plot, 1)
+
+    def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
+        """Draw histories; ``noise_norm`` is the expected norm of the noise in the residuals' units."""
+        self._histories, self._noise_norm = histories, noise_norm
+        self._draw()
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        restyle(self.plot)
+        self._draw()
+
+    def _draw(self) -> None:
+        self.plot.clear()
+        self.curves, self._numbers = {}, {}
+        by_time = self.against_time.isChecked()
+        self.plot.setLabel("bottom", "seconds" if by_time else "iteration")
+        norm = self._noise_norm or 1.0
+        for channel, history in enumerate(self._histories):
+            x = np.array([r.seconds if by_time else r.iteration for r in history])
+            suffix = "" if len(self._histories) == 1 else f", channel {channel}"
+            self._add(f"residual / noise{suffix}", x, [r.data_residual / norm for r in history], 2 * channel)
+            self._add(f"change{suffix}", x, [r.change for r in history], 2 * channel + 1)
+        colour = colours().curves
+        self.legend.setText(
+            " &nbsp;".join(
+                f'<span style="color:{colour[number % len(colour)]}">●</span> {name}'
+                for number, name in self._numbers.items()
+            )
+        )
+        if self._noise_norm is not None and self._histories:
+            pen = pg.mkPen(colours().dim, style=Qt.PenStyle.DashLine)
+            self.plot.addItem(pg.InfiniteLine(0.0, angle=0, pen=pen))  # log10 of 1
+
+    def _add(self, name: str, x: Any, values: list[float], number: int) -> None:
+        """Draw one curve of what is known and can be drawn on a logarithmic axis."""
+        y = np.array(values)
+        known = np.isfinite(y) & (y > 0)
+        if known.any():
+            self.curves[name] = self.plot.plot(x[known], y[known], pen=curve_pen(number))
+            self._numbers[number] = name
+
+
+_HEADING_PX = 22
+_SPACING_PX = 6
+
+
+class ViewGrid(QWidget):
+    """Arranges views anew whenever its own size changes.
+
+    Parameters
+    ----------
+    views : sequence of (str, QWidget)
+        Headings and views, in reading order.
+    """
+
+    def __init__(self, views: Sequence[tuple[str, QWidget]], parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._cells: list[QWidget] = []
+        for title, view in views:
+            cell = QWidget()
+            label = QLabel(title)
+            label.setProperty("role", "heading")
+            label.setFixedHeight(_HEADING_PX)
+            box = QVBoxLayout(cell)
+            box.setContentsMargins(0, 0, 0, 0)
+            box.setSpacing(0)
+            box.addWidget(label)
+            box.addWidget(view, 1)
+            self._cells.append(cell)
+        self._layout = QGridLayout(self)
+        self._layout.setContentsMargins(0, 0, 0, 0)
+        self._layout.setSpacing(_SPACING_PX)
+        self.columns = 0
+        self._arrange(2)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Choose the number of columns for the new size."""
+        super().resizeEvent(event)
+        self._arrange(best_columns(len(self._cells), self.width(), self.height()))
+
+    def _arrange(self, columns: int) -> None:
+        if columns == self.columns:
+            return
+        self.columns = columns
+        for index in range(max(self._layout.columnCount(), self._layout.rowCount())):
+            self._layout.setColumnStretch(index, 0)
+            self._layout.setRowStretch(index, 0)
+        for index, cell in enumerate(self._cells):
+            self._layout.addWidget(cell, index // columns, index % columns)
+            self._layout.setRowStretch(index // columns, 1)
+            self._layout.setColumnStretch(index % columns, 1)
+
+
+def best_columns(count: int, width: int, height: int) -> int:
+    """Return in how many columns so many square views are largest in an area, in pixels."""
+
+    def side(columns: int) -> float:
+        rows = -(-count // columns)
+        return min(width / columns, height / rows - _HEADING_PX)
+
+    return max(range(1, count + 1), key=side)

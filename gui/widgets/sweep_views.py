@@ -1,0 +1,361 @@
+"""A sweep on the screen: its planned path, the quality of each PSF, their pictures, the routine's picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import QRectF, Qt, Signal
+from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPixmap
+from PySide6.QtWidgets import (
+    QHBoxLayout,
+    QHeaderView,
+    QLabel,
+    QSizePolicy,
+    QSplitter,
+    QTableWidget,
+    QTableWidgetItem,
+    QVBoxLayout,
+    QWidget,
+)
+
+from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
+from calibration_routines.psf.sweep_watch import PointTaken
+from gui.theme import colours
+from gui.widgets.plot import plot_widget, restyle
+
+Place = Mapping[str, float]
+
+_SHOWN = {"um": ("mm", 1e-3)}
+"""Lengths are shown in millimetres."""
+_MOST_SYMBOLS = 3000
+
+
+class PathPlot(QWidget):
+    """Draws places one after the other, the first one marked, and where the run is now.
+
+    With lateral and axial motion there are two views: depth across, and along the axis.
+    """
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._layout = QHBoxLayout(self)
+        self._layout.setContentsMargins(0, 0, 0, 0)
+        self.nothing = QLabel("Nothing moves.")
+        self.nothing.setObjectName("dim")
+        self.nothing.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        self._layout.addWidget(self.nothing)
+        self.views: list[_View] = []
+        self.places: tuple[Place, ...] = ()
+        self.setMinimumHeight(140)
+
+    def show_path(self, places: Sequence[Place]) -> None:
+        """Draw a path; an empty one says that nothing moves."""
+        places = tuple(places)
+        if places == self.places:
+            return
+        self.places = places
+        pairs = _pairs(places)
+        if [view.axes for view in self.views] != pairs:
+            for view in self.views:
+                self._layout.removeWidget(view.plot)
+                view.plot.deleteLater()
+            self.views = [_View(*pair) for pair in pairs]
+            for view in self.views:
+                self._layout.addWidget(view.plot)
+        self.nothing.setVisible(not self.views)
+        self.nothing.setText("Nothing moves." if not places else "The source goes to one place and stays.")
+        for view in self.views:
+            view.draw(places)
+
+    def clear(self, words: str) -> None:
+        """Show no path, and why."""
+        self.show_path(())
+        self.nothing.setText(words)
+
+    def show_now(self, place: Place | None) -> None:
+        """Mark where the run is."""
+        for view in self.views:
+            view.mark(place)
+
+    def restyle(self) -> None:
+        """Take over another theme."""
+        for view in self.views:
+            restyle(view.plot)
+            view.draw(self.places)
+
+
+class _View:
+    """One plot of two axes of the path."""
+
+    def __init__(self, across: str, down: str) -> None:
+        self.axes = across, down
+        labels = [_label(name) for name in self.axes]
+        self.plot: Any = plot_widget(labels[0][0], labels[1][0], x_unit=labels[0][1], y_unit=labels[1][1])
+        self._scales = [_scale(name) for name in self.axes]
+        self._line: Any = self.plot.plot([], [])
+        self._first: Any = self.plot.plot([], [])
+        self._now: Any = self.plot.plot([], [])
+
+    def draw(self, places: Sequence[Place]) -> None:
+        x, y = self._values(places)
+        symbols = {"symbol": "o", "symbolSize": 5} if len(places) <= _MOST_SYMBOLS else {"symbol": None}
+        dim, ok, warning = colours().dim, colours().ok, colours().warning
+        accent = pg.mkBrush(colours().accent)
+        self._line.setData(x, y, pen=pg.mkPen(dim, width=1), symbolBrush=accent, symbolPen=None, **symbols)
+        start = {"symbol": "s", "symbolSize": 10, "symbolBrush": None}
+        self._first.setData(x[:1], y[:1], pen=None, symbolPen=pg.mkPen(ok, width=2), **start)
+        here = {"symbol": "o", "symbolSize": 13, "symbolBrush": None}
+        self._now.setData([], [], pen=None, symbolPen=pg.mkPen(warning, width=2), **here)
+        self.plot.autoRange()
+
+    def mark(self, place: Place | None) -> None:
+        if place is None or not all(name in place for name in self.axes):
+            self._now.setData([], [])
+            return
+        x, y = self._values([place])
+        self._now.setData(x, y)
+
+    def _values(self, places: Sequence[Place]) -> list[Any]:
+        return [
+            np.array([place.get(name, 0.0) * scale for place in places])
+            for name, scale in zip(self.axes, self._scales, strict=True)
+        ]
+
+
+def _pairs(places: Sequence[Place]) -> list[tuple[str, str]]:
+    """Return the axes of each view: those that change, depth across."""
+    names = sorted({name for place in places for name in place})
+    moving = [n for n in names if len({place.get(n) for place in places}) > 1]
+    if not moving:
+        return []
+    lateral = [n for n in moving if n in ("x_um", "y_um")]
+    if "z_um" in moving:
+        side = ("z_um", lateral[0] if lateral else "x_um")
+        return [side, ("x_um", "y_um")] if len(lateral) == 2 else [side]
+    if lateral:
+        return [("x_um", "y_um")]
+    other = [n for n in names if n != moving[0]]
+    return [(moving[0], (moving[1:] or other or moving)[0])]
+
+
+def _label(name: str) -> tuple[str, str]:
+    axis, _, unit = name.rpartition("_")
+    return axis, _SHOWN.get(unit, (unit, 1.0))[0]
+
+
+def _scale(name: str) -> float:
+    return _SHOWN.get(name.rpartition("_")[2], ("", 1.0))[1]
+
+
+_COLUMNS = (
+    ("x (mm)", "Where the source stood"),
+    ("y (mm)", "Where the source stood"),
+    ("z (mm)", "Where the source stood"),
+    ("signal/noise", f"Mean signal inside the pattern over a pixel's noise; from {MIN_SNR:g} it is good"),
+    ("saturated", "Pixels at full scale"),
+    ("off (px)", "Distance from where the others, or the stage, say the pattern is"),
+    ("verdict", "What is wrong; the whole text as tool tip"),
+)
+_VERDICT = len(_COLUMNS) - 1
+
+
+class PsfTable(QWidget):
+    """A table of PSFs and a plot of their signal to noise; those with findings are marked.
+
+    Signals
+    -------
+    chosen : int
+        The row of a PSF that was clicked.
+    """
+
+    chosen = Signal(int)
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.table = QTableWidget(0, len(_COLUMNS))
+        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
+        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
+        self.table.verticalHeader().setDefaultSectionSize(24)
+        self.table.setTabKeyNavigation(False)
+        for column, (name, tip) in enumerate(_COLUMNS):
+            item = QTableWidgetItem(name)
+            item.setToolTip(tip)
+            self.table.setHorizontalHeaderItem(column, item)
+        header = self.table.horizontalHeader()
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(_VERDICT, QHeaderView.ResizeMode.Stretch)
+        self.table.currentCellChanged.connect(lambda row, *_: self.chosen.emit(row))
+        self.plot: Any = plot_widget("PSF", "signal / noise")
+        self.plot.setMinimumHeight(90)
+        self._points: Any = self.plot.plot([], [])
+        self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
+        self.plot.addItem(self._least)
+        self._qualities: list[PsfQuality | None] = []
+        split = QSplitter(Qt.Orientation.Vertical)
+        split.addWidget(self.table)
+        split.addWidget(self.plot)
+        split.setSizes([220, 140])
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(split)
+        self.restyle()
+
+    @property
+    def qualities(self) -> tuple[PsfQuality | None, ...]:
+        """What is shown, by row; None for PSFs that have not arrived."""
+        return tuple(self._qualities)
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self._qualities = []
+        self.table.setRowCount(0)
+        self._draw()
+
+    def arrived(self, event: PointTaken) -> None:
+        """Show a PSF that was just taken, or taken again."""
+        row = event.number - 1
+        self._set(row, event.quality, "taking it again" if event.retaking else "")
+        self.table.scrollTo(self.table.model().index(row, 0))
+        self._draw()
+
+    def show_all(self, qualities: Sequence[PsfQuality]) -> None:
+        """Show the last judgement, which holds all PSFs against one another."""
+        self.table.setRowCount(len(qualities))
+        self._qualities = []
+        for row, quality in enumerate(qualities):
+            self._set(row, quality)
+        self._draw()
+
+    def restyle(self) -> None:
+        """Take over another theme."""
+        restyle(self.plot)
+        self._least.setPen(pg.mkPen(colours().warning, style=Qt.PenStyle.DashLine))
+        self._draw()
+
+    def _set(self, row: int, quality: PsfQuality, note: str = "") -> None:
+        if self.table.rowCount() <= row:
+            self.table.setRowCount(row + 1)
+        self._qualities += [None] * (row + 1 - len(self._qualities))
+        self._qualities[row] = quality
+        verdict = note or ("good" if not quality.findings else " ".join(quality.findings))
+        cells = [f"{value / 1e3:.4g}" for value in quality.source_um]
+        cells += [f"{quality.snr:.0f}", f"{quality.saturated_pixels}", f"{quality.step_px:.2f}", verdict]
+        for column, text in enumerate(cells):
+            item = QTableWidgetItem(text)
+            if column != _VERDICT:
+                item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+            if quality.findings:
+                item.setForeground(QColor(colours().warning))
+                item.setToolTip("\n".join(quality.findings))
+            self.table.setItem(row, column, item)
+
+    def _draw(self) -> None:
+        # A single frame without noise has no figure.
+        known = [(row + 1, q) for row, q in enumerate(self._qualities) if q is not None and isfinite(q.snr)]
+        self.plot.setVisible(bool(known))
+        brushes = [pg.mkBrush(colours().warning if q.findings else colours().ok) for _, q in known]
+        self._points.setData(
+            [number for number, _ in known],
+            [q.snr for _, q in known],
+            pen=pg.mkPen(colours().line),
+            symbol="o",
+            symbolSize=7,
+            symbolPen=None,
+            symbolBrush=brushes or None,
+        )
+
+
+_IN_FULL = 24
+"""PSFs that are kept as they are, up to 2 MB each; a sweep may take a thousand."""
+_SMALL_PX = 256
+_LEVELS = (0.1, 99.9)
+"""Percentiles that small pictures are stretched to."""
+
+Image = npt.NDArray[Any]
+
+
+class PsfPicture(NamedTuple):
+    """A PSF, and by how much it was reduced along each side: 1 as it arrived, else 8 bit for the eye."""
+
+    image: Image
+    reduced: int
+
+
+class PsfPictures:
+    """Pictures by number; of all but the newest only a small one is kept."""
+
+    def __init__(self) -> None:
+        self._in_full: dict[int, Image] = {}
+        self._small: dict[int, PsfPicture] = {}
+
+    def __len__(self) -> int:
+        return len(self._in_full) + len(self._small)
+
+    @property
+    def nbytes(self) -> int:
+        """What they hold in memory."""
+        images = [*self._in_full.values(), *(picture.image for picture in self._small.values())]
+        return sum(image.nbytes for image in images)
+
+    def keep(self, number: int, image: Image) -> None:
+        """Keep a picture, in place of an earlier one of the same number."""
+        self._in_full.pop(number, None)
+        self._small.pop(number, None)
+        self._in_full[number] = image
+        if len(self._in_full) > _IN_FULL:
+            oldest = next(iter(self._in_full))
+            self._small[oldest] = small(self._in_full.pop(oldest))
+
+    def get(self, number: int) -> PsfPicture | None:
+        """Return a picture; None where none has arrived."""
+        image = self._in_full.get(number)
+        return PsfPicture(image, 1) if image is not None else self._small.get(number)
+
+
+def small(image: Image) -> PsfPicture:
+    """Return an image, (height, width), as means of blocks stretched to 8 bit, 256 pixels wide at most."""
+    factor = -(-max(image.shape) // _SMALL_PX)
+    height, width = (max(1, length // factor) for length in image.shape)
+    rows, columns = min(factor, image.shape[0]), min(factor, image.shape[1])
+    blocks = image[: height * rows, : width * columns].reshape(height, rows, width, columns)
+    means = blocks.mean(axis=(1, 3))
+    low, high = np.percentile(means, _LEVELS)
+    stretched = (means - low) * (255 / max(high - low, 1.0))
+    return PsfPicture(np.clip(np.rint(stretched), 0, 255).astype(np.uint8), factor)
+
+
+class Picture(QWidget):
+    """Shows a pixmap, scaled down or up to the space there is."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.pixmap = QPixmap()
+        self.setMinimumSize(160, 120)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+
+    def show_pixmap(self, pixmap: QPixmap) -> None:
+        """Show a picture; an empty one shows nothing."""
+        self.pixmap = pixmap
+        self.update()
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self.show_pixmap(QPixmap())
+
+    def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802 - Qt's name
+        """Draw the picture."""
+        if self.pixmap.isNull():
+            return
+        size = self.pixmap.size().scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)
+        left, top = (self.width() - size.width()) / 2, (self.height() - size.height()) / 2
+        painter = QPainter(self)
+        painter.setRenderHint(QPainter.RenderHint.SmoothPixmapTransform)
+        painter.drawPixmap(
+            QRectF(left, top, size.width(), size.height()), self.pixmap, QRectF(self.pixmap.rect())
+        )
+        painter.end()

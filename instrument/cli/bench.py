@@ -1,0 +1,271 @@
+"""The bench itself: ``new``, ``check``, ``drivers``, ``devices``, and ``gui``, the desktop program."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from drivers.camera import Camera
+from drivers.device import Device, Setting
+from drivers.errors import DeviceError
+from drivers.led_array import LedArray
+from drivers.registry.discovery import BUSES, FoundDevice
+from drivers.registry.listing import Listing, list_devices
+from drivers.registry.registry import KINDS, driver_names, registration_mistakes
+from drivers.slm import Slm
+from drivers.stage import Stage
+from instrument.bench.bench import Bench
+from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
+from instrument.bench.safety import StepsFailedError
+from instrument.cli.app import App, BenchOption, examples, load_and_say
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, FileError
+
+new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
+
+_OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
+
+
+@new_app.command(
+    epilog=examples(
+        "diffuserbench new",
+        "diffuserbench new benches/microscope.toml",
+        "diffuserbench new --force          overwrite an existing bench.toml",
+        "diffuserbench new display.toml --display",
+        "diffuserbench new microscope.toml --led-microscope",
+    )
+)
+def new(
+    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path(DEFAULT_NAME),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
+    led_microscope: Annotated[
+        bool, typer.Option("--led-microscope", help="An LED array microscope instead, for calibrate dpc.")
+    ] = False,
+) -> None:
+    """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
+    if file.is_dir():
+        raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
+    if file.exists() and not force:
+        raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+    if display and led_microscope:
+        raise BenchError("Give --display or --led-microscope, not both.")
+    text, what = default_text(), "bench, with every key explained"
+    if display:
+        text, what = display_text(), "holographic display"
+    if led_microscope:
+        text, what = led_microscope_text(), "LED array microscope"
+    write_text(file, text)
+    typer.echo(f"Wrote {file}: a SIMULATED {what}.")
+    typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")
+
+
+@check_app.command(
+    epilog=examples("diffuserbench check", "diffuserbench check --bench benches/microscope.toml")
+)
+def check(bench: BenchOption = None) -> None:
+    """Open every device that the bench configuration names, report identity, settings and limits of each.
+
+    Ends with the light off. Nothing moves. Exit status 1 when a device fails; all failures are reported.
+    """
+    console = Console()
+    config = load_and_say(bench)
+    opened = Bench(config)
+    failures: list[str] = []
+    try:
+        for kind in opened.devices:
+            try:
+                device = opened.open_device(kind)
+                _print_device(console, kind, device)
+            except DeviceError as error:
+                failures.append(str(error))
+        label = opened.label
+    finally:
+        try:
+            opened.close()
+        except StepsFailedError as error:
+            failures.append(str(error))
+    if failures:
+        for failure in failures:
+            typer.echo(f"FAILED  {failure}", err=True)
+        typer.echo(f"{len(failures)} failure{'s' if len(failures) > 1 else ''}: {config.label}", err=True)
+        raise typer.Exit(1)
+    console.print(f"All {len(opened.devices)} devices answer: {label}", markup=False, soft_wrap=True)
+    console.print("Light off, nothing moving, devices closed.")
+
+
+def _print_device(console: Console, kind: str, device: Device) -> None:
+    identity = device.identity
+    mark = "  SIMULATED" if identity.simulated else ""
+    console.print(f"{kind}: {identity.vendor} {identity.model}{mark}", markup=False, style="bold")
+    table = Table(show_header=False, box=box.ROUNDED)
+    table.add_column("what", no_wrap=True)
+    table.add_column("value", overflow="fold")
+    table.add_row("driver", identity.driver)
+    table.add_row("serial number", identity.serial_number)
+    table.add_row("firmware", identity.firmware, end_section=True)
+    for name, value in _settings(device.settings()):
+        table.add_row(name, value)
+    table.add_section()
+    for name, value in _limits(device):
+        table.add_row(name, value)
+    console.print(table)
+
+
+def _settings(settings: Mapping[str, Setting]) -> Iterator[tuple[str, str]]:
+    for name, value in settings.items():
+        yield name, _text(value)
+
+
+def _limits(device: Device) -> Iterator[tuple[str, str]]:
+    if isinstance(device, Camera):
+        yield "sensor, pixels", "{} x {}".format(*device.sensor_shape)
+        yield "pixel pitch", f"{device.pixel_pitch_um:g} um"
+        yield "exposure limits", "{:g} to {:g} ms".format(*device.exposure_limits_ms)
+        yield "gain limits", "{:g} to {:g}".format(*device.gain_limits)
+        yield "binnings", _text(device.binnings)
+        yield "pixel formats", _text(device.pixel_formats)
+    elif isinstance(device, Stage):
+        for axis in device.axes:
+            yield (
+                f"axis {axis.name}",
+                f"{axis.lower_limit:g} to {axis.upper_limit:g} {axis.unit}, "
+                f"{axis.speed_per_s:g} {axis.unit}/s, smallest step {axis.resolution:g} {axis.unit}",
+            )
+    elif isinstance(device, LedArray):
+        yield "LEDs", str(len(device.led_positions_mm))
+        yield "wavelengths", f"{_text(device.wavelengths_nm)} nm"
+        yield "largest NA", f"{float(cast(float, abs(device.led_na).max())):.3g}"
+    elif isinstance(device, Slm):
+        yield "pixels", "{} x {}".format(*device.shape)
+        yield "pixel pitch", f"{device.pixel_pitch_um:g} um"
+        yield "settle time", f"{device.settle_ms:g} ms"
+
+
+def _text(value: Setting) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(_text(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+@drivers_app.command(epilog=examples("diffuserbench drivers"))
+def drivers() -> None:
+    """List the installed drivers for each kind of device: the names to put behind driver = in bench.toml.
+
+    No device is touched. Their keys are in docs/reference/bench-toml.md, or in the documentation of the
+    package that brings them.
+    """
+    width = max(map(len, KINDS)) + 2
+    for kind in KINDS:
+        typer.echo(f"{kind:<{width}}{', '.join(driver_names(kind)) or 'none'}")
+    for sentence in registration_mistakes():
+        typer.echo(sentence, err=True)
+
+
+@devices_app.command(
+    epilog=examples(
+        "diffuserbench devices", "diffuserbench devices --probe", "diffuserbench devices --json > found.json"
+    )
+)
+def devices(
+    probe: Annotated[
+        bool,
+        typer.Option(
+            "--probe",
+            help="Ask at serial ports too, by writing to them: not where a stray command can do harm.",
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for programs.")] = False,
+) -> None:
+    """List what is connected: USB, HID, serial ports, video devices, GenICam cameras, displays.
+
+    Devices that a driver is sure of come with the lines to put into bench.toml. Without --probe nothing is
+    written to any serial port, so a stage behind a common USB adapter is only listed as a port.
+    """
+    listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
+    typer.echo(_listing_json(listing) if as_json else _listing_words(listing))
+
+
+def _listing_json(listing: Listing) -> str:
+    found = [{**asdict(device), "bench_toml": device.bench_lines()} for device in listing.found]
+    return json.dumps({"found": found, "unavailable": listing.unavailable}, indent=2, default=str)
+
+
+def _listing_words(listing: Listing) -> str:
+    lines: list[str] = []
+    others = sorted({device.bus for device in listing.found} - set(BUSES))
+    for bus in (*BUSES, *others):
+        found = [device for device in listing.found if device.bus == bus]
+        unseen = any(sentence.startswith(f"{bus}:") for sentence in listing.unavailable)
+        nothing = "could not be looked at, see below" if unseen else "none found"
+        lines.append(f"{bus}:" if found else f"{bus}: {nothing}")
+        for device in found:
+            lines.append(f"  {_device_line(device)}")
+            lines += [f"      {row}" for row in device.bench_lines().splitlines()]
+    if listing.unavailable:
+        lines += ["", "Could not be looked at:", *(f"  {sentence}" for sentence in listing.unavailable)]
+    return "\n".join(lines)
+
+
+def _device_line(device: FoundDevice) -> str:
+    parts = [f"{device.address}  {device.description}"]
+    if device.usb_id:
+        parts.append(device.usb_id)
+    if device.serial_number:
+        parts.append(f"serial {device.serial_number}")
+    return ", ".join(parts)
+
+
+@gui_app.command(
+    epilog=examples("diffuserbench gui", "diffuserbench gui bench.toml"),
+)
+def gui(
+    bench: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[BENCH.TOML]",
+            help="Bench configuration. Default: bench.toml here, else the built-in simulated bench.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Open the desktop program: live view, stage, light, sweeps, reconstructions, holograms.
+
+    Closing the window, Ctrl-C and SIGTERM end it safely: light off, motion stopped, runs closed.
+    """
+    try:
+        config = load_and_say(bench)
+    except BenchError as error:
+        _show_too(error)
+        raise
+    try:
+        from gui.app import run
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in _OF_THE_WINDOW:
+            raise
+        raise BenchError(
+            f'The desktop program needs {error.name}. Install it: pip install "diffuserbench[gui]"'
+        ) from None
+    except ImportError as error:  # a library of the system that Qt needs, e.g. libEGL.so.1
+        raise BenchError(
+            f"The desktop program cannot start: {error}. On Debian: sudo apt install libegl1 libgl1 "
+            "libxkbcommon0 libfontconfig1 libdbus-1-3 libxcb-cursor0 libxcb-icccm4 libxcb-keysyms1"
+        ) from None
+    raise typer.Exit(run(config))
+
+
+def _show_too(error: BenchError) -> None:
+    """Show a mistake in a window: started from a menu, there is no terminal where it would be read."""
+    try:
+        from gui.app import show_mistake
+    except ImportError:  # the terminal tells it
+        return
+    show_mistake(error)

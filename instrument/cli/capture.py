@@ -1,0 +1,239 @@
+"""``diffuserbench snap`` and ``diffuserbench record``: a photograph; video at full camera rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from instrument.bench.bench import Bench
+from instrument.bench.photograph import Snapshot
+from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
+from instrument.cli.progress import keys, progress_bar
+from instrument.files.formatting import duration, size
+from instrument.runs.recorder import RecordingStatus
+from instrument.runs.recording import prepare_recording
+from instrument.runs.run import Run
+from instrument.runs.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
+from recon.base.declare import option
+
+snap_app, record_app = App(), App()
+
+DIM = 0.1
+"""Of full scale: a lit photograph whose brightest pixel stays below it wastes most of the sensor's range."""
+_LIGHT, _CAMERA, _FILES = "Light", "Camera", "Files"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """Camera and light, of a photograph as of a recording."""
+
+    exposure_ms: float | None = option(
+        None, help="Exposure time, e.g. 12.5.", unit="ms", default_words="as bench.toml has it", group=_CAMERA
+    )
+    gain: float | None = option(
+        None,
+        help="Gain factor, 1 is the base gain.",
+        default_words="as bench.toml has it",
+        metavar="FACTOR",
+        group=_CAMERA,
+    )
+    scene: bool = option(False, help="The scene is lit (the default).", group=_LIGHT)
+    source: bool = option(False, help="The point source is lit: a PSF.", group=_LIGHT)
+    dark: bool = option(False, help="Nothing is lit: a dark frame.", group=_LIGHT)
+    as_is: bool = option(
+        False,
+        help="Ask nobody: for scripts. Alone nothing is switched; with --scene, --source or --dark devices "
+        "are, and what an operator would switch stays as it is.",
+        group=_LIGHT,
+    )
+
+    def light(self) -> Light:
+        """Return the light asked for.
+
+        Raises
+        ------
+        typer.BadParameter
+            When more than one is.
+        """
+        flags = {Light.SCENE: self.scene, Light.SOURCE: self.source, Light.DARK: self.dark}
+        chosen = [name for name, is_set in flags.items() if is_set]
+        if len(chosen) > 1:
+            raise typer.BadParameter(f"choose one of --{', --'.join(chosen)}.")
+        if chosen:
+            return chosen[0]
+        return Light.AS_IS if self.as_is else Light.SCENE
+
+    def set_camera(self, bench: Bench) -> None:
+        """Give the camera what was asked for."""
+        if self.exposure_ms is not None:
+            bench.camera.set_exposure_ms(self.exposure_ms)
+        if self.gain is not None:
+            bench.camera.set_gain(self.gain)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SnapOptions(CaptureOptions):
+    """A photograph."""
+
+    average: int = option(
+        1,
+        help="Frames to average; the mean is float32.",
+        least=1,
+        flags=("--average", "-n"),
+        group=_CAMERA,
+    )
+    out: Path | None = option(
+        None,
+        help="Where to write: .tif, .png or .npy.",
+        default_words="photo-UTCTIME.tif here",
+        flags=("--out", "-o"),
+        group=_FILES,
+    )
+    force: bool = option(False, help="Overwrite the file if it exists.", group=_FILES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordOptions(CaptureOptions):
+    """A recording."""
+
+    seconds: float | None = option(
+        None, help="How long.", unit="s", least=0, flags=("--seconds", "-s"), group=_CAMERA
+    )
+    frames: int | None = option(
+        None, help="How many frames, lost ones counted.", least=1, flags=("--frames", "-n"), group=_CAMERA
+    )
+    buffers: int | None = option(
+        None,
+        help="Frames that may wait in memory for the disk.",
+        default_words="what fits into 256 MB",
+        least=16,
+        group=_CAMERA,
+    )
+    label: str = option("recording", help="Becomes part of the folder's name.", group=_FILES)
+    out: Path | None = option(
+        None,
+        help="Where the run's folder is made.",
+        default_words="data_folder of bench.toml",
+        metavar="FOLDER",
+        flags=("--out", "-o"),
+        group=_FILES,
+    )
+
+
+@snap_app.command(
+    epilog=examples(
+        "diffuserbench snap --out photo.tif",
+        "diffuserbench snap --exposure-ms 50 --average 10 --out photo.npy",
+        "diffuserbench snap --dark --average 20 --out dark.tif",
+        "diffuserbench snap --source --out psf.tif",
+        "diffuserbench snap --source --as-is --out psf.tif",
+    )
+)
+def snap(options: SnapOptions, bench: BenchOption = None) -> None:
+    """Take a photograph and write it with its metadata (exposure, gain, stage position, light ...).
+
+    The bench is opened for it and made safe again: light off, motion stopped.
+    """
+    light = options.light()
+    target = options.out or Path(photograph_name())
+    check_target(target, options.average, force=options.force)
+    with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
+        options.set_camera(opened)
+        switch_light(opened, light)
+        taken = _photograph(opened, options.average)
+        write_snapshot(opened, target, taken, light, operator_asked=not options.as_is)
+    _report(target, taken, light)
+
+
+def _photograph(bench: Bench, average: int) -> Snapshot:
+    with progress_bar() as bar:
+        task = bar.add_task("Frames", total=average, note="")
+        return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))
+
+
+def _report(target: Path, taken: Snapshot, light: Light) -> None:
+    height, width = taken.image.shape[:2]
+    metadata = taken.metadata
+    frames = "1 frame" if taken.average == 1 else f"mean of {taken.average} frames"
+    typer.echo(
+        f"Wrote {target}: {height} x {width} {taken.image.dtype}, {light.value}, "
+        f"{metadata.exposure_ms:g} ms, gain {metadata.gain:g}, {frames}."
+    )
+    typer.echo(
+        f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
+        f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
+    )
+    if light is not Light.DARK and taken.image.max() < DIM * taken.full_scale:
+        typer.echo(
+            f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",
+            err=True,
+        )
+    if metadata.saturated_fraction > 0:
+        typer.echo(
+            f"Warning: {metadata.saturated_fraction:.3%} of the pixels are saturated; shorten --exposure-ms.",
+            err=True,
+        )
+
+
+@record_app.command(
+    epilog=examples(
+        "diffuserbench record --seconds 10", "diffuserbench record --frames 600 --exposure-ms 5 --source"
+    ),
+)
+def record(options: RecordOptions, bench: BenchOption = None) -> None:
+    """Record every frame of the camera with its metadata, until a number of frames or seconds, or until q.
+
+    Frames that the camera dropped, or that the disk was too slow for, are counted and keep their numbers: the
+    recording has gaps there, never a shifted index.
+    """
+    light = options.light()
+    with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
+        options.set_camera(opened)
+        switch_light(opened, light)
+        recorder = prepare_recording(
+            opened,
+            options.out,
+            label=options.label,
+            n_frames=options.frames,
+            seconds=options.seconds,
+            n_buffers=options.buffers,
+        )
+        with progress_bar() as bar:
+            task = bar.add_task("Frames", total=options.frames, note="q ends")
+            recorder.on_progress = lambda status: bar.update(
+                task, completed=status.numbered, note=_note(status)
+            )
+            with keys({"q": recorder.stop}):
+                run = recorder.execute()
+    _last_words(run)
+
+
+def _note(status: RecordingStatus) -> str:
+    words = [
+        f"{status.frames_per_s:.1f}/s",
+        f"{size(status.bytes_per_s)}/s",
+        f"{size(status.free_bytes)} free",
+        f"buffer {status.waiting}/{status.n_buffers}",
+    ]
+    words += [f"DROPPED BY CAMERA {status.dropped_by_device}"] if status.dropped_by_device else []
+    words += [f"DISK TOO SLOW, LOST {status.not_written}"] if status.not_written else []
+    words += [f"SATURATED {status.saturated_fraction:.2%}"] if status.saturated_fraction else []
+    return "  ".join(words)
+
+
+def _last_words(run: Run) -> None:
+    mark = " SIMULATED" if run.is_simulated else ""
+    by_device = sum(gap.by_device for gap in run.gaps)
+    not_written = sum(gap.not_written for gap in run.gaps)
+    period_s = run.frame_period_s
+    took = f" in {duration(period_s * run.n_frames)}, {1 / period_s:.2f} frames/s" if period_s else ""
+    typer.echo(f"{run.condition}: {len(run.records)} of {run.n_frames} frames{took}{mark}")
+    if by_device:
+        counted = next((e["drops_counted_by"] for e in run.events if "drops_counted_by" in e), "")
+        typer.echo(f"Warning: the camera dropped {by_device} frames (by {counted}).", err=True)
+    if not_written:
+        typer.echo(f"Warning: the disk was too slow for {not_written} frames.", err=True)
+    typer.echo(f"Run: {run.path}")

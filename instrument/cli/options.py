@@ -1,0 +1,197 @@
+"""Command functions take options objects: their flags, help and refusals come from the declarations.
+
+A command is a function whose parameters are options classes (frozen dataclasses with declared fields, see
+:mod:`recon.base.declare`), :class:`Given`, and as many ordinary parameters of typer as it needs::
+
+    @app.command()
+    def snap(options: SnapOptions, bench: BenchOption = None) -> None: ...
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+from instrument.files.errors import BenchError
+from recon.base.declare import RARE, Option, options_of
+from recon.base.option_text import help_text, metavar, read
+from recon.errors import InputError
+
+_MAIN = "Options"
+_WIDEST_FLAG = 34
+
+
+@dataclass(frozen=True)
+class Only:
+    """Beside an options class (``Annotated[InputOptions, Only("dark", "crop")]``): the fields offered."""
+
+    names: tuple[str, ...]
+
+    def __init__(self, *names: str) -> None:
+        object.__setattr__(self, "names", names)
+
+
+@dataclass(frozen=True)
+class Given:
+    """The declared options that a command was given, by the names of their fields, and as they were typed."""
+
+    options: Mapping[str, Option]
+    typed: Mapping[str, str]
+
+    def __contains__(self, name: str) -> bool:
+        """Whether an option was typed, be it with its default value."""
+        return name in self.options
+
+    def flags(self, *names: str) -> list[str]:
+        """Return the flags of the options among ``names`` (none: of all) that were given."""
+        return [flag for name, flag in self.typed.items() if not names or name in names]
+
+    def refuse(self, title: str, *subjects: str) -> None:
+        """Refuse what was given and applies to none of these subjects, as the options declare it.
+
+        Raises
+        ------
+        BenchError
+            Which options, with the title ("--video"), and what they are for.
+        """
+        applies = {name: o.declaration.applies for name, o in self.options.items()}
+        wrong = [name for name, about in applies.items() if about and not set(about) & set(subjects)]
+        if wrong:
+            what = "; ".join(f"{self.typed[name]} (for a {' or a '.join(applies[name])})" for name in wrong)
+            raise BenchError(f"With {title} these do not apply: {what}. Leave them out.")
+
+
+class GroupedCommand(TyperCommand):
+    """A command whose help shows the options under their groups' headings, what is rare last."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments and options, a definition list a group."""
+        declared: Mapping[str, Option] = getattr(self.callback, "declared", {})
+        arguments: list[tuple[str, str]] = []
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            o = declared.get(param.name)
+            row = param.get_help_record(ctx) if o is None else (_left(o), help_text(o))
+            if row is None:
+                continue
+            if param.param_type_name == "argument":
+                arguments.append(row)
+            else:
+                heading = (o.declaration.group if o is not None else "") or _MAIN
+                groups.setdefault(heading, []).append(row)
+        groups = {name: groups[name] for name in sorted(groups, key=lambda name: name == RARE)}
+        for heading, rows in ({"Arguments": arguments} | groups).items():
+            if rows:
+                with formatter.section(heading):
+                    formatter.write_dl(rows, col_max=_WIDEST_FLAG)
+
+
+def _left(o: Option) -> str:
+    """Return the flags shown in help: the short ones and the first long one; the others are old names."""
+    short = [flag for flag in o.flags if not flag.startswith("--")]
+    names = ", ".join([*short, next(flag for flag in o.flags if flag.startswith("--"))])
+    return names if bool in o.kinds else f"{names} {metavar(o)}"
+
+
+def flat(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a function for typer: each declared field of its options objects is a parameter of its own."""
+    hints = typing.get_type_hints(function, include_extras=True)
+    objects: dict[str, tuple[type, dict[str, Option]]] = {}
+    declared: dict[str, Option] = {}
+    parameters: list[inspect.Parameter] = []
+    wants_given = ""
+    for parameter in inspect.signature(function).parameters.values():
+        hint = hints[parameter.name]
+        if hint is Given:
+            wants_given = parameter.name
+        elif (found := _options_class(hint)) is not None:
+            cls, options = found
+            objects[parameter.name] = cls, {f"{parameter.name}__{o.name}": o for o in options if o.flags}
+            declared |= objects[parameter.name][1]
+            parameters += [_parameter(key, o) for key, o in objects[parameter.name][1].items()]
+        else:
+            parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+
+    def run(**values: Any) -> None:
+        typed = {key: values.pop(key) for key in declared}
+        given = {key: value for key, value in typed.items() if value is not None and value != []}
+        read_values = _read(declared, given)
+        for name, (cls, keys) in objects.items():
+            values[name] = cls(**{o.name: read_values[key] for key, o in keys.items() if key in read_values})
+        if wants_given:
+            values[wants_given] = Given(
+                {declared[key].name: declared[key] for key in given},
+                {declared[key].name: _as_typed(declared[key], value) for key, value in given.items()},
+            )
+        function(**values)
+
+    run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
+    run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.declared = declared  # type: ignore[attr-defined]
+    run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
+    return run
+
+
+def _as_typed(o: Option, value: Any) -> str:
+    switch = next((flag for flag in o.flags if "/" in flag), "")
+    return switch.partition("/")[2] if value is False else o.flag
+
+
+def _options_class(hint: Any) -> tuple[type, tuple[Option, ...]] | None:
+    cls, *extras = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
+    if not (isinstance(cls, type) and hasattr(cls, "__dataclass_fields__")):
+        return None
+    options = options_of(cls)
+    for extra in extras:
+        if isinstance(extra, Only):
+            known = {o.name: o for o in options}
+            options = tuple(known[name] for name in extra.names)
+    return cls, options
+
+
+def _parameter(key: str, o: Option) -> inspect.Parameter:
+    """Return a parameter that is None unless it was typed; text is read later, with all mistakes at once."""
+    kind: Any = str
+    if bool in o.kinds:
+        kind = bool
+    elif o.item is not None:
+        kind = list[str]
+    else:
+        in_one = o.declaration.parse is not None or "," in o.declaration.metavar
+        several = [k for k in o.kinds if typing.get_origin(k) is tuple and not in_one]
+        kind = tuple[tuple(str for _ in typing.get_args(several[0]))] if several else kind  # type: ignore[misc]
+    annotation = typing.Annotated[kind | None, typer.Option(*o.flags, show_default=False, metavar=metavar(o))]
+    return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _read(declared: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of what was typed.
+
+    Raises
+    ------
+    BenchError
+        With all mistakes at once, each with its flag.
+    """
+    values: dict[str, Any] = {}
+    wrong: list[str] = []
+    for key, text in given.items():
+        o = declared[key]
+        try:
+            value = text if isinstance(text, bool) else read(o, text)
+        except (InputError, BenchError) as error:
+            wrong.append(str(error))
+            continue
+        values[key] = value
+        if mistake := o.mistake(value, typed=True):
+            wrong.append(mistake)
+    wrong += [f"{o.flag} must be given." for key, o in declared.items() if o.is_required and key not in given]
+    if wrong:
+        raise BenchError("\n".join(wrong))
+    return values

@@ -1,0 +1,193 @@
+"""How to compute a hologram, declared once (see :mod:`recon.base.declare`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.declare import option, require
+from recon.errors import InputError
+from recon.holography.display import Display
+from recon.holography.losses import LOSSES, Loss, loss_of
+from recon.holography.lowpass import Grid
+from recon.holography.target import foveal_weights
+
+Method = Literal["lbfgs", "nesterov", "one-step"]
+Fit = Literal["cover", "contain", "stretch"]
+Envelope = Literal["shade", "correct", "ignore"]
+
+_PICTURE, _COUNTS, _STOP, _SLM, _RARE = "Picture", "What counts", "When to stop", "Display", "Rarely needed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HologramOptions:
+    """How to compute a hologram; the defaults need no tuning.
+
+    Loss, weights, grid and frames make the model; ``fit``, ``srgb`` and ``envelope`` are about turning a
+    picture into a target, ``expansion`` about the display; the rest is about the search.
+    """
+
+    fit: Fit = option(
+        "cover",
+        help="How a picture that is not square fills the square field: it loses its sides, gets black "
+        "borders, or is stretched.",
+        choices=get_args(Fit),
+        group=_PICTURE,
+    )
+    srgb: bool = option(
+        False,
+        help="The picture's values are sRGB-coded and are decoded to intensities; else they are intensities.",
+        label="sRGB-coded",
+        group=_PICTURE,
+    )
+    loss: str | Loss = option(
+        "frequency",
+        help="Which differences count (Kuo 2020, Eqs. 7.16, 7.17 and 7.19).",
+        choices=LOSSES.names,
+        group=_COUNTS,
+    )
+    centre: tuple[float, float] = option(
+        (0.5, 0.5),
+        help="Of the fovea, the part of the field that counts fully with a weighted loss, from the top left.",
+        unit="fractions of the field",
+        metavar="Y,X",
+        label="Fovea's centre",
+        group=_COUNTS,
+    )
+    radius: float = option(
+        0.28,
+        help="Of the fovea.",
+        unit="fraction of the field",
+        above=0,
+        metavar="R",
+        label="Fovea's radius",
+        group=_COUNTS,
+    )
+    periphery: float = option(
+        0.1,
+        help="Weight far outside the fovea.",
+        least=0,
+        most=1,
+        metavar="W",
+        label="Elsewhere",
+        group=_COUNTS,
+    )
+    weights: npt.NDArray[Any] | None = option(
+        None,
+        help="Weights over the whole field, (height, width), any size, not negative, instead of the fovea.",
+        flags=("",),
+        group=_COUNTS,
+        recorded=False,
+    )
+    envelope: Envelope = option(
+        "shade",
+        help="What becomes of the mask pixels' envelope: the target gets it too (a picture darker at the "
+        "border), the hologram works against it, or it is left out of the model.",
+        choices=get_args(Envelope),
+        group=_COUNTS,
+    )
+    expansion: int | None = option(
+        None,
+        help="Étendue expansion: 4, 16, 36 ..., a square.",
+        default_words="the bench's",
+        least=1,
+        flags=("--expansion", "-q"),
+        metavar="Q",
+        group=_SLM,
+    )
+    frames: int = option(
+        1, help="Time-multiplexed frames, whose intensities average.", least=1, metavar="N", group=_SLM
+    )
+    complex_slm: bool = option(
+        False,
+        help="For an SLM that sets amplitude and phase.",
+        flags=("--complex",),
+        label="Complex SLM",
+        group=_SLM,
+    )
+    phase_levels: int | None = option(
+        None,
+        help="The SLM shows so many equidistant phases only: the last iterations round more and more pixels "
+        "and let the others make up for it.",
+        default_words="continuous, written in 256",
+        least=2,
+        flags=("--levels",),
+        metavar="N",
+        group=_SLM,
+    )
+    iterations: int = option(
+        100, help="At most so many.", least=0, flags=("--iterations", "-n"), metavar="N", group=_STOP
+    )
+    time_s: float | None = option(
+        None,
+        help="At most so many seconds.",
+        default_words="no limit",
+        unit="s",
+        above=0,
+        flags=("--time",),
+        metavar="S",
+        group=_STOP,
+    )
+    psnr_db: float | None = option(
+        None,
+        help="Stop when the seen image, through the eye's low-pass, is that good over the whole field.",
+        default_words="no limit",
+        unit="dB",
+        above=0,
+        flags=("--psnr",),
+        metavar="DB",
+        label="PSNR",
+        group=_STOP,
+    )
+    tolerance: float = option(
+        1e-5,
+        help="Stop when the loss fell by less than this fraction in each of five iterations in a row. "
+        "0: never.",
+        least=0,
+        metavar="X",
+        group=_STOP,
+    )
+    method: Method = option(
+        "lbfgs",
+        help="L-BFGS; projected gradient with Nesterov acceleration (Kuo 2020, A.6); back-propagated in one "
+        "step (Eqs. 7.11 to 7.13).",
+        choices=get_args(Method),
+        flags=("--method", "-m"),
+        group=_RARE,
+    )
+    grid: Grid = option(
+        "alias-free",
+        help="Grid that is optimised on; dissertation: the mask's own, which aliases.",
+        choices=get_args(Grid),
+        group=_RARE,
+    )
+    seed: int = option(0, help="Of the random start.", group=_RARE)
+
+    def __post_init__(self) -> None:
+        """Raise InputError that names all mistakes at once."""
+        require(self)
+        if not all(0 <= at <= 1 for at in self.centre):
+            raise InputError(f"centre must lie in 0 to 1 of the field, not {self.centre}.")
+        if self.weights is None:
+            return
+        if not loss_of(self.loss).takes_weights:
+            weighted = ", ".join(repr(loss.name) for loss in LOSSES.values() if loss.takes_weights)
+            raise InputError(f"Weights need a loss that takes them: {weighted}.")
+        weights = self.weights
+        if weights.ndim != 2 or not np.isfinite(weights).all() or weights.min() < 0 or weights.max() <= 0:
+            raise InputError("Weights must be a (height, width) image, finite, not negative, not all zero.")
+
+    def field_weights(self) -> npt.NDArray[Any] | None:
+        """Return the weights over the field, (height, width); None where the loss takes none."""
+        if not loss_of(self.loss).takes_weights:
+            return None
+        if self.weights is not None:
+            return self.weights
+        return foveal_weights((256, 256), centre=self.centre, radius=self.radius, periphery=self.periphery)
+
+    def display_of(self, display: Display) -> Display:
+        """Return the display as it is modelled: without the envelope where it is ignored."""
+        return replace(display, mask_fill=0.0) if self.envelope == "ignore" else display

@@ -1,0 +1,86 @@
+"""The priors that can be asked for by name, in options, windows and charts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from recon.base.registry import Registry
+from recon.priors.base import Prior
+from recon.priors.simple import L1, NonNegativity, Zero
+from recon.priors.total_variation import HaarTotalVariation, TotalVariation
+
+
+def _nothing(_: object) -> str | None:
+    return None
+
+
+@dataclass(frozen=True)
+class NamedPrior:
+    """A prior to choose.
+
+    Attributes
+    ----------
+    name : str
+        In options and records.
+    help : str
+        One line: what the scene is like.
+    make : callable
+        ``make(weight)`` returns the prior, in units of the scaled problem.
+    kind : "tv" or "l1"
+        What it counts, which its default weight follows: differences, or light.
+    weighted : bool
+        Whether it has a weight at all; bounds have none.
+    accepts : callable
+        ``accepts(problem)`` returns why the prior does not fit a problem, in words; None where it does.
+    """
+
+    name: str
+    help: str
+    make: Callable[[float], Prior]
+    kind: Literal["tv", "l1"] = "tv"
+    weighted: bool = True
+    accepts: Callable[[object], str | None] = _nothing
+
+    def __call__(self, weight: float) -> Prior:
+        """Return the prior of a weight."""
+        return self.make(weight)
+
+
+def _own() -> Iterable[NamedPrior]:
+    return (
+        NamedPrior(
+            "tv",
+            "Piecewise smooth: total variation, |dx| + |dy|; non-negative.",
+            lambda weight: TotalVariation(weight) + NonNegativity(),
+        ),
+        NamedPrior(
+            "tv-isotropic",
+            "Piecewise smooth: total variation, the gradient's length; non-negative.",
+            lambda weight: TotalVariation(weight, isotropic=True) + NonNegativity(),
+        ),
+        NamedPrior(
+            "tv-haar",
+            "Total variation with a cheap, inexact prox (Kuo 2020, A.1); non-negative.",
+            lambda weight: HaarTotalVariation(weight) + NonNegativity(),
+        ),
+        NamedPrior(
+            "l1",
+            "Points on black: sum of magnitudes; non-negative.",
+            lambda weight: L1(weight) + NonNegativity(),
+            kind="l1",
+        ),
+        NamedPrior(
+            "nonnegative",
+            "No light is negative; nothing else.",
+            lambda _: NonNegativity(),
+            kind="l1",
+            weighted=False,
+        ),
+        NamedPrior("none", "Nothing is known.", lambda _: Zero(), kind="l1", weighted=False),
+    )
+
+
+PRIORS: Registry[NamedPrior] = Registry("prior", "diffuserbench.priors", _own)
+"""Priors by name. One's own: ``PRIORS.register(NamedPrior(...))``, or as an entry point of the group."""

@@ -1,0 +1,237 @@
+"""The demo makes a good picture, keeps what it did, and can be stopped at any moment."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration_routines import SweepCalibration, SweepExposures
+from calibration_routines.demo.demo import Advance, DemoResult, run_demo
+from calibration_routines.demo.demo_picture import compare, scene_field
+from calibration_routines.demo.demo_settings import DemoSettings, read_picture
+from drivers.errors import DeviceError
+from instrument.bench.bench import Bench
+from instrument.cli import main
+from instrument.files.calibration_file import load_calibration
+from instrument.files.errors import FileError
+from instrument.runs.layout import RunCondition
+from instrument.runs.run import Run
+
+SMALL = DemoSettings(
+    preset="tiny",
+    camera_binning=1,
+    binning=1,
+    z_mm=(60.0, 150.0),
+    planes=3,
+    scene_plane=1,
+    half_field_deg=5.0,
+    reconstruction_s=5.0,
+    time_scale=0.0,
+)
+
+
+MOVING = ("dark frames and axial sweep", "response over the field", "photograph the scene", "reconstruct")
+SAFE = {"light": "off", "stage_moving": False, "scene_lit": False}
+
+
+class Listener:
+    """Keeps what the demo tells, and can raise when a stage begins or moves on."""
+
+    def __init__(self, trouble_in: str = "", trouble: BaseException | None = None) -> None:
+        self.stages: list[str] = []
+        self.trouble_in, self.trouble = trouble_in, trouble
+        self.bench: Bench | None = None
+
+    def make_trouble(self) -> None:
+        trouble, self.trouble = self.trouble, None
+        if trouble is not None:
+            raise trouble
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Advance]:
+        self.stages.append(name)
+
+        def advance(done: float, total: float) -> None:
+            if name == self.trouble_in and (done >= total / 2 or name == "reconstruct"):
+                self.make_trouble()
+
+        if name == self.trouble_in and name not in MOVING:
+            self.make_trouble()
+        yield advance
+
+    def on_bench(self, bench: Bench, folder: Path) -> None:
+        self.bench = bench
+
+    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
+        assert not exposures.warnings
+
+    def on_sweep(self, done: SweepCalibration) -> None:
+        assert not done.findings
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, Listener]:
+    listener = Listener()
+    return run_demo(tmp_path_factory.mktemp("demo"), listener, SMALL), listener
+
+
+def test_the_small_demo_reconstructs_its_scene(shown: tuple[DemoResult, Listener]) -> None:
+    result, listener = shown
+    assert result.comparison.psnr_db > 24
+    assert result.comparison.ssim > 0.7
+    assert list(result.seconds) == listener.stages
+    assert result.measured.photo.saturated_pixels == 0
+
+
+def test_everything_it_made_is_in_its_folder(shown: tuple[DemoResult, Listener]) -> None:
+    result, _ = shown
+    for path in result.files.values():
+        assert path.is_relative_to(result.folder)
+        assert path.exists()
+    figure = cv2.imread(str(result.files["summary figure"]))
+    assert figure is not None
+    assert figure.std() > 20
+    record = json.loads((result.folder / "demo.json").read_text())
+    assert record["state"] == "completed"
+    assert record["simulated"] is True
+    assert record["psnr_db"] == pytest.approx(result.comparison.psnr_db, abs=0.01)
+    assert record["left"] == SAFE
+    assert len(load_calibration(result.files["calibration"]).psfs) == SMALL.planes
+
+
+def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, Listener]) -> None:
+    result, _ = shown
+    truth = cv2.imread(str(result.files["ground truth, linear float32"]), cv2.IMREAD_UNCHANGED)
+    picture = cv2.imread(str(result.files["picture, linear float32"]), cv2.IMREAD_UNCHANGED)
+    height, width = truth.shape
+    field = scene_field(truth.shape, (height // 2, width // 2), (height - 8.0, width - 8.0), 1.0)
+    right = compare(picture, truth, field).psnr_db
+    assert compare(picture[::-1], truth, field).psnr_db < right - 5
+    assert compare(picture[:, ::-1], truth, field).psnr_db < right - 5
+    assert compare(np.roll(picture, 2, axis=1), truth, field).psnr_db < right - 2
+
+
+def test_pictures_stand_upright(shown: tuple[DemoResult, Listener]) -> None:
+    result, _ = shown
+    original = read_picture()
+    for name in ("picture", "ground truth, linear float32"):
+        image = cv2.imread(str(result.files[name]), cv2.IMREAD_UNCHANGED)[4:-4, 4:-4]  # without the margin
+        expected = cv2.resize(original, image.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_demo_as_it_is_keeps_its_promise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("instrument.cli.demo.DemoSettings", partial(DemoSettings, time_scale=0.0))
+    assert main(["demo", "--out", str(tmp_path), "--reconstruction-s", "30"]) == 0
+    out = capsys.readouterr().out
+    found = re.search(r"PSNR ([0-9.]+) dB, SSIM ([0-9.]+) against the ground truth", out)
+    assert found
+    assert float(found[1]) > 28  # promised: 24
+    assert float(found[2]) > 0.8
+    assert "SIMULATED" in out
+    for stage in ("home the stage", "dark frames and axial sweep", "photograph the scene", "reconstruct"):
+        assert re.search(rf"[0-9.]+  {stage}", out)
+    (folder,) = tmp_path.iterdir()
+    assert (folder / "summary.png").stat().st_size < 400_000
+
+
+STOP, FAIL = KeyboardInterrupt(), DeviceError("camera (simulated)", "was unplugged.")
+
+
+@pytest.mark.parametrize(
+    ("stage", "trouble"),
+    [
+        ("home the stage", STOP),
+        ("expose without saturating", STOP),
+        ("dark frames and axial sweep", STOP),
+        ("dark frames and axial sweep", FAIL),
+        ("photograph the scene", STOP),
+        ("photograph the scene", FAIL),
+        ("reconstruct", STOP),
+        ("write the pictures", STOP),
+    ],
+)
+def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
+    tmp_path: Path, stage: str, trouble: BaseException
+) -> None:
+    listener = Listener(stage, trouble)
+    with pytest.raises(type(trouble)):
+        run_demo(tmp_path, listener, SMALL)
+    (folder,) = tmp_path.iterdir()
+    record = json.loads((folder / "demo.json").read_text())
+    assert record["state"] == ("aborted" if isinstance(trouble, KeyboardInterrupt) else "failed")
+    assert record["stage"] == stage
+    assert record["left"] == SAFE
+    assert listener.bench is not None
+    assert not any(device.is_open for device in listener.bench.devices.values())
+    runs = sorted(path for path in folder.iterdir() if (path / "state.json").exists())
+    if stage in MOVING and stage != "reconstruct":
+        expected = RunCondition.ABORTED if record["state"] == "aborted" else RunCondition.FAILED
+        assert [Run.open(run).condition for run in runs][-1] is expected
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(FileError, match=r"is no folder|cannot be made"):
+        run_demo(tmp_path / "file", Listener(), SMALL)
+
+
+PROGRAM = """
+import sys
+from calibration_routines.demo import demo_settings
+from instrument.cli import main
+small = demo_settings.DemoSettings(
+    preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,
+    half_field_deg=5.0, reconstruction_s=5.0, time_scale=1.0,
+)
+import instrument.cli.demo as command
+command.DemoSettings = lambda **_: small
+print("ready", flush=True)
+sys.exit(main(["demo", "--out", sys.argv[1]]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wait_s", [0.0, 1.0, 2.5, 4.5])
+def test_ctrl_c_ends_the_command_with_130_and_a_safe_bench(tmp_path: Path, wait_s: float) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("demo-*/demo.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(wait_s)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    (folder,) = tmp_path.iterdir()
+    record = json.loads((folder / "demo.json").read_text())
+    if record["state"] == "completed":
+        pytest.skip("this machine was done before it was interrupted")
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert str(folder) in errors
+    assert record["state"] == "aborted"
+    conditions = [Run.open(state.parent).condition for state in folder.glob("*/state.json")]
+    assert set(conditions) <= {RunCondition.COMPLETED, RunCondition.ABORTED}
+    assert record.get("left", SAFE) == SAFE  # stopped before the bench was open, it is not there

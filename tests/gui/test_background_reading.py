@@ -1,0 +1,40 @@
+"""What is read in jobs: the newest request, in a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+
+from pytestqt.qtbot import QtBot
+
+from gui.background_reading import NewestOnly
+from gui.jobs import JobRunner
+
+WAIT_MS = 60_000
+
+
+def test_of_quick_requests_the_newest_is_read_and_what_is_forgotten_is_not_shown(qtbot: QtBot) -> None:
+    jobs = JobRunner()
+    reader = NewestOnly(jobs, "reading")
+    go_on, begun, shown = threading.Event(), [], []
+
+    def reads(number: int) -> int:
+        begun.append((number, threading.current_thread() is threading.main_thread()))
+        go_on.wait(20)
+        return number
+
+    for number in range(5):
+        reader.ask(lambda number=number: reads(number), shown.append)
+    qtbot.waitUntil(lambda: len(begun) == 1, timeout=WAIT_MS)
+    go_on.set()
+    qtbot.waitUntil(lambda: not jobs.jobs, timeout=WAIT_MS)
+    assert begun == [(0, False), (4, False)] or begun == [(4, False)]
+    assert shown[-1] == 4
+    go_on.clear()
+    reader.ask(lambda: reads(5), shown.append)
+    qtbot.waitUntil(lambda: begun[-1][0] == 5, timeout=WAIT_MS)
+    reader.forget()
+    reader.ask(lambda: reads(6), shown.append)
+    go_on.set()
+    qtbot.waitUntil(lambda: shown[-1] == 6, timeout=WAIT_MS)
+    assert 5 not in shown
+    assert jobs.join(10)

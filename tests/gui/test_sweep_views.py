@@ -1,0 +1,46 @@
+"""The pictures of a sweep's PSFs do not fill the memory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gui.widgets.sweep_views import PsfPictures, small
+
+
+def test_a_long_sweep_stays_small_and_every_psf_can_be_looked_at() -> None:
+    pictures = PsfPictures()
+    rng = np.random.default_rng(0)
+    image = rng.random((600, 800), dtype=np.float32)
+    for number in range(200):
+        pictures.keep(number, image.copy())
+    assert len(pictures) == 200
+    assert pictures.nbytes < 0.2 * 200 * image.nbytes
+    newest, oldest = pictures.get(199), pictures.get(0)
+    assert newest is not None
+    assert oldest is not None
+    assert newest.reduced == 1
+    np.testing.assert_array_equal(newest.image, image)
+    assert (oldest.reduced, oldest.image.shape, oldest.image.dtype) == (4, (150, 200), np.uint8)
+    assert pictures.get(200) is None
+
+
+def test_one_that_is_taken_again_takes_the_place_of_the_old_one() -> None:
+    pictures = PsfPictures()
+    for number in range(40):
+        pictures.keep(number, np.full((4, 4), float(number)))
+    pictures.keep(0, np.full((4, 4), 99.0))
+    again = pictures.get(0)
+    assert again is not None
+    assert again.reduced == 1
+    assert again.image[0, 0] == 99
+    assert len(pictures) == 40
+
+
+def test_a_small_picture_shows_the_same_spot() -> None:
+    image = np.zeros((1024, 512), np.float32)
+    image[400:408, 100:108] = 5000
+    found = small(image)
+    assert found.image.shape == (256, 128)
+    assert np.unravel_index(found.image.argmax(), found.image.shape) == (100, 25)
+    assert found.image[100, 25] == 255
+    assert small(np.ones((1, 3000), np.float32)).image.shape == (1, 250)

@@ -1,0 +1,182 @@
+"""Commands from declared options: flags, help, mistakes, what was given."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import typer
+
+from instrument.cli.app import App
+from instrument.cli.options import Given, Only
+from instrument.files.errors import BenchError
+from recon.base.declare import RARE, identity, option
+from recon.errors import InputError
+
+KINDS = ["plain", "fancy"]
+
+
+class Way(enum.StrEnum):
+    """Ways."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+def _pair(text: str) -> tuple[float, float]:
+    y, x = (float(part) for part in text.split(","))
+    return y, x
+
+
+@dataclass(frozen=True, kw_only=True)
+class Main:
+    """Options of the tests."""
+
+    rare: bool = option(True, help="Is rare.", group=RARE, applies=("film",))
+    count: int = option(3, help="How many.", least=1, most=9, flags=("--count", "-n"), group="Main")
+    kind: str = option(
+        "plain", help="Which.", choices=lambda: KINDS, flags=("--kind", "--sort"), group="Main"
+    )
+    z_um: float | None = option(
+        None, help="Where.", unit="um", shown_unit="mm", shown_factor=1e3, above=0, below=1e6, group="Main"
+    )
+    level: Literal["auto"] | float | Path = option("auto", help="Of dark.", group="Main")
+    binning: int | None = option(None, help="Of pixels.", least=1, none_word="auto", group="Main")
+    background: bool | None = option(None, help="As well.", default_words="as it comes", identifies=False)
+    centre: tuple[float, float] = option((0.5, 0.5), help="Of it.", parse=_pair, metavar="Y,X")
+    depths: tuple[float, ...] = option((), help="Of each.", above=0)
+    lasers: tuple[float, float] = option((638.0, 520.0), help="Two.")
+    place: tuple[float, float] = option((0.5, 0.5), help="Of it.", metavar="Y,X")
+    way: Way = option(Way.LEFT, help="Where to.")
+    hidden: int = option(7, help="Not on the command line.", flags=("",))
+
+    def __post_init__(self) -> None:
+        if self.count == 8:
+            raise InputError("8 is not liked.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class More:
+    """Required ones."""
+
+    out: Path = option(help="Where to.", flags=("--out", "-o"))
+    speed: float = option(1.0, help="How fast.")
+
+
+def run(*words: str) -> tuple[Path, Main, More, Given, bool]:
+    """Run a command with these words; return what it was called with."""
+    app, calls = App(), []
+
+    @app.command()
+    def made(
+        source: Annotated[Path, typer.Argument()],
+        main: Main,
+        more: Annotated[More, Only("out")],
+        given: Given,
+        loud: Annotated[bool, typer.Option("--loud")] = False,
+    ) -> None:
+        """Say something."""
+        calls.append((source, main, more, given, loud))
+
+    parser = typer.main.get_command(app)
+    with parser.make_context("made", list(words)) as context:
+        parser.invoke(context)
+    return calls[0]
+
+
+def test_nothing_given_is_every_default() -> None:
+    source, main, more, given, loud = run("in.tif", "--out", "x")
+    assert (source, main, more, loud) == (Path("in.tif"), Main(), More(out=Path("x")), False)
+    assert list(given.options) == ["out"]
+
+
+def test_words_become_values_in_the_units_of_python() -> None:
+    words = "--no-rare -n 4 --sort fancy --z-mm 25 --level 12.5 --binning 2 --no-background --centre 0.1,0.2"
+    words += " --depths 1 --depths 2 --lasers 500 600 --place 0.1,0.2 --way right --loud"
+    _, main, _, given, loud = run("in.tif", "-o", "x", *words.split())
+    assert main == Main(
+        rare=False,
+        count=4,
+        kind="fancy",
+        z_um=25000.0,
+        level=12.5,
+        binning=2,
+        background=False,
+        centre=(0.1, 0.2),
+        depths=(1.0, 2.0),
+        lasers=(500.0, 600.0),
+        place=(0.1, 0.2),
+        way=Way.RIGHT,
+    )
+    assert loud
+    assert "kind" in given
+    assert "hidden" not in given
+    assert run("in.tif", "-o", "x", "--level", "dark.tif", "--binning", "auto")[1] == Main(
+        level=Path("dark.tif")
+    )
+
+
+def test_a_default_that_was_typed_was_given() -> None:
+    assert "count" in run("in.tif", "-o", "x", "--count", "3")[3]
+
+
+def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_people_type() -> None:
+    with pytest.raises(BenchError) as raised:
+        run(
+            "in.tif", "--count", "10", "--kind", "fancie", "--z-mm", "-2", "--binning", "few", "--depths", "0"
+        )
+    assert str(raised.value).splitlines() == [
+        "--count must be a whole number, 1 or more, 9 or less, not 10.",
+        "--kind must be one of plain, fancy, not 'fancie'; 'fancy'?",
+        "--z-mm must be a number, above 0, below 1000 (mm), not -2.",
+        "--binning must be auto or a whole number, 1 or more, not 'few'.",
+        "--depths must be a number, above 0, not 0.",
+        "--out must be given.",
+    ]
+    with pytest.raises(BenchError, match="--centre 'middle': could not convert"):
+        run("in.tif", "-o", "x", "--centre", "middle")
+    with pytest.raises(BenchError, match="--place must be Y,X, 2 numbers, not '1,2,3'"):
+        run("in.tif", "-o", "x", "--place", "1,2,3")
+    with pytest.raises(BenchError, match="--way must be one of left, right, not 'up'"):
+        run("in.tif", "-o", "x", "--way", "up")
+    with pytest.raises(BenchError, match=r"--z-mm must be a number.*not 'nan'"):
+        run("in.tif", "-o", "x", "--z-mm", "nan")
+    with pytest.raises(InputError, match="not liked"):
+        run("in.tif", "-o", "x", "--count", "8")
+
+
+def test_what_does_not_apply_is_refused_from_its_declaration() -> None:
+    given = run("in.tif", "-o", "x", "--rare")[3]
+    given.refuse("--film", "film", "picture")
+    with pytest.raises(BenchError, match=r"With --picture these do not apply: --rare \(for a film\)\. Leave"):
+        given.refuse("--picture", "picture")
+
+
+def test_help_has_groups_and_what_is_registered_later(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "KINDS", ["plain", "fancy", "late"])
+    with pytest.raises(typer.Exit):
+        run("--help")
+    shown = capsys.readouterr().out
+    headings = [line for line in shown.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings == ["Arguments:", "Main:", "Options:", f"{RARE}:"]
+    assert "-n, --count N" in shown
+    assert "How many.  [default: 3; 9 or less]" in shown
+    assert "--kind plain|fancy|late" in shown
+    assert "--sort" not in shown
+    assert "--z-mm MM" in shown
+    assert "below 1000" in shown
+    assert "--level auto|X|FILE" in shown
+    assert "--background/--no-background" in shown
+    assert "[default: as it comes]" in shown
+    assert "[required]" in shown
+    assert "hidden" not in shown
+
+
+def test_what_only_says_when_to_stop_does_not_identify_kept_work() -> None:
+    assert "background" not in identity(Main())
+    assert identity(Main())["way"] == "left"

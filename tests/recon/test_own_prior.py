@@ -1,0 +1,160 @@
+"""A prior of the user's own, of which ``value`` and ``prox`` are known: every splitting solver takes it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.base.registry import Registry
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.erasures import Erasures
+from recon.errors import InputError, StructureError
+from recon.priors import PRIORS, HaarTotalVariation, NamedPrior, NonNegativity, Prior, TotalVariation, Zero
+from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules
+
+
+class Ridge(Prior):
+    """``weight / 2 ||x||^2``, as a newcomer would write it."""
+
+    def __init__(self, weight):
+        self.weight = weight
+
+    def value(self, x):
+        return 0.5 * self.weight * float(np.vdot(x, x))
+
+    def prox(self, x, step):
+        return x / (1 + self.weight * step)
+
+
+class PositiveRidge(Ridge):
+    """The same with non-negativity, whose common prox is known."""
+
+    def value(self, x):
+        return np.inf if x.min() < 0 else super().value(x)
+
+    def prox(self, x, step):
+        return np.maximum(super().prox(x, step), 0)
+
+
+def problem(n_channels=2):
+    rng = np.random.default_rng(0)
+    camera = PadCropConvolution(rng.random((n_channels, 5, 6)), (9, 8), dtype=np.float64)
+    x = np.maximum(rng.standard_normal(camera.domain_shape), 0)
+    data = camera.forward(x) + 0.1 * rng.standard_normal(camera.range_shape)
+    return Erasures(rng.random((1, 9, 8)) > 0.1, data.shape, np.float64) @ camera, data
+
+
+def minimum(operator, data, prior, x):
+    data = operator.outer.forward(data)
+    return 0.5 * float(np.linalg.norm(operator.forward(x) - data) ** 2) + prior.value(x)
+
+
+RULES = StoppingRules(iterations=1500, tolerance=1e-8)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    operator, data = problem()
+    masked = operator.outer.forward(data)
+    return (
+        Fista(operator, masked, PositiveRidge(0.5))
+        .run(StoppingRules(iterations=6000, tolerance=1e-9))
+        .solution
+    )
+
+
+@pytest.mark.parametrize("solver", [Admm, SensorAdmm])
+@pytest.mark.parametrize(
+    "prior",
+    [
+        Ridge(0.5) + NonNegativity(),
+        NonNegativity() + Ridge(0.5),
+        PositiveRidge(0.5) + Zero(),
+    ],
+    ids=["sum", "sum the other way", "with the bound inside"],
+)
+def test_admm_reaches_the_minimiser(solver, prior, reference):
+    operator, data = problem()
+    found = solver(operator, data, prior).run(RULES)
+    assert found.solution.min() >= -1e-12
+    best = minimum(operator, data, PositiveRidge(0.5), reference)
+    assert minimum(operator, data, PositiveRidge(0.5), np.maximum(found.solution, 0)) == pytest.approx(
+        best, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("solver", [Admm, SensorAdmm])
+def test_three_priors_at_once_agree_between_solvers(solver):
+    operator, data = problem()
+    prior = Ridge(0.3) + TotalVariation(0.2) + NonNegativity()
+    found = solver(operator, data, prior).run(RULES).solution
+    other = (SensorAdmm if solver is Admm else Admm)(operator, data, prior).run(RULES).solution
+    assert minimum(operator, data, prior, found) == pytest.approx(
+        minimum(operator, data, prior, other), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("solver", [Admm, SensorAdmm])
+def test_a_second_total_variation_is_taken_by_its_prox(solver):
+    """Two halves are the whole."""
+    operator, data = problem(1)
+    half = TotalVariation(0.2, tolerance=1e-12)
+    found = solver(operator, data, half + half + NonNegativity()).run(
+        StoppingRules(iterations=600, tolerance=1e-8)
+    )
+    whole = solver(operator, data, TotalVariation(0.4) + NonNegativity()).run(RULES)
+    of = TotalVariation(0.4) + NonNegativity()
+    assert minimum(operator, data, of, found.solution) == pytest.approx(
+        minimum(operator, data, of, whole.solution), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("solver", [Admm, SensorAdmm])
+def test_a_run_goes_on_from_a_checkpoint(solver):
+    operator, data = problem()
+    prior = Ridge(0.5) + NonNegativity()
+    whole = solver(operator, data, prior).run(StoppingRules(iterations=20, tolerance=0)).solution
+    first = solver(operator, data, prior)
+    first.run(StoppingRules(iterations=9, tolerance=0))
+    second = solver(operator, data, prior)
+    second.restore(first.checkpoint())
+    found = second.run(StoppingRules(iterations=20, tolerance=0)).solution
+    np.testing.assert_allclose(found, whole, atol=1e-12)
+
+
+def test_a_restart_forgets_the_prior_s_state():
+    operator, data = problem()
+    rules = StoppingRules(iterations=12, tolerance=0)
+    solver = SensorAdmm(operator, data, Ridge(0.5) + NonNegativity())
+    cold = solver.run(rules).solution
+    solver.restart(data)
+    np.testing.assert_allclose(solver.run(rules).solution, cold, atol=1e-12)
+
+
+def test_fista_says_why_it_does_not_take_a_sum_without_a_prox():
+    operator, data = problem()
+    with pytest.raises(StructureError, match="prox of this sum is not known: Ridge, NonNegativity"):
+        Fista(operator, data, Ridge(0.5) + NonNegativity()).step()
+
+
+def test_a_prox_that_is_not_that_of_its_value_is_refused():
+    operator, data = problem()
+    for solver in (Admm, SensorAdmm):
+        with pytest.raises(StructureError, match=r"HaarTotalVariation.*settle somewhere else.*fista"):
+            solver(operator, data, Ridge(0.5) + HaarTotalVariation(0.1))
+
+
+def test_names_are_objects_in_one_registry():
+    assert isinstance(PRIORS, Registry)
+    assert PRIORS.names() == ("tv", "tv-isotropic", "tv-haar", "l1", "nonnegative", "none")
+    assert all(prior.help.endswith(".") and prior.accepts(None) is None for prior in PRIORS.values())
+    assert [n for n, p in PRIORS.items() if not p.weighted] == ["nonnegative", "none"]
+    tv, bound = PRIORS["tv"](0.3).terms()
+    assert (tv.weight, bound.lower) == (0.3, 0)
+    with pytest.raises(InputError, match="Did you mean 'tv-haar'"):
+        PRIORS.named("tv-har")
+    own = NamedPrior("ridge", "Small.", Ridge)
+    registry = Registry("prior", "nobody's group", lambda: PRIORS.values())
+    registry.register(own)
+    assert registry.names()[-1] == "ridge"
+    assert registry["ridge"](0.5).weight == 0.5

@@ -1,0 +1,88 @@
+"""The structure of the packages: no two files import each other in a circle, no folder is crowded."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("recon", "drivers", "instrument", "calibration_routines", "gui")
+MOST_MODULES = 25
+
+
+def module_files(root: Path) -> dict[str, Path]:
+    """Return the packages' modules by their dotted names."""
+    found = {}
+    for package in PACKAGES:
+        for path in (root / package).rglob("*.py"):
+            found[".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")] = path
+    return found
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Yield what a module imports, inside functions too, but not what only type checkers see."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            waiting += node.orelse
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        waiting += ast.iter_child_nodes(node)
+
+
+def import_graph(files: Mapping[str, Path]) -> dict[str, set[str]]:
+    """Return which modules each module imports; a package's face hands names on and counts as no module."""
+    graph = {}
+    for name, path in files.items():
+        names = {n for n in imported(ast.parse(path.read_text("utf-8"))) if n in files and n != name}
+        graph[name] = {n for n in names if files[n].name != "__init__.py"}
+    return graph
+
+
+def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """Return the groups of modules that reach each other."""
+    reach = {name: _reached(graph, name) for name in graph}
+    groups = {frozenset({a, *(b for b in reach[a] if a in reach.get(b, ()))}) for a in graph if a in reach[a]}
+    return sorted(sorted(group) for group in groups)
+
+
+def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
+    seen: set[str] = set()
+    waiting = list(graph[start])
+    while waiting:
+        name = waiting.pop()
+        if name not in seen:
+            seen.add(name)
+            waiting += graph[name]
+    return seen
+
+
+def test_no_two_files_import_each_other_in_a_circle() -> None:
+    assert circles(import_graph(module_files(ROOT))) == []
+
+
+def test_no_folder_is_crowded() -> None:
+    counts: dict[Path, int] = {}
+    for path in module_files(ROOT).values():
+        counts[path.parent] = counts.get(path.parent, 0) + (path.name != "__init__.py")
+    crowded = {str(d.relative_to(ROOT)): n for d, n in counts.items() if n > MOST_MODULES}
+    assert not crowded, (
+        f"more than {MOST_MODULES} modules: split the room, or merge what has one reason to change"
+    )
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_circle_is_found(tmp_path: Path, inside: bool) -> None:
+    (tmp_path / "recon").mkdir()
+    one, two = tmp_path / "recon" / "one.py", tmp_path / "recon" / "two.py"
+    one.write_text("from recon import two\n")
+    two.write_text("def later():\n    import recon.one\n" if inside else "from recon.one import two\n")
+    assert circles(import_graph(module_files(tmp_path))) == [["recon.one", "recon.two"]]
