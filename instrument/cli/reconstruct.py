@@ -105,7 +105,7 @@ def reconstruct(
 
 
 def _picture(asked: _Asked, image: Path) -> None:
-    from instrument.cli.picture import reconstruct_to_picture
+    from instrument.cli.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
     given.refuse("a picture (give --volume, or --video with a recording)", "picture")
@@ -120,23 +120,16 @@ def _picture(asked: _Asked, image: Path) -> None:
         psf=source.psf,
         calibration=source.calibration,
         z_um=asked.options.z_um,
-        method="admm" if asked.options.solver == "auto" else asked.options.solver,
+        method=asked.options.solver,
         allow_saturated=asked.inputs.allow_saturated,
         allow_mixed_depth=asked.inputs.allow_mixed_depth,
         settings=asked.settings,
     )
-    reconstruct_to_picture(
-        request,
-        Outputs.named(output.out or _PICTURE, output.figure),
-        rotate_deg=int(output.rotate_deg),
-        checkpoint=output.checkpoint,
-        force=output.force,
-        explain=output.explain,
-    )
+    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, output.figure), output)
 
 
 def _volume(asked: _Asked, image: Path, psfs: Path) -> None:
-    from instrument.cli.volume import reconstruct_to_volume
+    from instrument.cli.solving import reconstruct_photograph
 
     options, output = asked.options, asked.output
     asked.given.refuse("--volume", "volume")
@@ -151,13 +144,7 @@ def _volume(asked: _Asked, image: Path, psfs: Path) -> None:
         device=options.device,
         settings=asked.settings,
     )
-    reconstruct_to_volume(
-        request,
-        Outputs.named(output.out or _PICTURE, volume=True),
-        checkpoint=output.checkpoint,
-        force=output.force,
-        explain=output.explain,
-    )
+    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, volume=True), output)
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
@@ -197,7 +184,7 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
             "--patterned needs a run and a calibration: "
             "diffuserbench reconstruct RUN --patterned SHEET --calibration FOLDER"
         )
-    from instrument.cli.patterned import reconstruct_to_patterned
+    from instrument.cli.solving import reconstruct_patterns
     from instrument.reconstruction.patterned import PatternedRequest
 
     request = PatternedRequest(
@@ -210,8 +197,7 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
         tau=options.tau,
         iterations=options.iterations,
     )
-    outputs = Outputs.named(output.out or _PICTURE)
-    reconstruct_to_patterned(request, outputs, rotate_deg=int(output.rotate_deg), force=output.force)
+    reconstruct_patterns(request, Outputs.named(output.out or _PICTURE), output)
 
 
 def _require_auto(asked: _Asked) -> None:
@@ -227,8 +213,3 @@ def _require_auto(asked: _Asked) -> None:
         )
     if wishes is not None and wishes.precision is not None and "precision" in asked.given:
         raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
-    if asked.output.checkpoint is not None and (asked.output.explain or wishes is not None):
-        raise BenchError(
-            f"{'--explain' if asked.output.explain else '--choose'} is about everything that --model auto "
-            "chooses, which it does not with --checkpoint. Leave one of the two out."
-        )
