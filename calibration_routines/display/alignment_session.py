@@ -11,7 +11,7 @@ from instrument.files.errors import BenchError, SettingsError
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import Display
-from recon.holography.pose_fit import PoseProbe
+from recon.holography.spots import PoseProbe
 
 Progress = Callable[[str, int], object]
 

@@ -16,8 +16,8 @@ from scipy.interpolate import griddata
 from recon.analysis.points import Noise, try_points
 from recon.analysis.resolution import axial_resolution
 from recon.analysis.window import WindowProblem
-from recon.evaluation.catalogue import map_named
 from recon.evaluation.lenslets import build_camera
+from recon.evaluation.maps import map_named
 from recon.evaluation.maps_scene import local_condition
 from recon.evaluation.scene import SceneSpec
 from recon.evaluation.scene_trial import Options, judge_image, run_scene, scene_of, solve
