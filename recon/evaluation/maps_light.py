@@ -50,7 +50,6 @@ def scene_map(
     y: Axis,
     methods: tuple[str, ...],
     options: Options | None = None,
-    draws: int = 1,
 ) -> StressMap:
     """Return a map whose axes are two numbers of a scene, fields of a ``SceneSpec``."""
     chosen = options or Options()
@@ -59,7 +58,7 @@ def scene_map(
         name, used = _handling(method, chosen)
         return run_scene(spec_at(base, size, seed, **{x.key: at_x, y.key: at_y}), name, used, size)
 
-    return StressMap(name, title, question, x, y, methods, trial, draws=draws, base=f"{base} {chosen}")
+    return StressMap(name, title, question, x, y, methods, trial, base=f"{base} {chosen}")
 
 
 def _handling(method: str, options: Options) -> tuple[str, Options]:
