@@ -16,7 +16,7 @@ from calibration_routines.display.display_procedures import AlignmentProcedure, 
 from instrument.cli.app import App, BenchOption, examples, open_and_say, require_new, saying_what_is_left
 from instrument.cli.progress import progress_bar
 from instrument.cli.sweeping import Told
-from instrument.display.table71_figure import rows, write_chart, write_csv
+from instrument.display.figures import rows, write_chart, write_csv
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from recon.base.declare import option
 from recon.base.option_text import size
