@@ -1,6 +1,7 @@
 """Seconds per iteration of the ADMM on the measured hand, beside a plain implementation in the same run.
 
-Plain: the literal algorithm of A.3 in float64 with complex ``numpy.fft`` (``recon.solvers.LiteralAdmm``).
+Plain: the literal algorithm of A.3 in float64 with complex ``numpy.fft``
+(``tests/recon/solvers/literal_admm.py``).
 The two take turns, three iterations each, so that other load on the machine falls on both alike; medians.
 
     python benchmarks/admm_hand.py [--rounds 15] [--threads N]
@@ -15,17 +16,21 @@ import argparse
 import datetime
 import os
 import platform
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import tifffile
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.reconstruction.preparation import prepare
-from recon.solvers import Admm, LiteralAdmm, Solver
+from recon.solvers import Admm, Solver
+from tests.recon.solvers.literal_admm import LiteralAdmm
 
 ROOT = Path(os.environ.get("DIFFUSERBENCH_DATA", Path(__file__).parents[1] / "../shared/data"))
 DATA = ROOT / "diffusercam_hand"

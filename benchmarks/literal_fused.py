@@ -1,6 +1,6 @@
 """The dissertation's ADMM for volumes (Kuo 2020, Eq. 4.5, A.3), written as well as its splitting allows.
 
-The same updates as :class:`recon.solvers.literal_volume.LiteralAdmm`, in four three-dimensional FFTs into
+The same updates as ``tests/recon/solvers/literal_volume.py``, in four three-dimensional FFTs into
 preallocated arrays and two compiled sweeps, with split variable and multiplier kept as one state: what a
 fair comparison has to beat. l1 takes the identity for Psi (one split less).
 """

@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines import PointSweep, expose_sweep
-from calibration_routines.psf.psf_quality import block_mean
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
+from recon.base.blocks import block_mean
 from recon.camera.registration import expected_shift, register
 
 BENCH = """

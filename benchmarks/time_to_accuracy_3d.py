@@ -33,8 +33,8 @@ from recon.base.threads import set_threads
 from recon.camera.convolution3d import Convolution3D
 from recon.priors import HaarTotalVariation, NonNegativity
 from recon.solvers import Fista
-from recon.solvers.literal_volume import LiteralAdmm
 from recon.solvers.tv_admm_volume import LeanTotalVariation
+from tests.recon.solvers.literal_volume import LiteralAdmm
 
 
 @dataclass

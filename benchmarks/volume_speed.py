@@ -5,7 +5,7 @@
 
 Each method runs in a process of its own (its peak memory is the process's), in rounds, one after the other,
 so that a busy machine is unjust to none. The best of the rounds' medians counts. ``naive`` is the
-dissertation's algorithm as it stands in NumPy (:class:`recon.solvers.literal_volume.LiteralAdmm`), ``fused``
+dissertation's algorithm as it stands in NumPy (``tests/recon/solvers/literal_volume.py``), ``fused``
 the same written well (``benchmarks/literal_fused.py``), both with three-dimensional FFTs.
 """
 
@@ -44,8 +44,8 @@ def problem(sensor: int, depths: int):
 def solver(method: str, operator, data):
     """Return a solver by its name in METHODS."""
     from recon.solvers.douglas_rachford import DouglasRachford
-    from recon.solvers.literal_volume import LiteralAdmm
     from recon.solvers.tv_admm_volume import LeanTotalVariation
+    from tests.recon.solvers.literal_volume import LiteralAdmm
 
     if method == "lean TV":
         return LeanTotalVariation(operator, data, 10.0)

@@ -28,6 +28,11 @@ class LedPattern:
     description: str
     levels: tuple[tuple[int, Rgb], ...] = ()
 
+    @classmethod
+    def of_mask(cls, description: str, lit: npt.NDArray[np.bool_], rgb: Rgb) -> LedPattern:
+        """Return the pattern that lights some LEDs of an array, ``(n_leds,)``, all in one colour."""
+        return cls(description, tuple((int(index), rgb) for index in np.flatnonzero(lit)))
+
     @property
     def is_dark(self) -> bool:
         """Whether no LED is lit."""
@@ -74,29 +79,6 @@ class LedArray(Device):
     def off(self) -> None:
         """Turn every LED off. Callable from any thread; overtakes whatever is running."""
 
-    # Patterns every array can make ---------------------------------------------------------------
     def single(self, index: int, rgb: Rgb = (255, 255, 255)) -> LedPattern:
-        """One LED."""
+        """Return the pattern of one LED; others are :mod:`instrument.plan.patterns`' matter."""
         return LedPattern(f"LED {index} rgb {rgb}", ((index, rgb),))
-
-    def bright_field(self, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
-        """All LEDs whose illumination falls inside the numerical aperture ``na``."""
-        return self._select(f"bright field NA {na:g} rgb {rgb}", self._radius() <= na, rgb)
-
-    def dark_field(self, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
-        """All LEDs whose illumination falls outside the numerical aperture ``na``."""
-        return self._select(f"dark field NA {na:g} rgb {rgb}", self._radius() > na, rgb)
-
-    def dpc_half(self, side: str, na: float, rgb: Rgb = (255, 255, 255)) -> LedPattern:
-        """Half of the bright field (A.2); ``side`` is ``"left"``, ``"right"``, ``"top"`` or ``"bottom"``."""
-        x, y = self.led_na[:, 0], self.led_na[:, 1]
-        halves = {"left": x < 0, "right": x > 0, "top": y > 0, "bottom": y < 0}
-        if side not in halves:
-            raise ValueError(f"DPC half {side!r} is unknown; choose one of {', '.join(halves)}.")
-        return self._select(f"DPC {side} NA {na:g} rgb {rgb}", halves[side] & (self._radius() <= na), rgb)
-
-    def _radius(self) -> npt.NDArray[np.float64]:
-        return np.hypot(self.led_na[:, 0], self.led_na[:, 1])
-
-    def _select(self, description: str, chosen: npt.NDArray[np.bool_], rgb: Rgb) -> LedPattern:
-        return LedPattern(description, tuple((int(i), rgb) for i in np.flatnonzero(chosen)))

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.spot_camera import SpotCamera, SpotLook
 from instrument.files.errors import BenchError, SettingsError
+from recon.base.declare import option
+from recon.base.option_text import size
 from recon.holography import Display
 from recon.holography.pose_fit import PoseProbe
 
@@ -48,15 +50,22 @@ class AlignmentSettings:
         Pictures of probe spots in the last measurement of depth, tilts and brightness.
     """
 
-    reach: float = 72.0
-    depth_um: float = 1000.0
+    reach: float = option(72.0, help="Largest shift to look for, mask pixels.", above=0)
+    depth_um: float = option(1000.0, help="Largest distance to look for.", unit="um", above=0)
     roll_mrad: float = 7.0
     scale: float = 0.003
     tilt_mrad: float = 5.0
     spots: int = 128
-    max_frames: int = 100
-    moves: int = 4
-    division: tuple[int, int] = (3, 5)
+    max_frames: int = option(100, help="Give up rather than take more.", least=1)
+    moves: int = option(4, help="Stage moves at most; 0: nothing moves.", least=0)
+    division: tuple[int, int] = option(
+        (3, 5),
+        help="Of the SLM, measured one by one.",
+        default_words="3x5",
+        flags=("--sections",),
+        metavar="ROWSxCOLUMNS",
+        parse=size,
+    )
     section_pictures: int = 8
     refinements: int = 4
 

@@ -24,6 +24,7 @@ from instrument.bench.bench import Bench
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import BenchError, SettingsError
 from instrument.plan import OFF, Light, Part, Plan, check
+from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
@@ -143,7 +144,7 @@ def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
         When the array does not reach beyond the objective's aperture.
     """
     na, rgb = _illumination_na(array, setup), _rgb(setup)
-    lights = [Light.of(array.dpc_half(side, na, rgb)) for side in SIDES]
+    lights = [Light.of(HalfCircle(side, na).on(array, rgb)) for side in SIDES]
     return Plan(
         label="dpc",
         parts=(
@@ -292,7 +293,8 @@ def _expose(bench: Bench, array: LedArray, setup: DpcSetup) -> AutoExposure:
         bench.scene_off()
         array.off()
         dark = bench.camera.snap()
-        array.set_pattern(array.dpc_half(SIDES[0], _illumination_na(array, setup), _rgb(setup)))
+        first = HalfCircle(SIDES[0], _illumination_na(array, setup))
+        array.set_pattern(first.on(array, _rgb(setup)))
         found = auto_expose(bench.camera, target=_TARGET, hot=hot_pixels(dark.image, dark.full_scale))
     finally:
         array.off()

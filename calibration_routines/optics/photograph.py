@@ -11,7 +11,6 @@ import numpy.typing as npt
 from calibration_routines.errors import CalibrationError, RunEndedError
 from calibration_routines.psf.analysis import DarkModel, channels_first, replace_hot
 from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
-from calibration_routines.psf.psf_quality import block_mean
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, Part, Plan
 from instrument.runs.acquire import acquire
@@ -19,6 +18,7 @@ from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
+from recon.base.blocks import block_mean
 
 
 @dataclass(frozen=True, slots=True)

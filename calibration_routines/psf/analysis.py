@@ -13,12 +13,12 @@ from scipy import fft, ndimage
 from calibration_routines.psf.exposure import hot_pixels
 from calibration_routines.psf.psf_quality import (
     PsfQuality,
-    block_mean,
     measure_psf,
     remove_low_frequencies,
     temporal_noise,
 )
 from calibration_routines.psf.stage_fit import StageFit, judge_points
+from recon.base.blocks import block_mean
 from recon.types import Geometry
 
 Counts = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]

@@ -20,6 +20,8 @@ import numpy.typing as npt
 from scipy.fft import dctn, idctn
 from scipy.stats import theilslopes
 
+from recon.base.blocks import block_mean
+
 
 def remove_low_frequencies(
     image: npt.NDArray[np.floating], order: int = 10
@@ -59,29 +61,6 @@ def remove_low_frequencies(
     low[..., :order, :order] = coefficients[..., :order, :order]
     background = idctn(low, axes=(-2, -1), norm="ortho", workers=-1)
     return np.maximum(values - background, 0.0), background
-
-
-def block_mean(image: npt.NDArray[np.floating], factor: int) -> npt.NDArray[np.float32]:
-    """Average ``factor x factor`` blocks over the last two axes; left-over rows and columns are cut.
-
-    Parameters
-    ----------
-    image : ndarray, (..., height, width)
-    factor : int
-
-    Returns
-    -------
-    ndarray, float32, (..., height // factor, width // factor)
-    """
-    if factor == 1:
-        return np.asarray(image, np.float32)
-    height, width = (n // factor for n in image.shape[-2:])
-    if height == 0 or width == 0:
-        raise ValueError(f"An image of {image.shape[-2:]} pixels cannot be binned by {factor}.")
-    cropped = np.asarray(image[..., : height * factor, : width * factor], np.float32)
-    blocks = cropped.reshape(*image.shape[:-2], height, factor, width, factor)
-    averaged: npt.NDArray[np.float32] = blocks.mean(axis=(-3, -1), dtype=np.float32)
-    return averaged
 
 
 MIN_SNR = 10.0

@@ -24,10 +24,10 @@ from scipy.optimize import least_squares
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
     PsfQuality,
-    block_mean,
     judge_sweep,
     with_finding,
 )
+from recon.base.blocks import block_mean
 from recon.camera.registration import Registration, register
 from recon.types import Geometry
 

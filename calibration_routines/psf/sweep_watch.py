@@ -28,7 +28,6 @@ from calibration_routines.psf.analysis import (
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
     PsfQuality,
-    block_mean,
     judge_next,
     measure_psf,
     with_finding,
@@ -53,6 +52,7 @@ from calibration_routines.psf.sweep_plan import (
 )
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
+from recon.base.blocks import block_mean
 from recon.types import Geometry
 
 Float = npt.NDArray[np.float32]

@@ -14,8 +14,9 @@ from pydantic import Field
 from drivers.device import DriverOptions
 from drivers.simulated.clock import Clock
 from drivers.simulated.surroundings import Surroundings
+from recon.base.blocks import block_sum
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
-from recon.optics.sensor import SensorSpec, bin_sum
+from recon.optics.sensor import SensorSpec
 
 Image = npt.NDArray[np.float32]
 
@@ -143,7 +144,7 @@ class DisplayWorld(Surroundings):
                 light *= np.float32(self.options.light)
                 self._image = (key, light)
             image = self._image[1]
-        return image if binning == 1 else bin_sum(image, binning)
+        return image if binning == 1 else block_sum(image, binning)
 
     def light_key(self) -> tuple[Any, ...]:
         """Return something that changes whenever :meth:`photons_per_s` does."""

@@ -16,9 +16,10 @@ from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.clock import Clock
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
 from drivers.simulated.surroundings import Surroundings
+from recon.base.blocks import block_sum
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.led_microscope import led_image
-from recon.optics.sensor import SensorSpec, bin_sum
+from recon.optics.sensor import SensorSpec
 from recon.optics.spectrum import BANDS
 from recon.types import Geometry
 
@@ -140,7 +141,7 @@ class LedMicroscopeWorld(Surroundings):
                     self._images.pop(next(iter(self._images)))
                 self._images[key] = self._render(sines, levels, weights)
             image = self._images[key]
-        return image if binning == 1 else bin_sum(image, binning)
+        return image if binning == 1 else block_sum(image, binning)
 
     def _render(self, sines: npt.NDArray[np.float64], levels: npt.NDArray[np.float64], weights: Rgb) -> Image:
         sample, total = self.sample, np.zeros((self.options.pixels, self.options.pixels), np.float32)

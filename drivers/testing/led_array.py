@@ -52,27 +52,17 @@ class LedArrayContract(DeviceContract):
         count = len(leds.led_positions_mm)
         for pattern in (
             leds.single(count - 1, (10, 20, 30)),
-            leds.bright_field(0.3),
-            leds.dark_field(0.2),
-            leds.dpc_half("left", 0.5),
+            _inside(leds, 0.3),
+            LedPattern.of_mask("left", leds.led_na[:, 0] < 0, (255, 255, 255)),
             LedPattern("two", ((0, (255, 0, 0)), (count // 2, (0, 0, 255)))),
         ):
             assert leds.set_pattern(pattern) == pattern == leds.pattern
 
     def test_off_is_dark(self, leds: LedArray) -> None:
-        leds.set_pattern(leds.bright_field(0.5))
+        leds.set_pattern(_inside(leds, 0.5))
         leds.off()
         assert leds.pattern.is_dark
         leds.off()
-
-    def test_dpc_halves_share_no_led_and_complete_each_other(self, leds: LedArray) -> None:
-        left, right = ({index for index, _ in leds.dpc_half(side, 0.6).levels} for side in ("left", "right"))
-        assert left
-        assert right
-        assert not left & right
-        inside = {index for index, _ in leds.bright_field(0.6).levels}
-        on_the_border = {int(i) for i in np.flatnonzero(leds.led_na[:, 0] == 0)}
-        assert left | right == inside - on_the_border
 
     @pytest.mark.parametrize("rgb", [(256, 0, 0), (0, -1, 0)])
     def test_wrong_levels_are_refused_and_the_pattern_stays(
@@ -89,3 +79,7 @@ class LedArrayContract(DeviceContract):
             with pytest.raises(LimitError, match=f"LED {index}"):
                 leds.set_pattern(LedPattern("wrong", ((index, (1, 1, 1)),)))
         assert leds.pattern == shown
+
+
+def _inside(leds: LedArray, na: float) -> LedPattern:
+    return LedPattern.of_mask(f"inside {na:g}", np.hypot(*leds.led_na.T) <= na, (255, 255, 255))

@@ -26,13 +26,13 @@ from gui.theme import colours
 from gui.widgets.dialogues import elided
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import plot_widget, restyle
+from instrument.plan.patterns import shape_buttons
+from recon.base.declare import with_overrides
 
 _LOOK_MS = 300
 _REST_MS = 150
 """Rest of the brightness before it is sent: a slider that is pulled must not fill a queue."""
 _COLOURS: dict[str, Rgb] = {"white": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
-_DPC = ("left", "right", "top", "bottom")
-_WITHOUT_APERTURE = ("off", "source")
 _DIMMEST = 70
 """Grey level of the faintest lit LED as drawn, so that it is seen to be lit."""
 
@@ -89,19 +89,17 @@ class LedPanel(Panel):
         self.pattern_buttons: dict[str, QPushButton] = {}
         grid = QGridLayout()
         grid.setSpacing(4)
-        for number, (name, words, tip) in enumerate(
-            [
-                ("bright", "Bright field", "All LEDs inside the numerical aperture"),
-                ("dark", "Dark field", "All LEDs outside the numerical aperture"),
-                ("source", "Source", "The LEDs of the point source ([source] in bench.toml)"),
-                ("off", "Off", "Every LED dark"),
-                *((side, f"DPC {side}", f"The {side} half of the bright field") for side in _DPC),
-            ]
-        ):
+        self._shapes = shape_buttons()
+        tips = {
+            "Off": "Every LED dark",
+            "Source": "The LEDs of the point source ([source] in bench.toml)",
+            **{words: shape.help for words, shape in self._shapes.items()},
+        }
+        for number, (words, tip) in enumerate(tips.items()):
             button = QPushButton(words)
             button.setToolTip(tip)
-            button.clicked.connect(lambda _=False, name=name: self.show_pattern(name))
-            self.pattern_buttons[name] = button
+            button.clicked.connect(lambda _=False, words=words: self.show_pattern(words))
+            self.pattern_buttons[words] = button
             grid.addWidget(button, number // 4, number % 4)
         top = QHBoxLayout()
         top.addWidget(self.colour)
@@ -209,26 +207,24 @@ class LedPanel(Panel):
 
     # Lighting ------------------------------------------------------------------------------------
     def show_pattern(self, name: str) -> None:
-        """Show a pattern: ``"bright"``, ``"dark"``, ``"source"``, ``"off"`` or a DPC half."""
+        """Show a pattern by its button's words: ``"Off"``, ``"Source"``, or one of ``shape_buttons``."""
         leds, bench = self.session.bench.led_array, self.session.bench
         if leds is None:
             return
-        if name not in _WITHOUT_APERTURE and not self.na.submit():  # not with the aperture of before
-            return
-        na, rgb = self.na.value or 0.25, self.rgb
+        shape, rgb = self._shapes.get(name), self.rgb
+        if shape is not None and hasattr(shape, "na"):
+            if not self.na.submit():  # not with the aperture of before
+                return
+            shape = with_overrides(shape, {"na": self.na.value or shape.na})
         self._rest.stop()  # the brightness that was pulled goes with the pattern
 
         def work(_: object) -> None:
-            if name == "off":
-                leds.off()
-            elif name == "source":
+            if shape is not None:
+                leds.set_pattern(shape.on(leds, rgb))
+            elif name == "Source":
                 bench.source_on()
-            elif name == "bright":
-                leds.set_pattern(leds.bright_field(na, rgb))
-            elif name == "dark":
-                leds.set_pattern(leds.dark_field(na, rgb))
             else:
-                leds.set_pattern(leds.dpc_half(name, na, rgb))
+                leds.off()
 
         self._start(f"LED array: {name}", work)
 

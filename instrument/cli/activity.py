@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from instrument.cli.app import App, examples, saying_what_is_left
-from instrument.cli.reconstruct_options import BinningOption, CalibrationOption, DistanceOption, PsfOption
+from instrument.cli.options import Only
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
+from instrument.reconstruction.inputs import InputOptions, SourceOptions
 from instrument.reconstruction.request import Settings
 from instrument.reconstruction.video_output import VideoPictures
-from instrument.reconstruction.words import parse_binning
 from instrument.runs.layout import STATE
+from recon.base.declare import option
+from recon.reconstruction.options import ReconstructionOptions
 
 app = App()
 
 WARM_ITERATIONS = 6
 """Of a recording reconstructed on the way: with a video's usual 4, a quarter of simulated neurons is lost."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActivityFiles:
+    """Where results go."""
+
+    out: Path = option(
+        Path("activity"), help="Made by this.", metavar="FOLDER", flags=("--out", "-o"), group="Files"
+    )
+    force: bool = option(False, help="Replace what is in the folder.", group="Files")
 
 
 @app.command(
@@ -39,41 +52,24 @@ def activity(
             help="A video of reconstruct --video, or a recording (then with --calibration).",
         ),
     ],
-    psf: PsfOption = None,
-    calibration: CalibrationOption = None,
-    z_mm: DistanceOption = None,
-    binning: BinningOption = "auto",
-    window_s: Annotated[
-        float,
-        typer.Option("--window", min=0.0, metavar="S", help="Of the sliding baseline, seconds."),
-    ] = 30.0,
-    percentile: Annotated[
-        float, typer.Option("--percentile", min=0.0, max=100.0, help="Of a window that is the baseline.")
-    ] = 20.0,
-    align: Annotated[bool, typer.Option("--align", help="Move frames back to one place first.")] = False,
-    least_correlation: Annotated[
-        float,
-        typer.Option("--correlation", min=0.0, max=1.0, help="Local correlation from which a region begins."),
-    ] = 0.5,
-    radius_px: Annotated[
-        float, typer.Option("--radius", min=1.0, metavar="PX", help="As far as a region reaches.")
-    ] = 8.0,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FOLDER", help="Made by this.")] = Path(
-        "activity"
-    ),
-    force: Annotated[bool, typer.Option("--force", help="Replace what is in the folder.")] = False,
+    settings: ActivitySettings,
+    files: ActivityFiles,
+    source: Annotated[SourceOptions, Only("psf", "calibration")],
+    inputs: Annotated[InputOptions, Only("binning")],
+    scene: Annotated[ReconstructionOptions, Only("z_um")],
 ) -> None:
     """Find what is active in a video: baseline, dF/F, regions, traces, and a film with activity in red.
 
     The baseline of a pixel is the 20th percentile of its last and next seconds; regions are where neighbours
     change together.
     """
-    if (out / "activity.json").exists() and not force:
+    out = files.out
+    if (out / "activity.json").exists() and not files.force:
         raise FileError(out, "holds results already.", "Choose another folder with --out, or --force.")
     if out.exists() and not out.is_dir():
         raise FileError(out, "is no folder.")
     with saying_what_is_left(out):
-        pictures = _video(video, psf, calibration, z_mm, binning, out, force)
+        pictures = _video(video, source, inputs, scene, files)
         warm = pictures.attributes.get("diffuserbench", {}).get("warm_iterations")
         if warm is not None and warm < WARM_ITERATIONS:
             typer.echo(
@@ -81,20 +77,14 @@ def activity(
                 f"some of what is active is missed: reconstruct it with --warm {WARM_ITERATIONS}.",
                 err=True,
             )
-        settings = ActivitySettings(
-            window_s=window_s,
-            percentile=percentile,
-            align=align,
-            least_correlation=least_correlation,
-            radius_px=radius_px,
-        )
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         found = find_activity(pictures, settings, free_bytes=free)
         typer.echo(f"{'Frames':<12}{len(found.indices)} of {pictures.path}")
         typer.echo(
-            f"{'Motion':<12}up to {found.motion.largest_px:.2f} pixels" + (", taken out" if align else "")
+            f"{'Motion':<12}up to {found.motion.largest_px:.2f} pixels"
+            + (", taken out" if settings.align else "")
         )
-        if not found.motion.is_still and not align:
+        if not found.motion.is_still and not settings.align:
             typer.echo(
                 "Warning: frames move by half a pixel or more: edges look active. Try --align.", err=True
             )
@@ -115,18 +105,16 @@ def _fading(share: float) -> str:
 
 def _video(
     path: Path,
-    psf: Path | None,
-    calibration: Path | None,
-    z_mm: float | None,
-    binning: str,
-    out: Path,
-    force: bool,
+    source: SourceOptions,
+    inputs: InputOptions,
+    scene: ReconstructionOptions,
+    files: ActivityFiles,
 ) -> VideoPictures:
     """Return the video that ``path`` is, or reconstruct the recording that it is."""
     if not path.exists():
         raise FileError(path, "does not exist; a video of 'reconstruct --video' or a run is expected.")
     if is_zarr_name(path):
-        if psf is not None or calibration is not None:
+        if source != SourceOptions():
             raise BenchError("--psf and --calibration are for recordings; this is a reconstructed video.")
         return opened(path)
     if not (path / STATE).exists():
@@ -134,17 +122,17 @@ def _video(
     from instrument.cli.video import reconstruct_to_video
     from instrument.reconstruction.video import VideoRequest
 
-    out.mkdir(parents=True, exist_ok=True)
+    files.out.mkdir(parents=True, exist_ok=True)
     request = VideoRequest(
         run=path,
-        out=out / "video.ome.zarr",
-        psf=psf,
-        calibration=calibration,
-        z_um=None if z_mm is None else 1e3 * z_mm,
-        settings=Settings(binning=parse_binning(binning)),
+        out=files.out / "video.ome.zarr",
+        psf=source.psf,
+        calibration=source.calibration,
+        z_um=scene.z_um,
+        settings=Settings(binning=inputs.binning),
         warm_iterations=WARM_ITERATIONS,
     )
-    reconstruct_to_video(request, workers=None, scheduler=None, force=force)
+    reconstruct_to_video(request, workers=None, scheduler=None, force=files.force)
     return opened(request.out)
 
 

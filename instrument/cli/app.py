@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from instrument.cli.options import GroupedCommand, flat
+from instrument.files.errors import FileError
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
@@ -110,6 +111,18 @@ def naming_as_is() -> Iterator[None]:
         raise OperatorNeededError(
             f"{error} Or, where the light already is as it must be, add --as-is."
         ) from None
+
+
+def require_new(file: Path, *, overwrite: bool) -> None:
+    """Refuse to write over a file.
+
+    Raises
+    ------
+    FileError
+        When it exists, unless it may be overwritten.
+    """
+    if file.exists() and not overwrite:
+        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
 
 
 @contextmanager

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.etendue import parse_size
+from instrument.cli.options import Given, Only
 from instrument.cli.progress import progress_bar
-from instrument.cli.reconstruct_options import (
-    BinningOption,
-    CropOption,
-    DarkOption,
-    PsfOption,
-)
 from instrument.files.errors import BenchError
-from instrument.reconstruction.words import parse_binning, parse_dark
+from instrument.reconstruction.inputs import InputOptions, SourceOptions
+from recon.base.declare import option
+from recon.base.option_text import size as size_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from instrument.evaluation.chart_data import ChartData
     from instrument.reconstruction.job import Job
     from recon.evaluation.scored import Named, Point, Problem
@@ -31,8 +27,121 @@ app = App()
 
 _LEAST_S = 1.0
 """For settings, where photographs took all of the budget: so that each call comes further."""
-_OWN = "--calibration (or --psf) and --image"
-_COMPARED = "--calibrations with --calibration and --image"
+
+
+class _Subject(NamedTuple):
+    """What is charted: as options are declared to apply to it, and as people ask for it."""
+
+    word: str
+    title: str
+    of_photographs: tuple[str, ...] = ()
+
+
+_SCENE = _Subject("scene", "--scene")
+_OWN = _Subject("photograph", "--calibration (or --psf) and --image", ("picture", "volume"))
+_COMPARED = _Subject(
+    "comparison of calibrations", "--calibrations with --calibration and --image", ("volume",)
+)
+_SIMULATED = _Subject("simulated calibration", "--calibrations")
+_HOLOGRAM = _Subject("hologram", "--hologram")
+_HOLOGRAMS, _PHOTOGRAPHS = (_HOLOGRAM.word,), (_OWN.word, _COMPARED.word)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChartOptions:
+    """What is charted, and for how long."""
+
+    scene: str | None = option(
+        None,
+        help="A simulated scene with ground truth: dense-picture, sparse-picture, beads, dense-volume, "
+        "microscope.",
+        metavar="NAME",
+        group="What to chart",
+    )
+    calibration: tuple[Path, ...] = option(
+        (),
+        help="Your calibration; with --volume PSF images of several depths will do. With --calibrations: "
+        "one or more, to be compared.",
+        metavar="FOLDER",
+        flags=("--calibration", "-c"),
+        group="What to chart",
+    )
+    calibrations: bool = option(
+        False,
+        help="Calibrations: your own (--calibration, --image), whole and thinned; else of a simulated "
+        "microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
+        group="What to chart",
+    )
+    hologram: tuple[str, ...] = option(
+        (),
+        help="A picture to be shown by the bench's SLM, once for each plane: a file, or portrait, relief, "
+        "head, leaves, clouds.",
+        metavar="TARGET",
+        group="What to chart",
+    )
+    volume: bool = option(
+        False,
+        help="With --image: a volume of all calibrated depths.",
+        applies=_PHOTOGRAPHS,
+        group="What to chart",
+    )
+    z_um: tuple[float, ...] = option(
+        (),
+        help="Distance of a flat scene, of several depths; of each hologram's plane, behind the focal plane.",
+        unit="um",
+        shown_unit="mm",
+        shown_factor=1000.0,
+        flags=("--z-mm",),
+        applies=(*_PHOTOGRAPHS, *_HOLOGRAMS),
+        group="What to chart",
+    )
+    expansion: tuple[int, ...] = option(
+        (),
+        help="Étendue expansions; repeatable.",
+        default_words="4, 16 and the bench's",
+        flags=("--expansion", "-q"),
+        applies=_HOLOGRAMS,
+        group="Holograms",
+    )
+    frames: tuple[int, ...] = option(
+        (1, 2, 3),
+        help="Time-multiplexed frames; repeatable.",
+        default_words="1, 2, 3",
+        least=1,
+        applies=_HOLOGRAMS,
+        group="Holograms",
+    )
+    slm: tuple[int, int] | None = option(
+        None,
+        help="Other SLM pixels than the bench's: few, for a quick chart.",
+        metavar="HxW",
+        parse=size_of,
+        applies=_HOLOGRAMS,
+        group="Holograms",
+    )
+    size: int | None = option(
+        None,
+        help="Pixels of the side of a scene (default 48) or of the microscope's sensor (about; 90).",
+        least=16,
+        applies=(_SCENE.word, _SIMULATED.word),
+        group="Simulated scenes",
+    )
+    seed: int = option(0, help="Of the scene.", least=0, group="Simulated scenes")
+    budget_s: float = option(
+        300.0,
+        help="Time for all settings together.",
+        unit="s",
+        least=1,
+        flags=("--budget",),
+        group="Time and files",
+    )
+    out: Path = option(
+        Path("chart"),
+        help="For chart.png, .html, .csv, .json.",
+        metavar="FOLDER",
+        flags=("--out", "-o"),
+        group="Time and files",
+    )
 
 
 @app.command(
@@ -49,111 +158,11 @@ _COMPARED = "--calibrations with --calibration and --image"
     )
 )
 def chart(
-    scene: Annotated[
-        str | None,
-        typer.Option(
-            "--scene",
-            metavar="NAME",
-            help="A simulated scene with ground truth: dense-picture, sparse-picture, beads, dense-volume, "
-            "microscope.",
-            show_default=False,
-        ),
-    ] = None,
-    calibration: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--calibration",
-            "-c",
-            metavar="FOLDER",
-            help="Your calibration; with --volume PSF images of several depths will do. With --calibrations: "
-            "one or more, to be compared.",
-            show_default=False,
-        ),
-    ] = None,
-    psf: PsfOption = None,
-    image: Annotated[
-        Path | None,
-        typer.Option("--image", "-i", metavar="FILE", help="Your photograph.", show_default=False),
-    ] = None,
-    dark: DarkOption = "auto",
-    crop: CropOption = None,
-    binning: BinningOption = "auto",
-    hologram: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--hologram",
-            metavar="TARGET",
-            help="A picture to be shown by the bench's SLM, once for each plane: a file, or portrait, "
-            "relief, head, leaves, clouds.",
-            show_default=False,
-        ),
-    ] = None,
-    calibrations: Annotated[
-        bool,
-        typer.Option(
-            "--calibrations",
-            help="Calibrations: your own (--calibration, --image), whole and thinned; else of a simulated "
-            "microscope: one PSF, axial, 3 x 3, 5 x 5, blind from beads.",
-        ),
-    ] = False,
-    z_mm: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--z-mm",
-            metavar="MM",
-            help="Distance of a flat scene, of several depths; of each hologram's plane.",
-            show_default=False,
-        ),
-    ] = None,
-    volume: Annotated[
-        bool, typer.Option("--volume", help="With --image: a volume of all calibrated depths.")
-    ] = False,
-    expansion: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--expansion",
-            "-q",
-            help="With --hologram: étendue expansions. Default: 4, 16 and the bench's.",
-            show_default=False,
-        ),
-    ] = None,
-    frames: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--frames",
-            min=1,
-            help="With --hologram: time-multiplexed frames. Default: 1, 2, 3.",
-            show_default=False,
-        ),
-    ] = None,
-    slm: Annotated[
-        str | None,
-        typer.Option(
-            "--slm",
-            metavar="HxW",
-            help="With --hologram: other SLM pixels than the bench's: few, for a quick chart.",
-            show_default=False,
-        ),
-    ] = None,
+    options: ChartOptions,
+    source: Annotated[SourceOptions, Only("psf", "image")],
+    inputs: Annotated[InputOptions, Only("dark", "crop", "binning")],
+    given: Given,
     bench: BenchOption = None,
-    size: Annotated[
-        int | None,
-        typer.Option(
-            "--size",
-            min=16,
-            metavar="N",
-            help="Pixels of the side of a scene (default 48) or of the microscope's sensor (about; 90).",
-            show_default=False,
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the scene.")] = 0,
-    budget_s: Annotated[
-        float, typer.Option("--budget", min=1.0, metavar="S", help="Time for all settings together, seconds.")
-    ] = 300.0,
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", metavar="FOLDER", help="For chart.png, .html, .csv, .json."),
-    ] = Path("chart"),
 ) -> None:
     """Chart what every setting costs against how good it is, each in a process of its own, quick ones first.
 
@@ -163,78 +172,22 @@ def chart(
     expansion, frames and iterations. Calibrations (--calibrations): the number of photographs against the
     error of what is reconstructed with them. Run the same command again to go on where it stopped.
     """
-    subject = _only(
-        calibrations and bool(calibration or image),
-        {
-            "--scene": scene is not None,
-            _OWN: any(path is not None for path in (calibration, psf, image)),
-            "--hologram": bool(hologram),
-            "--calibrations": calibrations,
-        },
-    )
-    _refuse(
-        subject,
-        {
-            "--volume": (volume, (_OWN, _COMPARED)),
-            "--dark": (dark != "auto", (_OWN, _COMPARED)),
-            "--crop": (crop is not None, (_OWN, _COMPARED)),
-            "--bin": (binning != "auto", (_OWN, _COMPARED)),
-            "--psf": (psf is not None, (_OWN,)),
-            "--z-mm": (bool(z_mm), (_OWN, _COMPARED, "--hologram")),
-            "--expansion": (bool(expansion), ("--hologram",)),
-            "--frames": (bool(frames), ("--hologram",)),
-            "--slm": (slm is not None, ("--hologram",)),
-            "--size": (size is not None, ("--scene", "--calibrations")),
-            "--bench": (bench is not None, ("--hologram",)),
-        },
-    )
+    subject = _subject(given)
+    given.refuse(subject.title, subject.word, *subject.of_photographs)
+    if bench is not None and subject is not _HOLOGRAM:
+        raise BenchError(f"--bench is for holograms; it does not apply with {subject.title}.")
     from instrument.evaluation.chart_figure import write_charts
-    from instrument.evaluation.chart_problems import (
-        problem_of_calibrations,
-        problem_of_job,
-        problem_of_pictures,
-        problem_of_scene,
-    )
 
-    problem: Problem
-    if scene is not None:
-        problem, about = problem_of_scene(scene, size or 48, seed)
-    elif hologram:
-        problem, about = problem_of_pictures(
-            load_and_say(bench),
-            hologram,
-            z_mm or (),
-            expansion or (),
-            frames or (1, 2, 3),
-            None if slm is None else parse_size(slm),
-        )
-    elif calibrations and subject != _COMPARED:
-        began = time.monotonic()
-        problem, about = _calibrations(size or 90, out, budget_s)
-        budget_s = max(budget_s - (time.monotonic() - began), _LEAST_S)
-    else:
-        if len(z_mm or ()) > 1 or (z_mm and volume):
-            raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
-        z_um = 1e3 * z_mm[0] if z_mm else None
-        compared = subject == _COMPARED
-        jobs = {
-            folder: _job(folder, psf, image, dark, crop, binning, volume=volume)
-            for folder in _folders(calibration, compared=compared)
-        }
-        prepared = list(jobs.values())
-        prepared = prepared or [_job(None, psf, image, dark, crop, binning, volume=volume)]
-        for job in prepared:
-            for name, text in job.notes.items():
-                typer.echo(f"{name:<12}{text}")
-        if compared:
-            problem, about = problem_of_calibrations(jobs, z_um, volume=volume)
-        else:
-            problem, about = problem_of_job(prepared[0], z_um, volume=volume)
+    out = options.out
+    began = time.monotonic()
+    problem, about = _problem(subject, options, source, inputs, bench)
+    # Photographs of a simulated microscope are taken out of the budget.
+    spent_s = time.monotonic() - began if subject is _SIMULATED else 0.0
     if about.get("simulated"):
         typer.echo("SIMULATED   what is charted, or its input, comes from a simulation")
     out.mkdir(parents=True, exist_ok=True)
     record = out / "chart.json"
-    data = _made(problem, about, record, budget_s)
+    data = _made(problem, about, record, max(options.budget_s - spent_s, _LEAST_S))
     if not data.points:
         if not data.failed:
             raise BenchError("There was no time for any setting: give a longer --budget.")
@@ -244,60 +197,96 @@ def chart(
     typer.echo(f"{'Wrote':<12}{', '.join(map(str, (record, *files)))}")
 
 
-def _folders(given: list[Path] | None, *, compared: bool) -> list[Path]:
-    folders = given or []
-    if compared and not folders:
-        raise BenchError("--calibrations with --image compares your own: give --calibration, once or more.")
-    if not compared and len(folders) > 1:
-        raise BenchError("Several --calibration are compared with --calibrations; else give one.")
-    if repeated := [str(folder) for folder in folders if folders.count(folder) > 1]:
-        raise BenchError(f"--calibration {repeated[0]} is given twice.")
-    return folders
+def _problem(
+    subject: _Subject,
+    options: ChartOptions,
+    source: SourceOptions,
+    inputs: InputOptions,
+    bench: Path | None,
+) -> tuple[Problem, dict[str, Any]]:
+    """Return what is charted, and what to say of it."""
+    from instrument.evaluation.chart_problems import (
+        problem_of_calibrations,
+        problem_of_job,
+        problem_of_pictures,
+        problem_of_scene,
+    )
 
-
-def _only(compared: bool, given: dict[str, bool]) -> str:
-    if compared and not given["--scene"] and not given["--hologram"]:
-        return _COMPARED
-    chosen = [name for name, is_given in given.items() if is_given]
-    if len(chosen) != 1:
-        found = f"; {' and '.join(chosen)} exclude each other" if chosen else ""
-        raise BenchError(
-            f"Give one of --scene NAME, --hologram TARGET, --calibrations, or your own {_OWN}{found}."
+    if subject is _SCENE:
+        assert options.scene is not None
+        return problem_of_scene(options.scene, options.size or 48, options.seed)
+    z_mm = [1e-3 * z_um for z_um in options.z_um]
+    if subject is _HOLOGRAM:
+        return problem_of_pictures(
+            load_and_say(bench), options.hologram, z_mm, options.expansion, options.frames, options.slm
         )
-    return chosen[0]
+    if subject is _SIMULATED:
+        return _calibrations(options.size or 90, options.out, options.budget_s)
+    if len(z_mm) > 1 or (z_mm and options.volume):
+        raise BenchError("--z-mm is the distance of a flat scene: give it once, and without --volume.")
+    z_um = options.z_um[0] if options.z_um else None
+    compared = subject is _COMPARED
+    jobs = {
+        folder: _job(folder, source, inputs, volume=options.volume)
+        for folder in _folders(options.calibration, compared=compared)
+    }
+    prepared = list(jobs.values()) or [_job(None, source, inputs, volume=options.volume)]
+    for job in prepared:
+        for name, text in job.notes.items():
+            typer.echo(f"{name:<12}{text}")
+    if compared:
+        return problem_of_calibrations(jobs, z_um, volume=options.volume)
+    return problem_of_job(prepared[0], z_um, volume=options.volume)
 
 
-def _refuse(subject: str, options: dict[str, tuple[bool, tuple[str, ...]]]) -> None:
-    for name, (is_given, subjects) in options.items():
-        if is_given and subject not in subjects:
-            raise BenchError(f"{name} goes with {' or '.join(subjects)}, not with {subject}.")
+def _folders(given: Sequence[Path], *, compared: bool) -> Sequence[Path]:
+    if compared and not given:
+        raise BenchError("--calibrations with --image compares your own: give --calibration, once or more.")
+    if not compared and len(given) > 1:
+        raise BenchError("Several --calibration are compared with --calibrations; else give one.")
+    if repeated := [str(folder) for folder in given if given.count(folder) > 1]:
+        raise BenchError(f"--calibration {repeated[0]} is given twice.")
+    return given
 
 
-def _job(
-    calibration: Path | None,
-    psf: Path | None,
-    image: Path | None,
-    dark: str,
-    crop: str | None,
-    binning: str,
-    *,
-    volume: bool,
-) -> Job:
-    if image is None or (calibration is None) == (psf is None):
+def _subject(given: Given) -> _Subject:
+    """Return what is to be charted.
+
+    Raises
+    ------
+    BenchError
+        When none or more than one is given.
+    """
+    own = any(name in given for name in ("calibration", "psf", "image"))
+    found = [s for s, name in ((_SCENE, "scene"), (_HOLOGRAM, "hologram")) if name in given]
+    if "calibrations" in given and ("calibration" in given or "image" in given):
+        found.append(_COMPARED)
+    elif "calibrations" in given:
+        found += [_OWN, _SIMULATED] if own else [_SIMULATED]
+    elif own:
+        found.append(_OWN)
+    if len(found) != 1:
+        both = f"; {' and '.join(s.title for s in found)} exclude each other" if found else ""
+        raise BenchError(
+            f"Give one of --scene NAME, --hologram TARGET, --calibrations, or your own {_OWN.title}{both}."
+        )
+    return found[0]
+
+
+def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, volume: bool) -> Job:
+    image, psf = source.image, source.psf
+    if image is None or (folder is None) == (psf is None):
         raise BenchError("Your own chart needs --image FILE, and either --calibration FOLDER or --psf FILE.")
     if psf is not None and volume:
         raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
     from instrument.reconstruction.job import job_from_calibration, job_from_files
-    from instrument.reconstruction.preparation import Crop
     from instrument.reconstruction.volume_job import volume_job
 
-    window = None if crop is None else Crop.parse(crop)
-    level, factor = parse_dark(dark), parse_binning(binning)
     if psf is not None:
-        return job_from_files(psf, image, dark=level, crop=window, binning=factor)
-    assert calibration is not None
+        return job_from_files(psf, image, dark=inputs.dark, crop=inputs.crop, binning=inputs.binning)
+    assert folder is not None
     prepared = volume_job if volume else job_from_calibration
-    return prepared(calibration, image, dark=level, crop=window, binning=factor)
+    return prepared(folder, image, dark=inputs.dark, crop=inputs.crop, binning=inputs.binning)
 
 
 def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:

@@ -52,8 +52,8 @@ class Given:
         """Return the flags of the options among ``names`` (none: of all) that were given."""
         return [flag for name, flag in self.typed.items() if not names or name in names]
 
-    def refuse(self, subject: str, title: str) -> None:
-        """Refuse what was given and does not apply to a subject, as the options declare it.
+    def refuse(self, title: str, *subjects: str) -> None:
+        """Refuse what was given and applies to none of these subjects, as the options declare it.
 
         Raises
         ------
@@ -61,9 +61,9 @@ class Given:
             Which options, with the title ("--video"), and what they are for.
         """
         applies = {name: o.declaration.applies for name, o in self.options.items()}
-        wrong = [name for name, subjects in applies.items() if subjects and subject not in subjects]
+        wrong = [name for name, about in applies.items() if about and not set(about) & set(subjects)]
         if wrong:
-            what = "; ".join(f"{self.typed[name]} (for {' or '.join(applies[name])})" for name in wrong)
+            what = "; ".join(f"{self.typed[name]} (for a {' or a '.join(applies[name])})" for name in wrong)
             raise BenchError(f"With {title} these do not apply: {what}. Leave them out.")
 
 
@@ -135,6 +135,7 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
     run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.declared = declared  # type: ignore[attr-defined]
+    run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
     return run
 
 
@@ -163,7 +164,8 @@ def _parameter(key: str, o: Option) -> inspect.Parameter:
     elif o.item is not None:
         kind = list[str]
     else:
-        several = [k for k in o.kinds if typing.get_origin(k) is tuple and o.declaration.parse is None]
+        in_one = o.declaration.parse is not None or "," in o.declaration.metavar
+        several = [k for k in o.kinds if typing.get_origin(k) is tuple and not in_one]
         kind = tuple[tuple(str for _ in typing.get_args(several[0]))] if several else kind  # type: ignore[misc]
     annotation = typing.Annotated[kind | None, typer.Option(*o.flags, show_default=False, metavar=metavar(o))]
     return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

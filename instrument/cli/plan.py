@@ -13,10 +13,11 @@ from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import duration, size
-from instrument.plan import BenchAbilities, Plan, check, estimate
+from instrument.plan import BenchAbilities, Light, Plan, check, estimate
 from instrument.plan.drawing import draw_path
 from instrument.plan.file import load_plan, save_plan
-from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
+from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
+from instrument.plan.patterns import PATTERNS, led_shape, pattern_help, shape_from_text
 from instrument.runs.acquire import abilities_of
 
 app = App("Look at a plan before anything moves, or write one to start from.")
@@ -63,6 +64,7 @@ def new(
     epilog=examples(
         "diffuserbench plan illumination --lattice 3 --exposure-ms 20 lit.toml",
         'diffuserbench plan illumination --groups "0-3;4-7;8,9" --exposure-ms 20 lit.toml',
+        'diffuserbench plan illumination --pattern "half na=0.3" --exposure-ms 20 lit.toml',
     )
 )
 def illumination(
@@ -82,7 +84,17 @@ def illumination(
             "--lattice",
             metavar="N",
             min=1,
-            help="The array's LEDs in N x N groups by place.",
+            help="The array's LEDs in N x N groups by place; short for --pattern 'grid side=N'.",
+            show_default=False,
+        ),
+    ] = None,
+    pattern: Annotated[
+        str | None,
+        typer.Option(
+            "--pattern",
+            metavar="NAME",
+            help=f"A named pattern and all that belong to it: {', '.join(PATTERNS)}. With options: "
+            "'half na=0.3'. diffuserbench plan patterns lists them.",
             show_default=False,
         ),
     ] = None,
@@ -95,24 +107,34 @@ def illumination(
     Run it twice, with the scene and with a plain white sheet in its place; then
     diffuserbench reconstruct SCENE --patterned SHEET solves all frames together.
     """
-    if (groups is None) == (lattice is None):
-        raise BenchError("Give the patterns either as --groups or as --lattice N (one of them).")
+    if sum(given is not None for given in (groups, lattice, pattern)) != 1:
+        raise BenchError("Give the patterns either as --groups, --lattice N or --pattern NAME (one of them).")
     if file.suffix.lower() not in (".toml", ".json"):
         raise FileError(file, "a plan's name ends in .toml or .json.")
     if file.exists():
         raise FileError(file, "exists already and was left as it is.")
     if groups is not None:
-        chosen = groups_from_text(groups)
+        lights = group_lights(groups_from_text(groups), level)
     else:
+        shape = led_shape(*shape_from_text(pattern or f"grid side={lattice}"))
         with open_and_say(bench) as opened:
             if opened.led_array is None:
                 raise BenchError(
-                    "--lattice needs the bench's LED array, and this bench has none. Give --groups."
+                    "Patterns by place need the bench's LED array, and this bench has none. Give --groups."
                 )
-            chosen = lattice_groups(opened.led_array.led_positions_mm, lattice or 1)
-    plan = illumination_plan(chosen, exposure_ms=exposure_ms, level=level, average=average)
-    save_plan(plan, file)
-    typer.echo(f"Wrote {file}: {len(chosen)} patterns. Look at it with: diffuserbench plan show {file}")
+            rgb = None if level == 255 else (level, level, level)
+            lights = [Light.named(one, rgb) for one in shape.series(opened.led_array)]
+    save_plan(illumination_plan(lights, exposure_ms=exposure_ms, average=average), file)
+    typer.echo(f"Wrote {file}: {len(lights)} patterns. Look at it with: diffuserbench plan show {file}")
+
+
+@app.command(epilog=examples("diffuserbench plan patterns"))
+def patterns() -> None:
+    """List the LED patterns that a plan can name, with their options.
+
+    In a plan: light = "half side=left na=0.3", or { kind = "half", side = "left", rgb = [0, 255, 0] }.
+    """
+    typer.echo(pattern_help())
 
 
 def _describe(plan: Plan, abilities: BenchAbilities) -> None:

@@ -35,7 +35,7 @@ from recon.holography import Display, HologramOptions
 app = App()
 
 PICTURES = (".png", ".tif", ".tiff", ".npy", ".bmp")
-_PATTERN, _SHOWN, _PHOTOGRAPHED = ("a hologram",), "Shown on the SLM", "Photographed, with --capture"
+_PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photographed, with --capture"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class ShowOptions:
         help="Where its picture goes (PNG).",
         default_words="summary.png in its folder",
         flags=("--picture", "-p"),
-        applies=("a run",),
+        applies=("run",),
         group="Of a run",
     )
 
@@ -135,10 +135,10 @@ def show(
     the field of view, low-passed as an eye would, and compared with --target: PSNR and SSIM.
     """
     if len(what) == 1 and what[0].suffix.lower() not in PICTURES:
-        given.refuse("a run", "a run")
+        given.refuse("a run", "run")
         _show_run(what[0], options.picture)
         return
-    given.refuse("a hologram", "a hologram")
+    given.refuse("a hologram", "hologram")
     options.check(len(what))
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None

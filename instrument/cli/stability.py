@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
-import enum
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError, FileError
+from recon.base.declare import option
 
 app = App()
 
 
-class SizeName(enum.StrEnum):
-    """The sizes of a map."""
+@dataclass(frozen=True, kw_only=True)
+class StabilityOptions:
+    """Which maps, how large, and where they are kept."""
 
-    QUICK = "quick"
-    FULL = "full"
+    method: tuple[str, ...] = option(
+        (),
+        help="Only these methods; repeatable.",
+        default_words="each map's",
+        flags=("--method", "-m"),
+        metavar="NAME",
+    )
+    size: Literal["quick", "full"] = option("quick", help="quick: coarse, small pictures; full: hours.")
+    out: Path = option(
+        Path("stability"),
+        help="Where maps are kept and gone on with.",
+        metavar="FOLDER",
+        flags=("--out", "-o"),
+    )
+    list_maps: bool = option(False, help="Only list maps and their methods.", flags=("--list",))
+    redraw: bool = option(False, help="Only draw what stability.json holds.")
+    shipped: bool = option(False, help="With --redraw: the maps that come with the program.")
 
 
 @app.command(
@@ -33,30 +50,10 @@ class SizeName(enum.StrEnum):
     )
 )
 def stability(
+    options: StabilityOptions,
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Maps; default all.", show_default=False)
     ] = None,
-    method: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method",
-            "-m",
-            metavar="NAME",
-            help="Only these methods; repeatable. Default: each map's.",
-            show_default=False,
-        ),
-    ] = None,
-    size: Annotated[
-        SizeName, typer.Option("--size", help="quick: coarse, small pictures; full: hours.")
-    ] = SizeName.QUICK,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where maps are kept and gone on with.")
-    ] = Path("stability"),
-    list_maps: Annotated[bool, typer.Option("--list", help="Only list maps and their methods.")] = False,
-    redraw: Annotated[bool, typer.Option("--redraw", help="Only draw what stability.json holds.")] = False,
-    shipped: Annotated[
-        bool, typer.Option("--shipped", help="With --redraw: the maps that come with the program.")
-    ] = False,
 ) -> None:
     """Map where methods fail: the error against pairs of stresses, with the failure boundary drawn.
 
@@ -67,45 +64,46 @@ def stability(
     from recon.evaluation.stability_run import cells_of, run_map
 
     chosen = [map_named(name) for name in names] if names else list(MAPS.values())
-    if list_maps:
+    if options.list_maps:
         for stress in chosen:
             typer.echo(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")
             typer.echo(f"{'':<20}methods: {'; '.join(stress.methods)}")
         return
-    if redraw:
-        _redraw(out, [s.name for s in chosen] if names else None, shipped=shipped)
+    if options.redraw:
+        _redraw(options.out, [s.name for s in chosen] if names else None, shipped=options.shipped)
         return
-    if shipped:
+    if options.shipped:
         raise BenchError("--shipped goes with --redraw.")
-    wanted = {s.name: _methods(s.methods, method) for s in chosen}
+    wanted = {s.name: _methods(s.methods, options.method) for s in chosen}
     chosen = [s for s in chosen if wanted[s.name]]
     if not chosen:
         known = sorted({m for s in (map_named(n) for n in wanted) for m in s.methods})
-        raise BenchError(f"No map has the method {', '.join(method or [])}. Methods: {'; '.join(known)}.")
+        raise BenchError(f"No map has the method {', '.join(options.method)}. Methods: {'; '.join(known)}.")
+    out, size = options.out, options.size
     _make(out)
     from instrument.files.stability_file import RESULT, CellLog, map_record, write_stability
 
     log = CellLog(out)
-    jobs = {s.name: cells_of(s, size.value, wanted[s.name]) for s in chosen}
+    jobs = {s.name: cells_of(s, size, wanted[s.name]) for s in chosen}
     pictures = [out / f"{s.name}.png" for s in chosen]
     with saying_what_is_left(out / RESULT, *pictures), progress_bar() as bar:
         task = bar.add_task("stability", total=sum(map(len, jobs.values())), note="")
         for stress, picture in zip(chosen, pictures, strict=True):
             asked = set(jobs[stress.name])
-            made = [c for c in log.of(stress, size.value) if (c.method, c.ix, c.iy) in asked]
+            made = [c for c in log.of(stress, size) if (c.method, c.ix, c.iy) in asked]
             bar.update(task, advance=len(made), note=stress.name)
-            for cell in run_map(stress, size.value, methods=wanted[stress.name], known=made):
-                log.add(stress, size.value, cell)
+            for cell in run_map(stress, size, methods=wanted[stress.name], known=made):
+                log.add(stress, size, cell)
                 bar.update(task, advance=1, note=f"{stress.name}: {cell.method}")
-            record = map_record(stress, size.value, log.of(stress, size.value))
+            record = map_record(stress, size, log.of(stress, size))
             write_stability(out, {stress.name: record}, " ".join(["diffuserbench", *sys.argv[1:]]))
             _draw(record, picture)
             _tell(stress.name, record)
     typer.echo(f"Wrote {', '.join(map(str, (out / RESULT, *pictures)))}")
 
 
-def _methods(offered: tuple[str, ...], asked: list[str] | None) -> list[str]:
-    return list(offered) if asked is None else [m for m in offered if m in asked]
+def _methods(offered: tuple[str, ...], asked: tuple[str, ...]) -> list[str]:
+    return list(offered) if not asked else [m for m in offered if m in asked]
 
 
 def _make(folder: Path) -> None:

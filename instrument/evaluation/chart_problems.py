@@ -16,7 +16,7 @@ from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES
 from instrument.reconstruction.job import Job
-from recon.base.noise import NoiseModel
+from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.camera_model import one_depth
 from recon.errors import InputError
 from recon.evaluation.chart_hologram import HologramProblem
@@ -124,8 +124,7 @@ def _noise_of_mean(job: Job) -> NoiseModel | float | None:
     noise = job.binned_noise(None)
     if job.measurement.ndim == 2 or not isinstance(noise, NoiseModel):
         return noise
-    colours = job.measurement.shape[2]
-    return NoiseModel(noise.read_noise / colours**0.5, noise.counts_per_electron / colours)
+    return averaged_noise(noise, job.measurement.shape[2])
 
 
 def problem_of_pictures(

@@ -106,7 +106,7 @@ class RecordFormat:
         try:
             found = json.loads(path.read_text("utf-8"))
         except FileNotFoundError:
-            raise self.error(path, "does not exist.", self.make) from None
+            raise self.error(path, "there is no such file.", self.make) from None
         except OSError as error:
             raise self.error(path, f"cannot be read: {error.strerror or error}.") from error
         except ValueError as error:

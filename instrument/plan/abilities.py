@@ -13,6 +13,7 @@ from drivers.stage import StageAxis
 from instrument.files.errors import FileError
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.errors import PlanError
+from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.model import Plan, Step
 from instrument.plan.positions import SourcePosition
 
@@ -47,6 +48,8 @@ class BenchAbilities:
         operator.
     n_leds : int
         0 without an LED array.
+    led_array : LedPlaces, optional
+        Where its LEDs are, for patterns by name.
     slm_shape : tuple of int, optional
     slm_settle_ms : float
     free_bytes : int, optional
@@ -65,6 +68,7 @@ class BenchAbilities:
     can_switch_source: bool = True
     can_switch_scene: bool = True
     n_leds: int = 0
+    led_array: LedPlaces | None = None
     slm_shape: tuple[int, int] | None = None
     slm_settle_ms: float = 0.0
     free_bytes: int | None = None
@@ -186,12 +190,15 @@ def check(
 
 def _step_problems(step: Step, abilities: BenchAbilities) -> Iterable[str]:
     yield from _position_problems(step, abilities)
-    if step.light.kind == "pattern":
+    is_pattern = step.light.kind == "pattern" or step.light.is_named
+    if is_pattern:
         if abilities.n_leds == 0:
             yield f'light "{step.light}", but the bench has no LED array.'
         elif beyond := [led[0] for led in step.light.leds if led[0] >= abilities.n_leds]:
             yield f"LED {beyond[0]} does not exist; the array has LEDs 0 to {abilities.n_leds - 1}."
-    if step.light.kind != "pattern" and not abilities.can_switch_source:
+        elif abilities.led_array is not None and step.light.on(abilities.led_array).kind == "off":
+            yield f'light "{step.light}" lights no LED of this array.'
+    if not is_pattern and not abilities.can_switch_source:
         yield f'light "{step.light}", but the bench has no LED array and nobody can be asked to see to it.'
     if not abilities.can_switch_scene:
         yield (

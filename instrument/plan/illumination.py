@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-import numpy as np
-import numpy.typing as npt
-
 from instrument.files.errors import BenchError
 from instrument.plan.model import OFF, Light, Part, Plan
 
@@ -18,10 +15,8 @@ MOST_NAMED = 8
 """LEDs of a group that its description names."""
 
 
-def illumination_plan(
-    groups: Sequence[Sequence[int]], *, exposure_ms: float, level: int = 255, average: int = 1
-) -> Plan:
-    """Return a plan that photographs the scene lit by each group of LEDs in turn.
+def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: int = 1) -> Plan:
+    """Return a plan that photographs the scene in each light in turn, and once in the dark.
 
     The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
     :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
@@ -29,39 +24,49 @@ def illumination_plan(
 
     Parameters
     ----------
-    groups : sequence of sequences of int
-        LED numbers of each pattern.
+    lights : sequence of Light
+        Patterns by name, or of :func:`group_lights`.
     exposure_ms : float
-    level : int
-        Of every LED, 1 to 255.
     average : int
         Frames averaged for each pattern.
 
     Raises
     ------
     BenchError
-        When there is no group, an empty one, or a level out of range.
+        When there is no light.
     """
-    if not groups or not all(len(group) for group in groups):
+    if not lights:
+        raise BenchError("Active illumination needs patterns, each with one LED at least.")
+    exposures = (exposure_ms,)
+    return Plan(
+        label="active illumination",
+        parts=(
+            Part(label=DARK, light=(OFF,), exposures_ms=exposures, average=average),
+            Part(label=PATTERN, light=tuple(lights), exposures_ms=exposures, average=average),
+        ),
+    )
+
+
+def group_lights(groups: Sequence[Sequence[int]], level: int = 255) -> list[Light]:
+    """Return the lights of groups of LEDs by number, every LED at one level.
+
+    Raises
+    ------
+    BenchError
+        When a group is empty, or the level out of range.
+    """
+    if not all(len(group) for group in groups):
         raise BenchError("Active illumination needs groups of LEDs, each with one at least.")
     if not 1 <= level <= 255:
         raise BenchError(f"An LED's level lies between 1 and 255, not {level}.")
-    lights = tuple(
+    return [
         Light(
             kind="pattern",
             description=f"group {number}: {_in_words(group)}",
             leds=tuple((led, level, level, level) for led in group),
         )
         for number, group in enumerate(groups)
-    )
-    exposures = (exposure_ms,)
-    return Plan(
-        label="active illumination",
-        parts=(
-            Part(label=DARK, light=(OFF,), exposures_ms=exposures, average=average),
-            Part(label=PATTERN, light=lights, exposures_ms=exposures, average=average),
-        ),
-    )
+    ]
 
 
 def _in_words(group: Sequence[int]) -> str:
@@ -97,29 +102,3 @@ def groups_from_text(text: str) -> list[list[int]]:
             raise BenchError(f"--groups: a group names an LED twice: {group.strip()!r}.")
         groups.append(numbers)
     return groups
-
-
-def lattice_groups(positions_mm: npt.ArrayLike, side: int) -> list[list[int]]:
-    """Return the LEDs of an array in ``side x side`` square groups by place, row by row; empty ones left out.
-
-    Parameters
-    ----------
-    positions_mm : array, (n_leds, 2 or 3)
-    side : int
-        Groups along each axis.
-
-    Raises
-    ------
-    BenchError
-        When ``side`` is below 1.
-    """
-    if side < 1:
-        raise BenchError(f"--lattice takes 1 or more groups along each axis, not {side}.")
-    across = np.asarray(positions_mm, float)[:, :2]
-    low, high = across.min(axis=0), across.max(axis=0)
-    extent = np.where(high > low, high - low, 1.0)
-    cell = np.clip(((across - low) / extent * side).astype(int), 0, side - 1)
-    groups = [
-        np.flatnonzero((cell[:, 1] == row) & (cell[:, 0] == column)) for row, column in np.ndindex(side, side)
-    ]
-    return [[int(led) for led in group] for group in groups if len(group)]

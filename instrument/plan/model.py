@@ -8,42 +8,108 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PositiveFloat, StringConstraints, ValidationError, model_validator
+from pydantic import (
+    Field,
+    PositiveFloat,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from drivers.led_array import LedPattern
 from instrument.plan.errors import PlanError, plan_problems
+from instrument.plan.led_shapes import WHITE, LedPlaces, LedShape
+from instrument.plan.patterns import PATTERNS, led_shape, shape_from_text, shape_text
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
+from recon.base.declare import changed
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^/\x00-\x1f]+$")]
 Loop = Literal["repeat", "position", "light", "slm", "exposure"]
 LOOPS: tuple[Loop, ...] = ("repeat", "position", "slm", "light", "exposure")
 Level = Annotated[int, Field(ge=0, le=255)]
+_WITHOUT_SHAPE = ("off", "source", "pattern")
+"""Kinds of light that are no patterns by name."""
 
 
 class Light(PlanData):
     """What the LED array shows during a step.
 
     ``off``: dark. ``source``: the bench's point source, as ``bench.toml`` describes it. ``pattern``: the
-    listed LEDs, ``leds`` as ``[index, red, green, blue]`` with levels 0 to 255.
+    listed LEDs, ``leds`` as ``[index, red, green, blue]`` with levels 0 to 255. Any other kind is a pattern
+    of :mod:`instrument.plan.patterns` by name, its options beside it, in the colour ``rgb`` (white); the LEDs
+    are found by :meth:`on` when the array is known.
     """
 
-    kind: Literal["off", "source", "pattern"]
+    kind: str
     description: str = ""
     leds: tuple[tuple[Annotated[int, Field(ge=0)], Level, Level, Level], ...] = ()
+    rgb: tuple[Level, Level, Level] | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _options_beside(cls, data: Any) -> Any:
+        """Take the options of a named pattern from beside its kind, or from a kind with options behind it."""
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        kind = data.get("kind")
+        if isinstance(kind, str) and len(kind.split()) > 1:
+            data["kind"], written = shape_from_text(kind)
+            data = {**written, **data}
+        if data.get("kind") not in _WITHOUT_SHAPE:
+            given = dict(data.get("options", {}))
+            given |= {name: data.pop(name) for name in list(data) if name not in cls.model_fields}
+            data["options"] = given
+        return data
 
     @model_validator(mode="after")
-    def _leds_belong_to_a_pattern(self) -> Light:
+    def _kind_and_the_rest_agree(self) -> Light:
         if (self.kind == "pattern") != bool(self.leds):
             raise ValueError('leds belong to kind = "pattern", which needs at least one')
+        if self.kind in _WITHOUT_SHAPE and (self.options or self.rgb is not None):
+            raise ValueError(f'kind = "{self.kind}" has no options and no rgb')
+        if self.is_named and self.kind not in PATTERNS:
+            known = ", ".join((*_WITHOUT_SHAPE, *PATTERNS))
+            raise ValueError(f"light {self.kind!r} is not known; there are {known}")
+        if self.is_named:
+            led_shape(self.kind, self.options)
         return self
+
+    @model_serializer(mode="wrap")
+    def _with_options_beside(self, dumped: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data: dict[str, Any] = dumped(self)
+        options = data.pop("options", {})
+        if self.rgb is None:
+            data.pop("rgb", None)
+        return {**data, **options}
 
     @classmethod
     def of(cls, pattern: LedPattern) -> Light:
-        """Return the light of a pattern that an LED array composed (bright field, DPC half ...)."""
+        """Return the light of a pattern that was composed for an LED array."""
         leds = tuple((index, *rgb) for index, rgb in pattern.levels)
         if not leds:
             return OFF
         return cls(kind="pattern", description=pattern.description, leds=leds)
+
+    @classmethod
+    def named(cls, shape: LedShape, rgb: tuple[int, int, int] | None = None) -> Light:
+        """Return the light of a named pattern."""
+        options = {option.name: value for option, value in changed(shape)}
+        return cls(kind=shape.name, rgb=rgb, options=options)
+
+    @property
+    def is_named(self) -> bool:
+        """Whether it is a pattern by name, whose LEDs :meth:`on` finds."""
+        return self.kind not in _WITHOUT_SHAPE
+
+    def on(self, array: LedPlaces) -> Light:
+        """Return the light with its LEDs listed, for an array; itself where it is no pattern by name."""
+        if not self.is_named:
+            return self
+        return Light.of(led_shape(self.kind, self.options).on(array, self.rgb or WHITE))
 
     def pattern(self) -> LedPattern:
         """Return the LED pattern of a light of kind ``pattern``."""
@@ -51,6 +117,9 @@ class Light(PlanData):
         return LedPattern(name, tuple((led[0], (led[1], led[2], led[3])) for led in self.leds))
 
     def __str__(self) -> str:
+        if self.is_named:
+            colour = "" if self.rgb is None else f" rgb {self.rgb}"
+            return shape_text(led_shape(self.kind, self.options)) + colour
         return self.kind if self.kind != "pattern" else self.pattern().description
 
 
@@ -265,6 +334,19 @@ class Plan(PlanData):
         """Return the plan with every SLM image at the path that ``place`` gives for it."""
         parts = (
             part.model_copy(update={"slm_images": tuple(map(place, part.slm_images))}) for part in self.parts
+        )
+        return self.model_copy(update={"parts": tuple(parts)})
+
+    def on(self, array: LedPlaces | None) -> Plan:
+        """Return the plan with the LEDs of every named pattern listed, as an array lights them.
+
+        What a run keeps: it does not change when a pattern is described otherwise one day.
+        """
+        if array is None or not any(light.is_named for part in self.parts for light in part.light):
+            return self
+        parts = (
+            part.model_copy(update={"light": tuple(light.on(array) for light in part.light)})
+            for part in self.parts
         )
         return self.model_copy(update={"parts": tuple(parts)})
 

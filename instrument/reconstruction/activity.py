@@ -17,6 +17,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
 from instrument.reconstruction.video_mp4 import DEFAULT_FPS, levels_of, write_mp4
 from instrument.reconstruction.video_output import VideoPictures, create_output
+from recon.base.declare import option
 from recon.streams.baseline import Motion, aligned, baseline, change, fading, motion
 from recon.streams.regions import Region, find_regions, local_correlation
 
@@ -51,11 +52,29 @@ class ActivitySettings:
         As :func:`recon.streams.regions.find_regions`.
     """
 
-    window_s: float = WINDOW_S
-    percentile: float = 20.0
-    align: bool = False
-    least_correlation: float = 0.5
-    radius_px: float = 8.0
+    window_s: float = option(
+        WINDOW_S, help="Of the sliding baseline.", unit="s", least=0, flags=("--window",), group="Activity"
+    )
+    percentile: float = option(
+        20.0, help="Of a window that is the baseline.", least=0, most=100, group="Activity"
+    )
+    align: bool = option(False, help="Move frames back to one place first.", group="Activity")
+    least_correlation: float = option(
+        0.5,
+        help="Local correlation from which a region begins.",
+        least=0,
+        most=1,
+        flags=("--correlation",),
+        group="Activity",
+    )
+    radius_px: float = option(
+        8.0,
+        help="As far as a region reaches.",
+        unit="px",
+        least=1,
+        flags=("--radius",),
+        group="Activity",
+    )
 
 
 @dataclass(frozen=True, slots=True)

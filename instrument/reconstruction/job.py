@@ -49,7 +49,7 @@ from instrument.reconstruction.record import (
     slices_record,
     source_record,
 )
-from recon.base.noise import NoiseModel
+from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.refocus import at_depth
 from recon.types import Calibration
 
@@ -130,9 +130,7 @@ class Job:
         factor: float = int(self.provenance.get("binning", 1)) * int(self.provenance.get("image_binning", 1))
         if factor > 1 and self.provenance.get("mosaic"):
             factor /= 2  # red and blue have a quarter of the pixels
-        if isinstance(noise, NoiseModel):
-            return NoiseModel(noise.read_noise / factor, noise.counts_per_electron / factor**2)
-        return None if noise is None else noise / factor
+        return averaged_noise(noise, factor**2)
 
 
 def job_from_files(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
+from recon.base.blocks import block_mean
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -262,12 +263,10 @@ def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
         raise BenchError(f"--bin {factor}: the image has {image.shape[0]} x {image.shape[1]} pixels.")
     if factor == 1:
         return image.astype(np.float32)
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    blocks = image[: height * factor, : width * factor].reshape(
-        height, factor, width, factor, *image.shape[2:]
-    )
-    binned: FloatImage = blocks.mean(axis=(1, 3), dtype=np.float32)
-    return binned
+    if image.ndim == 2:
+        binned: FloatImage = block_mean(image, factor)
+        return binned
+    return np.ascontiguousarray(np.moveaxis(block_mean(np.moveaxis(image, -1, 0), factor), 0, -1))
 
 
 def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:

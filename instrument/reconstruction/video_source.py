@@ -12,6 +12,7 @@ from drivers.frame import FrameMetadata
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
 from instrument.runs.run import Run
+from recon.base.blocks import block_mean
 from recon.base.noise import estimate_deviation
 
 _BLOCK = 8
@@ -99,8 +100,7 @@ def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
     height, width = (n // _BLOCK for n in channels.shape[1:])
     if min(height, width) < 2:
         return True  # too few blocks to tell
-    cut = channels[:, : height * _BLOCK, : width * _BLOCK].astype(np.float64)
-    means = cut.reshape(len(cut), height, _BLOCK, width, _BLOCK).mean(axis=(2, 4))
+    means = block_mean(channels, _BLOCK, dtype=np.float64)
     spread = means.var(axis=(1, 2)) * _BLOCK**2
     given = np.asarray(deviation, np.float64).reshape(-1)
     if (spread > LIT * given**2).any():

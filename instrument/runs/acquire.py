@@ -68,6 +68,7 @@ def prepare(
         control.check()
     folder = Path(folder) if folder is not None else bench.config.data_folder
     check(plan, abilities_of(bench, folder))
+    plan = plan.on(bench.led_array)
     writer = RunWriter.create(
         folder, label=plan.label, bench=record_of(bench), plan=plan, calibrations=calibrations
     )
@@ -93,6 +94,7 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
+        led_array=bench.led_array,
         slm_shape=slm.shape if slm is not None else None,
         slm_settle_ms=slm.settle_ms if slm is not None else 0.0,
         free_bytes=free_bytes(folder) if folder is not None else None,

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.window import WindowProblem
+from recon.base.declare import option
 from recon.errors import InputError
 
 Array = npt.NDArray[Any]
@@ -41,8 +42,18 @@ class Noise:
         Read noise.
     """
 
-    electrons: float = 10_000.0
-    read_e: float = 2.0
+    electrons: float = option(
+        10_000.0, help="Electrons at the brightest pixel of the tests' images.", least=1, group="Point tests"
+    )
+    read_e: float = option(
+        2.0,
+        help="Read noise of the tests' images, electrons.",
+        least=0,
+        flags=("--read-noise",),
+        metavar="E",
+        label="Read noise (electrons)",
+        group="Point tests",
+    )
 
     def expose(self, light: Array, rng: np.random.Generator) -> Floats:
         """Return one exposure of an image, in the image's units."""

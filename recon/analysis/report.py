@@ -36,6 +36,7 @@ from recon.analysis.sampling import (
     lateral_spacing_um,
     voxel_grid,
 )
+from recon.base.declare import option
 from recon.camera.camera_model import choose_model, sort_by_depth
 from recon.camera.refocus import central_psfs, refocus
 from recon.errors import InputError
@@ -55,6 +56,17 @@ STEEPEST = math.atan(40.0)
 """Angle at which a response is taken to have ended."""
 MARGIN_PX = 24
 """Dark rim kept around the light of cropped PSFs, for shifts."""
+
+
+def _cutoff(typed: str) -> tuple[float, float]:
+    """Read ``X,Y``, or one angle for both, as ``(y, x)``."""
+    try:
+        values = [float(part) for part in typed.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(0 < v < 90 for v in values):
+        raise ValueError("one or two angles between 0 and 90, as 41.5,30 for x and y.")
+    return values[-1], values[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +95,49 @@ class AnalysisSettings:
         Of the point tests' images.
     """
 
-    z_um: float | None = None
-    deflection_deg: float = 0.5
-    cutoff_deg: tuple[float | None, float | None] | None = None
+    z_um: float | None = option(
+        None,
+        help="Depth to analyse.",
+        default_words="the middle in 1/z",
+        unit="um",
+        shown_unit="mm",
+        shown_factor=1000.0,
+        above=0,
+        group="Optics",
+    )
+    deflection_deg: float = option(
+        0.5, help="The diffuser's largest deflection.", unit="deg", above=0, below=90, group="Optics"
+    )
+    cutoff_deg: tuple[float | None, float | None] | None = option(
+        None,
+        help="Angles at which the sensor's response is down to 20 %, along x and y (calibrate angular).",
+        default_words="not known",
+        unit="deg",
+        metavar="X,Y",
+        parse=_cutoff,
+        group="Optics",
+    )
     fall_off: FallOff | None = None
-    fall_off_deg: float | None = None
-    lenslet_um: float | None = None
-    wavelength_nm: float | None = None
-    points: bool = True
+    fall_off_deg: float | None = option(
+        None,
+        help="Sigma of the sensor's angular response.",
+        default_words="from --cutoff-deg",
+        unit="deg",
+        above=0,
+        group="Optics",
+    )
+    lenslet_um: float | None = option(
+        None, help="Diameter of a microlens diffuser's lenses.", unit="um", above=0, group="Optics"
+    )
+    wavelength_nm: float | None = option(
+        None,
+        help="Of the light.",
+        default_words="the calibration's",
+        unit="nm",
+        above=0,
+        group="Optics",
+    )
+    points: bool = option(True, help="Two- and 16-point tests by reconstructions.", group="Point tests")
     noise: Noise = field(default_factory=Noise)
 
 

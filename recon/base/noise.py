@@ -30,6 +30,13 @@ class NoiseModel:
         return float(np.sqrt(self.read_noise**2 + self.counts_per_electron * signal))
 
 
+def averaged_noise(noise: NoiseModel | float | None, count: float) -> NoiseModel | float | None:
+    """Return the noise of the mean of ``count`` pixels or frames, from that of one; None where not known."""
+    if isinstance(noise, NoiseModel):
+        return NoiseModel(noise.read_noise / count**0.5, noise.counts_per_electron / count)
+    return None if noise is None else noise / count**0.5
+
+
 Stencil = tuple[tuple[int, int, float], ...]
 
 _LINE = (1.0, -2.0, 1.0)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+import re
 import typing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.base.declare import Declaration, Option, options_of
+from recon.base.declare import Declaration, Option, expression, options_of
 from recon.errors import InputError
 
 
@@ -27,14 +28,18 @@ def read(o: Option, typed: str | Sequence[str]) -> Any:
     if o.item is not None:
         one = dataclasses.replace(o, type=o.item)
         return tuple(read(one, word) for word in ([typed] if isinstance(typed, str) else typed))
-    if not isinstance(typed, str):
-        kinds = next(typing.get_args(kind) for kind in o.kinds if typing.get_origin(kind) is tuple)
-        return tuple(
-            read(dataclasses.replace(o, type=kind), word) for kind, word in zip(kinds, typed, strict=True)
-        )
     said = o.declaration
-    if said.none_word and typed == said.none_word:
+    if isinstance(typed, str) and said.none_word and typed == said.none_word:
         return None
+    kinds = next((typing.get_args(kind) for kind in o.kinds if typing.get_origin(kind) is tuple), ())
+    if kinds and said.parse is None:
+        words = typed.split(",") if isinstance(typed, str) else typed
+        if len(words) != len(kinds):
+            raise InputError(f"{o.flag} must be {metavar(o)}, {len(kinds)} numbers, not {typed!r}.")
+        return tuple(
+            read(dataclasses.replace(o, type=kind), word) for kind, word in zip(kinds, words, strict=True)
+        )
+    assert isinstance(typed, str)
     if said.parse is not None:
         try:
             return said.parse(typed)
@@ -71,6 +76,18 @@ def _finite(value: float) -> float:
     return value
 
 
+def size(typed: str) -> tuple[int, int]:
+    """Read a size or grid, ``1080x1920``: rows and columns. For declarations (``parse=size``).
+
+    Raises
+    ------
+    ValueError
+    """
+    if found := re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", typed):
+        return int(found[1]), int(found[2])
+    raise ValueError("write rows x columns, two whole numbers above 0, for example 3x5.")
+
+
 def shown(o: Option, value: Any) -> str:
     """Return a value as people type it."""
     if value is None:
@@ -80,7 +97,7 @@ def shown(o: Option, value: Any) -> str:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return f"{value / o.declaration.shown_factor:.6g}"
     if isinstance(value, tuple | list):
-        return " ".join(shown(o, one) for one in value)
+        return ("," if "," in o.declaration.metavar else " ").join(shown(o, one) for one in value)
     return str(value)
 
 
@@ -124,7 +141,9 @@ def table(cls: type) -> str:
     """Return a Markdown table of an options class: for the reference pages."""
     rows = ["| in Python | on the command line | default | what it is |", "| --- | --- | --- | --- |"]
     group = ""
-    for o in options_of(cls):
+    options = options_of(cls)
+    order = list(dict.fromkeys(o.declaration.group for o in options))
+    for o in sorted(options, key=lambda o: order.index(o.declaration.group)):
         if o.declaration.group != group:
             group = o.declaration.group
             rows.append(f"| **{group}** | | | |")
@@ -135,7 +154,7 @@ def table(cls: type) -> str:
 def _row(o: Option, said: Declaration) -> str:
     switch = bool in o.kinds
     typed = "" if not o.flags else f"`{', '.join(o.flags)}{'' if switch else f' {metavar(o)}'}`"
-    default = "required" if o.is_required else said.default_words or f"`{o.default!r}`"
+    default = "required" if o.is_required else said.default_words or f"`{expression(o.default)}`"
     limits = f" ({', '.join(o.limits())})" if o.limits() else ""
     applies = f" Of a {', '.join(said.applies)}." if said.applies else ""
     unit = f" In {said.unit}." if said.unit else ""

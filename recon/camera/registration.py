@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
+from recon.base.blocks import block_mean
 from recon.errors import InputError
 
 Array = npt.NDArray[Any]
@@ -331,5 +332,4 @@ def _blocks(image: Array, factor: int) -> Array:
     height, width = (n // factor * factor for n in image.shape)
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
     cut = image[top : top + height, left : left + width]
-    blocks: Array = cut.reshape(height // factor, factor, width // factor, factor).mean(axis=(1, 3))
-    return blocks
+    return block_mean(cut, factor, dtype=image.dtype)

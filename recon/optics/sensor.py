@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean, block_sum
 from recon.optics.sensor_kernel import expose_pixels
 
 
@@ -61,11 +62,10 @@ class FixedPattern:
         """Sum ``factor x factor`` pixels; a rest at the lower and right border is left out."""
         if factor == 1:
             return self
-        area = np.float32(factor * factor)
         return FixedPattern(
-            bin_sum(self.response, factor) / area,
-            bin_sum(self.dark_e_per_s, factor),
-            bin_sum(self.offset_e, factor),
+            block_mean(self.response, factor),
+            block_sum(self.dark_e_per_s, factor),
+            block_sum(self.offset_e, factor),
         )
 
     def cropped(self, rows: slice, columns: slice) -> FixedPattern:
@@ -93,13 +93,6 @@ def fixed_pattern(spec: SensorSpec, seed: int) -> FixedPattern:
     offset = share * rng.standard_normal(shape, np.float32)
     offset += share * rng.standard_normal(shape[1], np.float32)
     return FixedPattern(np.maximum(response, 0), dark, offset)
-
-
-def bin_sum(image: npt.NDArray[np.float32], factor: int) -> npt.NDArray[np.float32]:
-    """Sum ``factor x factor`` pixels; a rest at the lower and right border is left out."""
-    height, width = (side // factor for side in image.shape)
-    tiles = image[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    return np.asarray(tiles.sum(axis=(1, 3)), np.float32)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome, Solver
 from recon.solvers.fista import Fista
-from recon.solvers.literal_admm import LiteralAdmm
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
 from recon.solvers.wiener import wiener
@@ -12,7 +11,6 @@ __all__ = [
     "Admm",
     "Fista",
     "IterationRecord",
-    "LiteralAdmm",
     "Outcome",
     "Penalties",
     "SensorAdmm",

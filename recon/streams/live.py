@@ -10,10 +10,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, check_psf, require_finite, select_psf
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
-from recon.streams.live_level import Array, ComingLevel, FilterLevel, Floats, Level, binned
+from recon.streams.live_level import Array, ComingLevel, FilterLevel, Floats, Level
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 from recon.types import Calibration
@@ -188,7 +189,7 @@ class LiveReconstructor:
         began = _now()
         frame = self._on_calibration_pixels(image)
         level = self._level_for(frame)
-        small = binned(frame, level.binning)
+        small = block_mean(frame, level.binning)
         self._scene = self._watch.see(small)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
@@ -271,7 +272,7 @@ class LiveReconstructor:
         """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
             binning = self._first_binning()
-            small = binned(frame, binning).copy()
+            small = block_mean(frame, binning).copy()
             self._level = FilterLevel(self._psfs, binning, small, self._noise)
             self._pace.enter(binning)
             self._make(binning, small)
@@ -281,9 +282,9 @@ class LiveReconstructor:
         elif not isinstance(self._level, Level):  # there was no memory for its solver
             coarser = next((b for b in self._pace.levels if b > self._level.binning), None)
             if coarser is not None:
-                self._make(coarser, binned(frame, coarser).copy())
+                self._make(coarser, block_mean(frame, coarser).copy())
         elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.binning:
-            self._make(wanted, binned(frame, wanted).copy())
+            self._make(wanted, block_mean(frame, wanted).copy())
         return self._level
 
     def _first_binning(self) -> int:
@@ -347,7 +348,7 @@ class LiveReconstructor:
         if image.shape != self._shape:
             self._refuse_other_shape(image)
         factor = image.shape[0] // self._psfs.shape[1]
-        frame = binned(_channels(image), factor)
+        frame = block_mean(_channels(image), factor)
         if self._background is not None:
             frame = frame - self._background
         return frame

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.noise import NoiseModel
+from recon.base.blocks import block_mean
+from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT
@@ -38,7 +39,7 @@ class FilterLevel:
 
     def __init__(self, psfs: Floats, binning: int, frame: Floats, noise: NoiseModel | float | None) -> None:
         self.binning = binning
-        binned_psfs = binned(psfs, binning)
+        binned_psfs = block_mean(psfs, binning)
         deviation = [_noise(channel, noise, binning) for channel in frame]
         self._deviation = np.array(deviation, np.float32)[:, None, None]
         energy = np.sqrt(np.sum(binned_psfs.astype(np.float64) ** 2, axis=(1, 2))).astype(np.float32)
@@ -119,29 +120,9 @@ class ComingLevel:
             self._error = error
 
 
-def binned(image: Array, factor: int) -> Floats:
-    """Return means of ``factor x factor`` pixels of (n_channels, height, width), float32.
-
-    What does not fill a block is left out at the last rows and columns.
-    """
-    if factor == 1:
-        return np.asarray(image, np.float32)
-    height, width = (n // factor * factor for n in image.shape[1:])
-    # Sums of strided views: several times faster than a mean over axes of length ``factor``.
-    rows = image[:, 0:height:factor].astype(np.float32)
-    for i in range(1, factor):
-        rows += image[:, i:height:factor]
-    total: Floats = rows[:, :, 0:width:factor].copy()
-    for j in range(1, factor):
-        total += rows[:, :, j:width:factor]
-    total *= np.float32(1 / factor**2)
-    return total
-
-
 def _noise(channel: Floats, noise: NoiseModel | float | None, binning: int) -> float:
     """Return a binned pixel's noise: averaging divides the deviation of white noise by ``binning``."""
     valid = np.ones(channel.shape, bool)
     if noise is None:
         return channel_noise(channel, valid, None)
-    single = noise.deviation(channel) if isinstance(noise, NoiseModel) else float(noise)
-    return channel_noise(channel, valid, single / binning)
+    return channel_noise(channel, valid, averaged_noise(noise, binning**2))

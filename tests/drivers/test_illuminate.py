@@ -13,6 +13,7 @@ import pytest
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.illuminate.led_array import IlluminateLedArray, IlluminateOptions
 from drivers.led_array import OFF, LedPattern
+from instrument.plan.led_shapes import BrightField
 from tests.mocks.illuminate_emulator import IlluminateEmulator
 from tests.mocks.pty_device import Answer
 
@@ -93,7 +94,7 @@ def spoil(command: bytes, *answers: Answer) -> Callable[[bytes, bytes], list[Ans
 def test_leds_shine_with_exactly_the_levels_asked_for(
     array: IlluminateEmulator, leds: IlluminateLedArray, rgb: tuple[int, int, int]
 ) -> None:
-    pattern = leds.bright_field(0.3, rgb)
+    pattern = BrightField(0.3).on(leds, rgb)
     assert len(pattern.levels) > 20  # more than firmware 1 takes in one line
     leds.set_pattern(pattern)
     expected = np.zeros_like(array.lit)
@@ -227,7 +228,7 @@ def test_off_during_a_pattern_leaves_it_dark(array: IlluminateEmulator, leds: Il
 
 
 def test_off_from_many_threads_at_once(array: IlluminateEmulator, leds: IlluminateLedArray) -> None:
-    leds.set_pattern(leds.bright_field(0.2))
+    leds.set_pattern(BrightField(0.2).on(leds))
     runs = [in_background(leds.off) for _ in range(4)]
     for thread, _ in runs:
         thread.join(30)
@@ -321,7 +322,7 @@ def test_what_a_sequence_cannot_do_is_refused(array: IlluminateEmulator, leds: I
     with pytest.raises(LimitError, match="one colour"):
         leds.sequencer.load([leds.single(0, (1, 0, 0)), leds.single(1, (2, 0, 0))])
     with pytest.raises(LimitError, match="more than firmware"):
-        leds.sequencer.load([leds.bright_field(1.0)])
+        leds.sequencer.load([BrightField(1.0).on(leds)])
     leds.sequencer.load([leds.single(0)])
     for interval_ms, repeats in ((-1, 1), (65_536, 1), (10, 0)):
         with pytest.raises(LimitError):

@@ -16,6 +16,7 @@ from drivers.simulated.led_microscope import (
 )
 from drivers.testing.camera import CameraContract
 from drivers.testing.led_array import LedArrayContract
+from instrument.plan.led_shapes import HalfCircle
 from recon.optics.led_microscope import led_image
 
 
@@ -61,9 +62,9 @@ def test_the_array_lights_the_sample() -> None:
     array = MicroscopeLedArray(MicroscopeLedOptions(), world)
     array.open()
     assert world.photons_per_s((1.0, 1.0, 1.0)) is None
-    array.set_pattern(array.dpc_half("left", 0.13, (0, 255, 0)))
+    array.set_pattern(HalfCircle("left", 0.13).on(array, (0, 255, 0)))
     left = world.photons_per_s((1.0, 1.0, 1.0))
-    array.set_pattern(array.dpc_half("right", 0.13, (0, 255, 0)))
+    array.set_pattern(HalfCircle("right", 0.13).on(array, (0, 255, 0)))
     right = world.photons_per_s((1.0, 1.0, 1.0))
     assert left is not None
     assert right is not None

@@ -21,6 +21,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.slm_correction import SlmCorrection, load_slm_correction
 from instrument.files.slm_image import write_slm_image
+from instrument.plan.patterns import shape_buttons
 
 WAIT_MS = 60_000
 LEFT = Qt.MouseButton.LeftButton
@@ -145,7 +146,7 @@ def leds(qtbot: QtBot, window: MainWindow) -> LedPanel:
     return panel
 
 
-@pytest.mark.parametrize("name", ["bright", "dark", "source", "left", "right", "top", "bottom"])
+@pytest.mark.parametrize("name", ["Source", *shape_buttons()])
 def test_led_patterns(qtbot: QtBot, window: MainWindow, leds: LedPanel, name: str) -> None:
     array = window.session.bench.led_array
     assert array is not None
@@ -155,14 +156,17 @@ def test_led_patterns(qtbot: QtBot, window: MainWindow, leds: LedPanel, name: st
     qtbot.mouseClick(leds.pattern_buttons[name], LEFT)
     qtbot.waitUntil(lambda: not array.pattern.is_dark, timeout=WAIT_MS)
     lit = dict(array.pattern.levels)
-    if name == "source":
+    if name == "Source":
         assert set(lit) == {0}
     else:
         assert set(lit.values()) == {(0, 100, 0)}
         inside = np.hypot(*array.led_na[sorted(lit)].T) <= 0.2
-        assert not inside.any() if name == "dark" else inside.all()
+        if name == "Dark field":
+            assert not inside.any()
+        elif hasattr(shape_buttons()[name], "na"):
+            assert inside.all()
     qtbot.waitUntil(lambda: leds._drawn == array.pattern, timeout=WAIT_MS)
-    qtbot.mouseClick(leds.pattern_buttons["off"], LEFT)
+    qtbot.mouseClick(leds.pattern_buttons["Off"], LEFT)
     qtbot.waitUntil(lambda: array.pattern.is_dark, timeout=WAIT_MS)
 
 

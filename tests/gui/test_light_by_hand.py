@@ -71,7 +71,7 @@ def test_a_pattern_is_not_lit_with_an_aperture_that_makes_no_sense(
     leds.na.setFocus()
     leds.na.selectAll()
     qtbot.keyClicks(leds.na, "7")
-    qtbot.mouseClick(leds.pattern_buttons["bright"], LEFT)
+    qtbot.mouseClick(leds.pattern_buttons["Bright field"], LEFT)
     assert leds.na.property("refused")
     assert not window.session.jobs.is_busy("led_array")
 
@@ -81,12 +81,12 @@ def test_the_light_goes_off_whatever_stands_in_the_field_of_the_aperture(
 ) -> None:
     array = window.session.bench.led_array
     assert array is not None
-    qtbot.mouseClick(leds.pattern_buttons["bright"], LEFT)
+    qtbot.mouseClick(leds.pattern_buttons["Bright field"], LEFT)
     qtbot.waitUntil(lambda: not array.pattern.is_dark, timeout=WAIT_MS)
     leds.na.setFocus()
     leds.na.selectAll()
     qtbot.keyClicks(leds.na, "7")
-    qtbot.mouseClick(leds.pattern_buttons["off"], LEFT)
+    qtbot.mouseClick(leds.pattern_buttons["Off"], LEFT)
     qtbot.waitUntil(lambda: array.pattern.is_dark, timeout=WAIT_MS)
 
 

@@ -15,6 +15,7 @@ from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from gui.widgets.image_view import ImageView
 from instrument.files.images import read_image
+from instrument.plan.led_shapes import BrightField
 from instrument.runs.run import Run
 from instrument.runs.snapshot import Light
 
@@ -199,7 +200,7 @@ def test_a_recording_ends_under_the_light_that_it_began_with(
     bench = live.session.bench
     assert bench.led_array is not None
     bench.scene_on() if scene else bench.scene_off()
-    pattern = bench.led_array.set_pattern(bench.led_array.bright_field(0.25, (9, 9, 9)))
+    pattern = bench.led_array.set_pattern(BrightField(0.25).on(bench.led_array, (9, 9, 9)))
     live.record_bar.seconds.set_value(0.1)
     live.record()
     qtbot.waitUntil(lambda: live.record_bar.job is None, timeout=WAIT_MS)
@@ -213,7 +214,7 @@ def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: Live
     bench.source_on()
     bench.scene_off()
     assert live.light is Light.SOURCE
-    bench.led_array.set_pattern(bench.led_array.bright_field(0.25))
+    bench.led_array.set_pattern(BrightField(0.25).on(bench.led_array))
     assert not bench.source_lit
     assert live.light is Light.AS_IS
     live._show_light()

@@ -160,7 +160,7 @@ def test_an_existing_file_is_spared_and_quality_ends_the_work(capsys):
         (["picture.png", "--out", "slm.tif"], "written as .png"),
         (["picture.png", "--complex"], "written as .npy"),
         (["picture.png", "--weights", "picture.png"], "loss that takes them: 'spatial'"),
-        (["picture.png", "--loss", "spatial", "--centre", "2"], "write Y,X"),
+        (["picture.png", "--loss", "spatial", "--centre", "2"], "must be Y,X"),
         (["picture.png", "picture.png"], "Give --z-mm once for each"),
         (["picture.png", "--color"], "needs a colour picture"),
         (["picture.png", "--z-mm", "100000"], "too far"),

@@ -49,6 +49,7 @@ class Main:
     centre: tuple[float, float] = option((0.5, 0.5), help="Of it.", parse=_pair, metavar="Y,X")
     depths: tuple[float, ...] = option((), help="Of each.", above=0)
     lasers: tuple[float, float] = option((638.0, 520.0), help="Two.")
+    place: tuple[float, float] = option((0.5, 0.5), help="Of it.", metavar="Y,X")
     way: Way = option(Way.LEFT, help="Where to.")
     hidden: int = option(7, help="Not on the command line.", flags=("",))
 
@@ -94,7 +95,7 @@ def test_nothing_given_is_every_default() -> None:
 
 def test_words_become_values_in_the_units_of_python() -> None:
     words = "--no-rare -n 4 --sort fancy --z-mm 25 --level 12.5 --binning 2 --no-background --centre 0.1,0.2"
-    words += " --depths 1 --depths 2 --lasers 500 600 --way right --loud"
+    words += " --depths 1 --depths 2 --lasers 500 600 --place 0.1,0.2 --way right --loud"
     _, main, _, given, loud = run("in.tif", "-o", "x", *words.split())
     assert main == Main(
         rare=False,
@@ -107,6 +108,7 @@ def test_words_become_values_in_the_units_of_python() -> None:
         centre=(0.1, 0.2),
         depths=(1.0, 2.0),
         lasers=(500.0, 600.0),
+        place=(0.1, 0.2),
         way=Way.RIGHT,
     )
     assert loud
@@ -136,6 +138,8 @@ def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_peopl
     ]
     with pytest.raises(BenchError, match="--centre 'middle': could not convert"):
         run("in.tif", "-o", "x", "--centre", "middle")
+    with pytest.raises(BenchError, match="--place must be Y,X, 2 numbers, not '1,2,3'"):
+        run("in.tif", "-o", "x", "--place", "1,2,3")
     with pytest.raises(BenchError, match="--way must be one of left, right, not 'up'"):
         run("in.tif", "-o", "x", "--way", "up")
     with pytest.raises(BenchError, match=r"--z-mm must be a number.*not 'nan'"):
@@ -146,9 +150,9 @@ def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_peopl
 
 def test_what_does_not_apply_is_refused_from_its_declaration() -> None:
     given = run("in.tif", "-o", "x", "--rare")[3]
-    given.refuse("film", "--film")
-    with pytest.raises(BenchError, match=r"With --picture these do not apply: --rare \(for film\)\. Leave"):
-        given.refuse("picture", "--picture")
+    given.refuse("--film", "film", "picture")
+    with pytest.raises(BenchError, match=r"With --picture these do not apply: --rare \(for a film\)\. Leave"):
+        given.refuse("--picture", "picture")
 
 
 def test_help_has_groups_and_what_is_registered_later(

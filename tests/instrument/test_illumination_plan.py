@@ -6,11 +6,11 @@ import pytest
 
 from instrument.files.errors import BenchError
 from instrument.plan import Plan
-from instrument.plan.illumination import illumination_plan
+from instrument.plan.illumination import group_lights, illumination_plan
 
 
 def test_each_group_is_lit_once_after_the_dark() -> None:
-    plan = illumination_plan([[0, 1], [5], [7, 8, 9]], exposure_ms=20, level=100)
+    plan = illumination_plan(group_lights([[0, 1], [5], [7, 8, 9]], 100), exposure_ms=20)
     steps = list(plan.steps())
     assert [step.label for step in steps] == ["dark", "pattern", "pattern", "pattern"]
     assert [tuple(led[0] for led in step.light.leds) for step in steps] == [(), (0, 1), (5,), (7, 8, 9)]
@@ -22,4 +22,4 @@ def test_each_group_is_lit_once_after_the_dark() -> None:
 @pytest.mark.parametrize(("groups", "level"), [([], 9), ([[1], []], 9), ([[1]], 0), ([[1]], 256)])
 def test_impossible_groups_are_refused(groups: list[list[int]], level: int) -> None:
     with pytest.raises(BenchError):
-        illumination_plan(groups, exposure_ms=1, level=level)
+        illumination_plan(group_lights(groups, level), exposure_ms=1)

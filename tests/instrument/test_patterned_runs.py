@@ -13,7 +13,7 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.plan.file import load_plan
-from instrument.plan.illumination import groups_from_text, illumination_plan, lattice_groups
+from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
 from recon import Calibration
 from recon.base.metrics import psnr
@@ -62,7 +62,7 @@ def write_run(
         clean = 20000 * cast(reflects * light) + DARK_COUNTS
         frames[number] = clean + rng.normal(0, 1, SHAPE)
     frames = {index: np.clip(np.round(frame), 0, 65535) for index, frame in frames.items()}
-    plan = illumination_plan(groups, exposure_ms=10)
+    plan = illumination_plan(group_lights(groups), exposure_ms=10)
     return write_recording(folder, frames, plan=plan, **settings)  # type: ignore[arg-type]
 
 
@@ -148,13 +148,13 @@ def test_what_does_not_belong_together_is_refused(files: tuple[Path, Path, Path]
     assert "no run of active illumination" in refused(sheet, recording)
     dark = write_run(tmp_path / "dark", np.zeros(SHAPE))
     assert refused(dark)
-    short = illumination_plan(GROUPS, exposure_ms=10)
+    short = illumination_plan(group_lights(GROUPS), exposure_ms=10)
     missing = write_recording(tmp_path / "short", {0: np.ones(SHAPE)}, plan=short)
     assert "lacks 3 frames" in refused(sheet, missing)
     small = write_recording(
         tmp_path / "small",
         {n: np.ones((10, 10)) for n in range(4)},
-        plan=illumination_plan(GROUPS, exposure_ms=1),
+        plan=illumination_plan(group_lights(GROUPS), exposure_ms=1),
     )
     assert "24 x 30" in refused(sheet, small)
 
@@ -208,12 +208,3 @@ def test_the_plan_command_writes_what_runs(tmp_path: Path, capsys: pytest.Captur
 def test_groups_that_are_none_are_refused(text: str, says: str) -> None:
     with pytest.raises(BenchError, match=says):
         groups_from_text(text)
-
-
-def test_a_lattice_groups_leds_by_place() -> None:
-    x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 1.0])
-    groups = lattice_groups(np.column_stack([x.ravel(), y.ravel()]), 2)
-    assert groups == [[0], [1, 2], [3], [4, 5]]
-    assert lattice_groups([[0, 0], [1, 0]], 1) == [[0, 1]]
-    with pytest.raises(BenchError, match="--lattice"):
-        lattice_groups([[0, 0]], 0)

@@ -10,6 +10,7 @@ from instrument.bench.config import DEVICE_TABLES, PLAIN_TABLES
 from instrument.bench.config_file import default_text, parse_config
 from instrument.bench.config_reference import reference
 from instrument.cli import COMMANDS
+from instrument.cli.reference import page as options_page
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
 
@@ -20,6 +21,17 @@ def test_the_configuration_reference_is_what_the_models_say() -> None:
     assert page == reference(), (
         "renew it: python -m instrument.bench.config_reference > docs/reference/bench-toml.md"
     )
+
+
+def test_the_reference_of_options_is_what_they_are_declared_to_be() -> None:
+    page = (DOCS / "options.md").read_text("utf-8")
+    assert page == options_page(), "renew it: python -m instrument.cli.reference > docs/reference/options.md"
+
+
+def test_no_option_is_without_words() -> None:
+    rows = [line for line in options_page().splitlines() if line.startswith("| `")]
+    assert len(rows) > 80
+    assert [row for row in rows if row.endswith("|  |")] == []
 
 
 def test_the_configuration_reference_explains_every_key() -> None:

@@ -9,8 +9,9 @@ from recon.base import fft
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
-from recon.solvers import Admm, Fista, LiteralAdmm, Penalties, StoppingRules, StopReason
+from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
 from recon.solvers.prior_splits import split_prior
+from tests.recon.solvers.literal_admm import LiteralAdmm
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),

@@ -13,16 +13,17 @@ from recon.camera.erasures import Erasures
 from recon.camera.local_convolution import FieldOfPsfs, local_convolution
 from recon.camera.low_rank import low_rank
 from recon.priors import L1, NonNegativity, TotalVariation
-from recon.solvers import Admm, Fista, LiteralAdmm, SensorAdmm, StoppingRules, StopReason
+from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.gpu_camera import DepthCamera
 from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
 from recon.solvers.gpu_picture import picture_solver
 from recon.solvers.gpu_total_variation import PlainTotalVariation
-from recon.solvers.literal_volume import LiteralAdmm as LiteralVolume
 from recon.solvers.operator_admm import OperatorAdmm
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.tv_admm_volume import LeanTotalVariation
+from tests.recon.solvers.literal_admm import LiteralAdmm
+from tests.recon.solvers.literal_volume import LiteralAdmm as LiteralVolume
 
 RNG = np.random.default_rng(0)
 SENSOR = (12, 13)

@@ -10,8 +10,8 @@ from recon.camera.convolution3d import Convolution3D
 from recon.priors import L1, NonNegativity
 from recon.solvers import Fista, StoppingRules, StopReason
 from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.literal_volume import LiteralAdmm
 from recon.solvers.tv_admm_volume import LeanTotalVariation
+from tests.recon.solvers.literal_volume import LiteralAdmm
 
 LONG = StoppingRules(iterations=3000, tolerance=1e-7)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration_routines.psf.psf_quality import block_mean, remove_low_frequencies
+from calibration_routines.psf.psf_quality import remove_low_frequencies
+from recon.base.blocks import block_mean
 
 
 def test_a_slow_gradient_under_sharp_spots_goes_and_the_spots_stay() -> None:

@@ -101,7 +101,7 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path, record: Any, messag
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"tea\.json: does not exist\. Make one: brew"):
+    with pytest.raises(FileError, match=r"tea\.json: there is no such file\. Make one: brew"):
         TEA.read(tmp_path / "tea.json")
 
 

@@ -14,8 +14,8 @@ from recon.camera.registration import displacement, shifted
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser
 from recon.optics.grid import PixelGrid
-from recon.optics.rays import RayPropagator
 from recon.optics.spectrum import mixed_spectrum
+from tests.recon.optics.rays import RayPropagator
 
 SENSOR, PSF = (16, 18), (7, 5)
 POINTS = np.array([(r, c) for r in (-4, 4) for c in (-5, 5)], float)

@@ -10,7 +10,7 @@ import pytest
 from recon import Calibration, InputError, NoiseModel, reconstruct
 from recon.base.metrics import psnr
 from recon.streams.live import LivePicture, LiveReconstructor
-from recon.streams.live_level import Level, binned
+from recon.streams.live_level import Level
 from recon.streams.pace import HOLD, Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
 
@@ -484,12 +484,3 @@ def test_pace_tells_from_wiener_pictures_that_there_is_time_again() -> None:
     for _ in range(7):
         pace.note_filter(Spent(5, 5))
     assert pace.affordable(1, 33) == 2
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3, 5])
-def test_binning_averages_blocks(factor: int) -> None:
-    image = np.random.default_rng(0).integers(0, 65536, (2, 31, 47)).astype(np.uint16)
-    height, width = (n // factor for n in image.shape[1:])
-    cut = image[:, : height * factor, : width * factor].astype(float)
-    expected = cut.reshape(2, height, factor, width, factor).mean(axis=(2, 4))
-    np.testing.assert_allclose(binned(image, factor), expected, rtol=1e-6)

@@ -8,8 +8,8 @@ from scipy import ndimage
 
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.grid import PixelGrid
-from recon.optics.rays import RayPropagator
 from recon.optics.wave import WavePropagator
+from tests.recon.optics.rays import RayPropagator
 
 DISTANCE_UM = 3000.0
 

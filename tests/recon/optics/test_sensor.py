@@ -9,7 +9,8 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from recon.optics.sensor import FixedPattern, Readout, SensorSpec, bin_sum, expose, fixed_pattern
+from recon.base.blocks import block_sum
+from recon.optics.sensor import FixedPattern, Readout, SensorSpec, expose, fixed_pattern
 
 SHAPE = (200, 200)
 READOUT = Readout(
@@ -144,7 +145,7 @@ def test_fixed_pattern_has_the_spreads_of_its_data_sheet() -> None:
 
 def test_binning_sums_pixels() -> None:
     image = np.arange(30, dtype=np.float32).reshape(5, 6)
-    np.testing.assert_array_equal(bin_sum(image, 2), [[14, 22, 30], [62, 70, 78]])
+    np.testing.assert_array_equal(block_sum(image, 2), [[14, 22, 30], [62, 70, 78]])
     pattern = fixed_pattern(SPEC, seed=1)
     binned = pattern.binned(2)
     assert binned.response.mean() == pytest.approx(pattern.response.mean(), rel=1e-4)
