@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,19 +38,25 @@ class Behaviour:
         Of that dialogue, as QFileDialog has them.
     must_exist : bool
         Whether a path must name something that is there.
+    needed : bool
+        Whether it must be given here, although the declaration lets it be left out.
+    needed_when : callable, optional
+        Called when it was left out; returns why it is needed, empty where it is not.
     understand : callable, optional
         Turns a text into the value in place of the declaration; BenchError with the reason where it cannot.
     require : callable, optional
         Called with a value that the declaration allows; returns why it cannot be all the same, empty where
         it can.
     enabled_when : callable, optional
-        Called with the form's present values by name, but those of texts; returns why the field does not
-        apply, empty where it does. One that does not apply has its default.
+        Called with what is chosen and ticked in the form, by name; returns why the field does not apply,
+        empty where it does. One that does not apply has its default.
     """
 
     browse: Browse = "open"
     filters: str = ""
     must_exist: bool = False
+    needed: bool = False
+    needed_when: Callable[[], str] | None = None
     understand: Callable[[str], Any] | None = None
     require: Callable[[Any], str] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
@@ -169,6 +177,8 @@ class NumberField(OptionField):
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
         number, problem = self.widget.typed()
+        if number is None and not problem and self.behaviour.needed_when is not None:
+            problem = self.behaviour.needed_when()
         return (None, problem) if number is None or problem else (self._in_own_unit(number), "")
 
     def raw(self) -> object:
@@ -223,9 +233,9 @@ class ChoiceField(OptionField):
         self.whole = self.widget
         narrow(self.widget)
         self.widget.setToolTip(self.tip)
-        none_word = option.declaration.none_word
-        if none_word or option.default is None:
-            self.widget.addItem(none_word or AUTOMATIC, None)
+        if type(None) in typing.get_args(option.type):
+            word = AUTOMATIC if option.default is None else "none"
+            self.widget.addItem(option.declaration.none_word or word, None)
         if bool in option.kinds:
             self.widget.addItem("yes", True)
             self.widget.addItem("no", False)
@@ -270,7 +280,8 @@ class EntryField(OptionField):
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         super().__init__(option, behaviour)
-        empty = default_shown(option) or ("none" if option.default is None else "")
+        optional = option.default is None and not behaviour.needed
+        empty = default_shown(option) or ("none" if optional else "")
         self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=empty)
         self.whole = self.widget
         if option.kinds == (Path,):
@@ -280,7 +291,7 @@ class EntryField(OptionField):
 
     def _understood(self, text: str) -> Any:
         if not text:
-            if self.option.is_required:
+            if self.option.is_required or self.behaviour.needed:
                 raise BenchError(f"{self.bare_label} is needed here.")
             return self.option.default
         try:
@@ -299,7 +310,10 @@ class EntryField(OptionField):
 
     def _parts(self, text: str) -> str | list[str]:
         """Return one text, or the parts of what is repeated or has several words."""
-        if self.option.declaration.parse is None:
+        said = self.option.declaration
+        if said.parse_all is not None:
+            return re.split(r"[,;]?\s+", text)
+        if said.parse is None:
             has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
             return text.replace(",", " ").split() if has_parts else text
         return [part.strip() for part in text.split(";") if part.strip()] if self.option.item else text

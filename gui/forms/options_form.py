@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QVBoxLayout, QWidget
 
-from gui.forms.fields import Behaviour, EntryField, LinesField, OptionField, Told, field_for
+from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, Told, field_for
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, options_of
 from recon.errors import InputError
@@ -17,6 +17,8 @@ from recon.errors import InputError
 FOLDED = ("Rarely needed", "Advanced")
 """Groups that are folded away, wherever they are declared."""
 
+_MARGINS = (2, 6, 8, 2)
+_ABOVE_HEADING_PX = 6
 _T = TypeVar("_T")
 
 
@@ -74,7 +76,7 @@ class OptionsForm(QWidget):
         self._hidden: set[str] = set()
         self._disabled: dict[str, str] = {}
         layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setContentsMargins(*_MARGINS)
         usual, seldom = QWidget(), QWidget()
         self._fill(usual, [f for f in self.fields.values() if not self._is_folded(f)])
         self._fill(seldom, [f for f in self.fields.values() if self._is_folded(f)])
@@ -173,12 +175,13 @@ class OptionsForm(QWidget):
         """Whether a field is shown for what is asked for, and goes with the others."""
         return name not in self._hidden and name not in self._disabled
 
-    def show_for(self, *subjects: str) -> None:
-        """Show what is declared to apply to one of these subjects, or to everything."""
+    def show_for(self, *subjects: str, but_not: Collection[str] = ()) -> None:
+        """Show what is declared to apply to one of these subjects, or to everything, but not some fields."""
         self.hide_fields(
             name
             for name, field in self.fields.items()
-            if (about := field.option.declaration.applies) and not set(about) & set(subjects)
+            if name in but_not
+            or ((about := field.option.declaration.applies) and not set(about) & set(subjects))
         )
 
     def hide_fields(self, names: Iterable[str]) -> None:
@@ -264,6 +267,7 @@ class OptionsForm(QWidget):
             if group and (len(groups) > 1) and group not in FOLDED:
                 self._headings[group] = heading = QLabel(group)
                 heading.setProperty("role", "heading")
+                heading.setContentsMargins(0, _ABOVE_HEADING_PX if rows.rowCount() else 0, 0, 0)
                 rows.addRow(heading)
             for field in (f for f in fields if self._group(f) == group):
                 self._add(rows, field)
@@ -316,11 +320,9 @@ class OptionsForm(QWidget):
     def _update_enabled(self) -> None:
         """Disable what does not go with the others, with the reason as its tool tip."""
         ruled = {name: rule for name, f in self.fields.items() if (rule := f.behaviour.enabled_when)}
-        # Texts have no say: to read one may look for a file.
-        usable = {
-            n: f for n, f in self.fields.items() if n not in self._hidden and not isinstance(f, EntryField)
-        }
-        present = {n: f.read()[0] for n, f in usable.items()} if ruled else {}
+        chosen = (ChoiceField, SwitchField)  # texts have no say: to read one may look for a file
+        usable = {n: f for n, f in self.fields.items() if n not in self._hidden and isinstance(f, chosen)}
+        present = {name: field.read()[0] for name, field in usable.items()}
         for name, rule in ruled.items():
             field, why = self.fields[name], rule(present)
             if why == self._disabled.get(name, ""):
