@@ -20,7 +20,6 @@ from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
-from gui.python_lines import expression
 from gui.widgets.entry import existing_path
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
@@ -35,7 +34,7 @@ from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
 from instrument.reconstruction.result_list import free_name
 from instrument.runs.run_control import EndedEarlyError, RunControl
-from recon.base.declare import option
+from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
 _INTERVAL_S = 0.25
@@ -262,34 +261,38 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
 
     ``weights`` is the expression that makes the weights; None where there are none.
     """
-    options = expression(replace(order.options, weights=None))
+    imports = Imports(
+        {
+            ("instrument.bench.config_file", "load_config"),
+            ("instrument.bench.display_setup", "bench_display"),
+            ("instrument.bench.display_setup", "slm_size"),
+            ("instrument.display.hologram_file", "HologramFiles"),
+            ("instrument.display.hologram_job", "compute_and_judge"),
+            ("instrument.display.hologram_job", "prepare_target"),
+            ("instrument.files.images", "read_image"),
+        }
+    )
+    options = expression(replace(order.options, weights=None), imports)
     if weights is not None:
+        imports.names |= {("dataclasses", "replace"), ("recon.holography", weights.partition("(")[0])}
         options = f"replace({options}, weights={weights})"
-    imports = [
-        "from instrument.bench.config_file import load_config",
-        "from instrument.bench.display_setup import bench_display, slm_size",
-        "from instrument.display.hologram_file import HologramFiles",
-        "from instrument.display.hologram_job import compute_and_judge, prepare_target",
-        "from instrument.files.images import read_image",
-        "from recon.holography import HologramOptions, foveal_weights, painted_weights",
-    ]
     lines = [
-        f"config = load_config({'None' if config.path is None else expression(config.path)})",
+        f"config = load_config({'None' if config.path is None else expression(config.path, imports)})",
         f"options = {options}",
         "display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))",
     ]
     if order.alignment is not None:
-        imports.append("from instrument.files.alignment_file import load_alignment")
-        lines.append(f"display = load_alignment({expression(order.alignment)}).of(display)")
+        imports.names.add(("instrument.files.alignment_file", "load_alignment"))
+        lines.append(f"display = load_alignment({expression(order.alignment, imports)}).of(display)")
     lines += [
-        f"planes = {expression([(order.picture, order.z_mm), *order.further])}",
+        f"planes = {expression([(order.picture, order.z_mm), *order.further], imports)}",
         "targets = [",
         "    prepare_target(read_image(picture).pixels, display, options, z_mm=z_mm)",
         "    for picture, z_mm in planes",
         "]",
         "result = compute_and_judge(display, targets, options)",
-        f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, options, [display])",
+        f"out = {expression(order.out, imports)}",
+        "files = HologramFiles(out, config.display.slm_binning, options, [display])",
         "files.write(0, 0, result)",
     ]
-    head = ["from dataclasses import replace", "from pathlib import Path", "", *sorted(imports), ""]
-    return "\n".join([*head, *lines, ""])
+    return "\n".join([*imports.lines(), "", *lines, ""])

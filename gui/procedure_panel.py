@@ -20,12 +20,11 @@ from PySide6.QtWidgets import (
 )
 
 from calibration_routines.procedure import Outcome, Outlook, Procedure
-from gui.forms.as_python import script
 from gui.forms.field import Form
 from gui.forms.options_form import OptionsForm, scrolled
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun, Situation
+from gui.procedure_run import Ended, ProcedureRun, Situation, script
 from gui.session import BenchSession
 from gui.widgets.run_bar import RunBar
 from instrument.bench.bench import Bench

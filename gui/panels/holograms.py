@@ -24,7 +24,6 @@ from gui.hologram_work import (
 )
 from gui.jobs import BusyError, Job
 from gui.panel import Panel
-from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.widgets.hologram_views import HologramViews
 from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsMode
@@ -33,7 +32,7 @@ from instrument.display.hologram_job import field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.reconstruction.result_list import free_name
-from recon.base.declare import option, options_of
+from recon.base.declare import expression, option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions
 from recon.holography.display import require_defocus

@@ -27,7 +27,6 @@ from gui.background_reading import NewestOnly
 from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
-from gui.python_lines import expression
 from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
 from gui.theme import as_shown
@@ -43,6 +42,7 @@ from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.result_export import export_result
 from instrument.reconstruction.result_list import find_results, free_name
 from instrument.reconstruction.stored_result import StoredResult, open_result
+from recon.base.declare import expression
 from recon.reconstruction.choice import Choice
 
 Views = dict[Path, npt.NDArray[np.uint8]]

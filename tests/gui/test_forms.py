@@ -15,7 +15,6 @@ from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from calibration_routines.psf.sweep_request import AxialRequest
 from gui.forms.alignment import ALIGNMENT
-from gui.forms.as_python import script
 from gui.forms.routines import (
     ANGULAR,
     AXIAL,
@@ -28,6 +27,7 @@ from gui.forms.routines import (
     SLM,
     VOLUME,
 )
+from gui.procedure_run import script
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, led_microscope_text
 from instrument.files.errors import BenchError, SettingsError
