@@ -30,8 +30,7 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.formatting import duration
-from instrument.live.full_picture import MOST_ITERATIONS, full_picture
-from instrument.live.live import LiveResult
+from instrument.live.live import MOST_ITERATIONS, LiveResult, full_picture
 from instrument.reconstruction.job import find_calibration
 from instrument.runs.snapshot import Light, light_of
 from recon.reconstruction.result import Reconstruction

@@ -13,8 +13,7 @@ from instrument.bench.photograph import Snapshot
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.formatting import duration, size
-from instrument.runs.recorder import RecordingStatus
-from instrument.runs.recording import prepare_recording
+from instrument.runs.recorder import RecordingStatus, prepare_recording
 from instrument.runs.run import Run
 from instrument.runs.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
 from recon.base.declare import option

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from drivers.common.framing import LineFramer, Verdict
 from drivers.errors import DeviceError
-from drivers.illuminate.dialect import Firmware1, Firmware2, dialect_of
 from drivers.illuminate.geometry import read_geometry
-from drivers.illuminate.link import Link
+from drivers.illuminate.link import Firmware1, Firmware2, Link, dialect_of
 from drivers.illuminate.protocol import (
     Version,
     parse_properties,

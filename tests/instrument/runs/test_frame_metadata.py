@@ -23,7 +23,7 @@ from instrument.files.images import read_image, write_image
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import acquire
 from instrument.runs.layout import LOG
-from instrument.runs.recording import record
+from instrument.runs.recorder import record
 from instrument.runs.run import Run
 from instrument.runs.snapshot import Light, read_snapshot, write_snapshot
 
