@@ -30,7 +30,7 @@ from instrument.files.alignment_file import load_alignment
 from instrument.files.atomic import check_writable
 from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
-from instrument.reconstruction.result_list import free_name
+from instrument.reconstruction.result_list import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
@@ -169,7 +169,7 @@ def photograph(
     pattern = computed.order.out
     if make_folder:
         pattern.parent.mkdir(parents=True, exist_ok=True)
-    out = free_name(pattern.parent, f"{pattern.stem}-seen", ".png")
+    out = free_result(pattern.parent, f"{pattern.stem}-seen", ".png")
     check_writable(out)  # before the bench is touched
     control = RunControl()
 

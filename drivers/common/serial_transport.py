@@ -18,7 +18,7 @@ from typing import Any
 
 import serial
 
-from drivers.common.framing import Framer, LineFramer, Matcher, Verdict
+from drivers.common.framing import Belongs, Framer, LineFramer, Matcher
 from drivers.device import port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
 from drivers.registry.claim import holder_of
@@ -347,15 +347,15 @@ class SerialTransport:
     def _dispatch(self, message: bytes) -> None:
         with self._changed:
             awaited = self._awaited
-            verdict = Verdict.OTHER
+            verdict = Belongs.OTHER
             if awaited is not None and not awaited.done and awaited.error is None:
                 verdict = awaited.matcher(message)
-                if verdict is not Verdict.OTHER:
+                if verdict is not Belongs.OTHER:
                     awaited.messages.append(message)
-                if verdict is Verdict.END:
+                if verdict is Belongs.END:
                     awaited.done = True
                     self._changed.notify_all()
-        if verdict is Verdict.OTHER:
+        if verdict is Belongs.OTHER:
             self.unmatched += 1
             _log.debug("%s: %s belongs to no command", self.device, _shown(message))
             if self._on_message is not None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 
 from drivers.camera import Roi, TriggerMode
-from drivers.common.pixels import prepare
+from drivers.common.pixels import compile_kernels
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.v4l2 import api
@@ -239,7 +239,7 @@ class V4l2ImageSettings(V4l2Settings):
             shape = region.height, region.width
         made = set_format(self._device, wanted, shape)
         self._format, self._made = wanted, made
-        prepare(wanted.pixels.packing)
+        compile_kernels(wanted.pixels.packing)
         self._can_crop = region is not None and (region.height, region.width) == (made.height, made.width)
         self._origin = (region.top, region.left) if self._can_crop and region is not None else (0, 0)
         self._roi = self._whole = Roi(0, 0, made.height, made.width)

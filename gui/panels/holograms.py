@@ -54,7 +54,7 @@ from instrument.bench.display_setup import depth_limit_mm
 from instrument.display.hologram_job import HologramResult, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.reconstruction.result_list import free_name
+from instrument.reconstruction.result_list import free_result
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions, Scores
 from recon.holography.display import require_defocus
@@ -534,7 +534,7 @@ class HologramsPanel(Panel):
     def _suggest_out(self) -> None:
         if self.out.text() not in ("", str(self._suggested)):
             return  # a name that was chosen stays
-        self._suggested = free_name(self._suggestions, Path(self.picture.text()).stem or "slm", ".png")
+        self._suggested = free_result(self._suggestions, Path(self.picture.text()).stem or "slm", ".png")
         self.out.setText(str(self._suggested))
 
     def _show_mode(self) -> None:

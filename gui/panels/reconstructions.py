@@ -41,7 +41,7 @@ from instrument.files.volume_zarr import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.result_list import find_results, free_result
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.reconstruction.choice import Choice
 
@@ -322,7 +322,7 @@ class ReconstructionsPanel(Panel):
             return
         folder = self.session.runs_folder / "reconstructions"
         stem = Path(self.form.image.text()).stem or "reconstruction"
-        self._suggested = free_name(folder, stem, ".tif")
+        self._suggested = free_result(folder, stem, ".tif")
         field.setText(str(self._suggested))
 
     def reconstruct(self) -> Job | None:

@@ -24,7 +24,7 @@ from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.bench.config_file import load_config
 from instrument.bench.lights import Ask, Lights, SceneSwitch
 from instrument.bench.photograph import Snapshot, photograph
-from instrument.bench.safety import ClosingAtExit, Step, StepsFailedError, safe_steps, try_all
+from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
 from instrument.bench.source_mount import Position, SourceMount, known_geometry
 from instrument.files.errors import BenchError
 from recon.types import Geometry
@@ -345,7 +345,7 @@ class Bench:
         self._opened.discard(device)
         device.close()
 
-    def _safe_steps(self) -> list[Step]:
+    def _safe_steps(self) -> list[SafeStep]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe
         return safe_steps(
             self.led_array,

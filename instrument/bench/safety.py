@@ -85,7 +85,7 @@ class ClosingAtExit:
             )
 
 
-Step = tuple[str, Callable[[], None]]
+SafeStep = tuple[str, Callable[[], None]]
 """A step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it."""
 
 LIGHT_DOUBT = "The light may be on"
@@ -117,14 +117,14 @@ def safe_steps(
     camera: Camera,
     slm: Slm | None,
     opened: Collection[Device],
-) -> list[Step]:
+) -> list[SafeStep]:
     """Return the steps that make a bench safe: light off, motion stopped, exposure ended, SLM blank.
 
     Devices that are closed by then are safe already; ``slm`` is left out where it may keep its image. An LED
     array or a stage among ``opened`` (opened by the bench and not closed by it) that is not open was lost: it
     may shine or move on, and its step fails.
     """
-    steps: list[Step] = []
+    steps: list[SafeStep] = []
     if led_array is not None:
         steps.append(
             (f"light off, {led_array.name}", _made_sure(led_array, led_array.off, opened, LIGHT_DOUBT))
@@ -170,7 +170,7 @@ def _made_sure(
     return run
 
 
-def try_all(steps: Iterable[Step]) -> None:
+def try_all(steps: Iterable[SafeStep]) -> None:
     """Run every step in order, each even if those before it failed or were interrupted.
 
     Parameters

@@ -18,7 +18,7 @@ from instrument.files.formatting import duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
 from instrument.plan.file import load_plan, save_plan
 from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
-from instrument.plan.patterns import PATTERNS, led_shape, pattern_help, shape_from_text
+from instrument.plan.patterns import LED_PATTERNS, led_shape, pattern_help, shape_from_text
 from instrument.runs.acquire import abilities_of
 
 Point = tuple[float, float]
@@ -136,7 +136,7 @@ def illumination(
         typer.Option(
             "--pattern",
             metavar="NAME",
-            help=f"A named pattern and all that belong to it: {', '.join(PATTERNS)}. With options: "
+            help=f"A named pattern and all that belong to it: {', '.join(LED_PATTERNS)}. With options: "
             "'half na=0.3'. diffuserbench plan patterns lists them.",
             show_default=False,
         ),
