@@ -14,7 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
-from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
+from calibration_routines.display.hologram_photograph import (
+    CaptureOptions,
+    Photographed,
+    photograph_hologram,
+    write_capture,
+)
 from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
@@ -191,7 +196,7 @@ def photograph(
                 list(computed.result.hologram.slm),
                 computed.display,
                 computed.target,
-                average=average,
+                CaptureOptions(average=average),
             )
             bench.safe_state()
     except EndedEarlyError as error:

@@ -23,8 +23,8 @@ from PySide6.QtWidgets import (
 
 from calibration_routines.procedure import Outcome, Outlook, Procedure
 from gui.forms.as_python import script
-from gui.forms.field import Form
 from gui.forms.options_form import OptionsForm
+from gui.forms.routines import Form
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.procedure_run import Ended, ProcedureRun, Situation

@@ -13,12 +13,12 @@ from rich.console import Console
 from calibration_routines import finish_sweep, is_sweep, watch_resumed
 from calibration_routines.plan_procedures import finish_simple
 from calibration_routines.psf.sweep import FOLDER
-from calibration_routines.psf.sweep_procedure import event_lines
+from calibration_routines.psf.sweep_procedure import event_lines, sweep_outcome
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, open_and_say
+from instrument.cli.calibrate import print_lines, print_outcome
 from instrument.cli.progress import keys, one_task, progress_bar
-from instrument.cli.sweeping import describe_result, print_lines
 from instrument.files.formatting import duration, size
 from instrument.plan import Plan, check
 from instrument.plan.file import load_plan
@@ -177,16 +177,15 @@ def _finish(run: Path, bench: Bench | None) -> None:
     """Make a sweep's calibration of its complete run, with retakes where there is a bench."""
     with one_task("Analysing") as advance:
         done = finish_sweep(run, bench, on_analysis=advance)
-    describe_result(Console(), done)
+    print_outcome(Console(), sweep_outcome(done))
 
 
 def _finish_others(run: Run) -> None:
     """Make the result of a complete run of calibrate angular or dpc that has none yet."""
     with one_task("Analysing"):
         outcome = finish_simple(run)
-    if outcome is None:
-        return
-    print_lines(Console(), [*outcome.verdict, *(f"Wrote        {file}" for file in outcome.files)])
+    if outcome is not None:
+        print_outcome(Console(), outcome)
 
 
 def _close_recording(run: Run) -> None:

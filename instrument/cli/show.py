@@ -12,6 +12,7 @@ import typer
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
 from calibration_routines.display.hologram_photograph import (
+    CaptureOptions,
     display_of_pattern,
     envelope_of_pattern,
     photograph_hologram,
@@ -39,8 +40,8 @@ _PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photograph
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowOptions:
-    """How a hologram is shown and photographed, or where the picture of a run goes."""
+class _Shown:
+    """How a hologram is shown."""
 
     slm_calibration: Path | None = option(None, help="From calibrate slm.", applies=_PATTERN, group=_SHOWN)
     alignment: Path | None = option(
@@ -63,14 +64,12 @@ class ShowOptions:
         None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=_PHOTOGRAPHED
     )
     target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=_PHOTOGRAPHED)
-    average: int = option(4, help="Photographs a frame.", least=1, applies=_PATTERN, group=_PHOTOGRAPHED)
-    refine: int = option(
-        0,
-        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
-        least=0,
-        applies=_PATTERN,
-        group=_PHOTOGRAPHED,
-    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions(CaptureOptions, _Shown):
+    """How a hologram is shown and photographed, or where the picture of a run goes."""
+
     as_is: bool = option(
         False,
         help="Ask nobody; the laser stays on, and the background is estimated.",
@@ -201,8 +200,7 @@ def _capture(
         prepare_target(
             read_image(options.target).pixels, display, HologramOptions(envelope=envelope_of_pattern(facts))
         ),
-        average=options.average,
-        refine=options.refine,
+        options,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
     )
     mark = " (SIMULATED)" if found.simulated else ""
