@@ -27,11 +27,10 @@ from recon.optics.fall_off import (
 )
 from recon.optics.grid import PixelGrid
 from recon.optics.render import RenderSettings, render
-from recon.optics.scene import Scene
+from recon.optics.scene import Scene, TruthGrid, true_scene
 from recon.optics.scenes import bar_target, bead_volume, picture, tilted_target
 from recon.optics.sensor import SensorSpec
 from recon.optics.spectrum import mixed_spectrum
-from recon.optics.truth import true_scene
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
 
@@ -355,15 +354,17 @@ class SimulatedWorld(Surroundings):
             raise ValueError("There is no scene, so there is no ground truth.")
         return true_scene(
             self._scene,
-            shape,
-            pitch_um,
-            self.distance_um,
+            TruthGrid(
+                shape,
+                pitch_um,
+                self.distance_um,
+                source_um or (0.0, 0.0, 1.0),
+                layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
+                bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,
+            ),
             z_um=z_um,
-            source_um=source_um or (0.0, 0.0, 1.0),
             light=self._glow(self.options.scene_rgb),
             sensitivity=None if color else self.sensor.quantum_efficiency,
-            layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
-            bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,
             fall_off=self.fall_off if collected else None,
         )
 
