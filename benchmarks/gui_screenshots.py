@@ -325,13 +325,16 @@ def _hologram(window: MainWindow) -> None:
 
     panel = window.show_panel("holograms")
     assert isinstance(panel, HologramsPanel)
-    panel.picture.setText(str(panel.session.runs_folder.parent / "portrait.png"))
-    panel.picture.check()
     alignments = sorted(panel.session.runs_folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
-    panel.alignment.setText(str(alignments[-1]))
-    panel.weights_mode.setCurrentText("a fovea, dragged")
+    panel.form.set_values(
+        {
+            "picture": panel.session.runs_folder.parent / "portrait.png",
+            "alignment": alignments[-1],
+            "counts": "a fovea, dragged",
+            "iterations": 60,
+        }
+    )
     panel.target.set_fovea((0.42, 0.5), 0.24)
-    panel.iterations.setText("60")
     for start in (panel.compute, panel.photograph):
         job = start()
         if job is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
 from gui.python_lines import expression
+from gui.widgets.entry import existing_path
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
@@ -33,10 +35,12 @@ from instrument.display.hologram_file import HologramFiles
 from instrument.display.hologram_job import HologramResult, compute_and_judge, prepare_target
 from instrument.files.alignment_file import load_alignment
 from instrument.files.atomic import check_writable
+from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
 from instrument.reconstruction.result_list import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from recon.base.declare import option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
 _INTERVAL_S = 0.25
@@ -44,28 +48,62 @@ _FRAME_S = 0.02
 """How long each of several frames is shown before the next is sent; the SLM's settling comes on top."""
 
 
-@dataclass(frozen=True, slots=True)
-class HologramOrder:
-    """A hologram of one picture, as the panel's fields have it.
+def plane_of(text: str) -> tuple[Path, float]:
+    """Return a picture in another plane and its depth in mm, from ``FILE @ DEPTH mm``.
 
-    Attributes
-    ----------
-    picture : Path
-    out : Path
-    z_mm : float
-        Depth behind the focal plane.
-    alignment : Path or None
-        From ``align mask``.
-    further : tuple of (Path, float)
-        Pictures in other planes, each with its depth in mm behind the focal plane.
-    options : HologramOptions
+    Raises
+    ------
+    BenchError
+        When it is not understood, or there is no such file.
     """
+    name, at, depth = text.rpartition("@")
+    bare = depth.strip().removesuffix("mm").strip()
+    if not at or not bare:
+        raise BenchError(f"{text!r}: write FILE @ DEPTH mm, e.g. far.png @ 40 mm.")
+    try:
+        z_mm = float(bare.replace(",", "."))
+    except ValueError:
+        raise BenchError(f"The depth {bare!r} is no number of mm.") from None
+    if not math.isfinite(z_mm):
+        raise BenchError(f"The depth must be a finite number of mm, not {bare}.")
+    return existing_path(name.strip()), z_mm
 
-    picture: Path
-    out: Path
-    z_mm: float = 0.0
-    alignment: Path | None = None
-    further: tuple[tuple[Path, float], ...] = ()
+
+def pattern_png(text: str) -> Path:
+    """Return the name of a pattern; ValueError where it is none."""
+    path = Path(text).expanduser()
+    if path.suffix.lower() != ".png":
+        raise ValueError("the pattern needs a name that ends in .png.")
+    return path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HologramOrder:
+    """A hologram of one picture: the files, the planes, and how it is computed."""
+
+    picture: Path = option(help="The picture to show.", group="Picture")
+    z_mm: float = option(0.0, help="Behind the focal plane.", unit="mm", label="Depth", group="Picture")
+    further: tuple[tuple[Path, float], ...] = option(
+        (),
+        help="Pictures in other planes, each with its depth; several are separated by semicolons.",
+        default_words="none (FILE @ 40 mm; …)",
+        metavar="FILE @ DEPTH mm",
+        parse=plane_of,
+        label="Further planes",
+        group="Picture",
+    )
+    alignment: Path | None = option(
+        None,
+        help="Of the mask, from align mask: alignment.json.",
+        default_words="not aligned",
+        group="Display",
+    )
+    out: Path = option(
+        help="8-bit phase, 256 levels a turn; .json and a preview go beside it.",
+        parse=pattern_png,
+        label="Pattern",
+        group="Result",
+    )
     options: HologramOptions = field(default_factory=HologramOptions)
 
     def display(self, config: BenchConfig, size: tuple[tuple[int, int], float]) -> Display:

@@ -61,6 +61,10 @@ class Declaration:
     parse : callable, optional
         Makes the value of the words that people type, where the type does not tell how; raises InputError or
         ValueError with a sentence. Given once for each word of a repeated option.
+    parse_all : callable, optional
+        Makes one value of all the words of an option that may be repeated (``NAME=VALUE``, say).
+    replaced : mapping of str to str
+        Words that it could be once, and what replaces them, as a sentence.
     none_word : str
         What people type for None ("auto", say); empty: None cannot be typed.
     """
@@ -83,6 +87,8 @@ class Declaration:
     recorded: bool = True
     identifies: bool = True
     parse: Callable[[str], Any] | None = None
+    parse_all: Callable[[Sequence[str]], Any] | None = None
+    replaced: Mapping[str, str] = field(default_factory=dict)
     none_word: str = ""
 
     def words(self) -> tuple[str, ...]:
@@ -165,11 +171,14 @@ class Option:
         """
         name = self.flag if typed else self.name
         if value is None:
-            return None if self.default is None else f"{name} must be given, not None."
+            may_be = self.default is None or type(None) in typing.get_args(self.type)
+            return None if may_be else f"{name} must be given, not None."
         if self.item is not None and isinstance(value, Sequence) and not isinstance(value, str):
             one = dataclasses.replace(self, type=self.item, default=0)
             return next((wrong for v in value if (wrong := one.mistake(v, typed=typed))), None)
         if (words := self.words) and isinstance(value, str) and value not in words:
+            if value in self.declaration.replaced:
+                return f"{name} {value!r} is no more: {self.declaration.replaced[value]}"
             near = difflib.get_close_matches(value, words, 1)
             meant = f"; {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
