@@ -37,7 +37,7 @@ from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.slm_correction import load_slm_correction
-from instrument.reconstruction.result_list import free_name
+from instrument.reconstruction.result_list import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -211,7 +211,7 @@ def photograph(
     pattern = computed.order.out
     if make_folder:
         pattern.parent.mkdir(parents=True, exist_ok=True)
-    out = free_name(pattern.parent, f"{pattern.stem}-seen", ".png")
+    out = free_result(pattern.parent, f"{pattern.stem}-seen", ".png")
     check_writable(out)  # before the bench is touched
     control = RunControl()
 

@@ -31,7 +31,7 @@ from instrument.bench.display_setup import depth_limit_mm, expansion_side
 from instrument.display.hologram_job import field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.reconstruction.result_list import free_name
+from instrument.reconstruction.result_list import free_result
 from recon.base.declare import expression, option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions
@@ -376,7 +376,7 @@ class HologramsPanel(Panel):
         if present not in ("", str(self._suggested)):
             return  # a name that was chosen stays
         picture = Path(str(self.form.fields["picture"].raw()))
-        self._suggested = free_name(self._suggestions, picture.stem or "slm", ".png")
+        self._suggested = free_result(self._suggestions, picture.stem or "slm", ".png")
         self.form.set_values({"out": self._suggested})
 
     def _show_mode(self) -> None:

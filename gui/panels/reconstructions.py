@@ -36,11 +36,11 @@ from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import write_image
-from instrument.files.plane_steps import uneven_steps
+from instrument.files.volume_zarr import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.result_list import find_results, free_result
 from instrument.reconstruction.stored_result import StoredResult, open_result
 from recon.base.declare import expression
 from recon.reconstruction.choice import Choice
@@ -319,7 +319,7 @@ class ReconstructionsPanel(Panel):
             return
         folder = self.session.runs_folder / "reconstructions"
         stem = Path(self.form.text("image")).stem or "reconstruction"
-        self._suggested = free_name(folder, stem, ".tif")
+        self._suggested = free_result(folder, stem, ".tif")
         self.form.options.set_values({"out": self._suggested})
 
     def _settled(self, name: str) -> None:

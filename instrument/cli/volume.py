@@ -10,7 +10,7 @@ from instrument.cli.app import saying_what_is_left
 from instrument.cli.picture import tell_choice
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
-from instrument.files.plane_steps import uneven_steps
+from instrument.files.volume_zarr import uneven_steps
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.request import VOLUME_ITERATIONS, VolumeRequest
 from instrument.reconstruction.result_file import Outputs

@@ -25,6 +25,8 @@ from instrument.bench.display_setup import bench_display, depth_limit_mm
 from instrument.files.images import read_image, write_image
 from instrument.files.slm_image import levels_phase, read_slm_image
 from recon.errors import InputError
+from recon.holography import LOSSES
+from recon.holography.losses import LowPassed
 
 WAIT_MS = 60_000
 
@@ -430,3 +432,16 @@ def test_the_depth_limit_is_that_of_the_display_itself() -> None:
     display.defocus(0.999 * limit_mm)
     with pytest.raises(InputError, match="too far for this display"):
         display.defocus(-1.001 * limit_mm)
+
+
+def test_a_registered_loss_can_be_chosen(qtbot: QtBot, make_session, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Own(LowPassed):
+        name = "own"
+        help = "As the low-passed one."
+
+    monkeypatch.setattr(LOSSES, "_foreign", dict(LOSSES._foreign))
+    LOSSES.register(Own())
+    panel = HologramsPanel(make_session())
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    assert panel.loss.findText("own") >= 0
+    assert panel.loss.currentText() == "frequency"

@@ -9,8 +9,8 @@ import pytest
 
 import recon
 from recon import InputError
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 from recon.reconstruction.decide import choose
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.planes import put_back
