@@ -33,9 +33,8 @@ from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import prepare
 from instrument.runs.durable import read_lines
-from instrument.runs.layout import RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.verification import verify
 from instrument.runs.writer import FrameToStore, RunWriter
 

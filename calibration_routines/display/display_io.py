@@ -11,8 +11,7 @@ import numpy.typing as npt
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError
-from instrument.files.slm_correction import SlmCorrection
-from instrument.files.slm_image import phase_levels
+from instrument.files.slm_image import SlmCorrection, phase_levels
 from instrument.reconstruction.preparation import darkest_block
 
 Array = npt.NDArray[Any]

@@ -22,7 +22,7 @@ from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment, load_alignment, save_alignment
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError, FileError, SettingsError
-from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import load_slm_correction
 from instrument.runs.folder import dated_name, free_name
 from instrument.runs.run_control import RunControl
 from recon.holography.pose import NAMES

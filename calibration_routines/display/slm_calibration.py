@@ -12,7 +12,7 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.spot_camera import SpotCamera
 from instrument.files.errors import BenchError
-from instrument.files.slm_correction import SlmCorrection
+from instrument.files.slm_image import SlmCorrection
 from recon.holography import Display
 from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases_from_frames

@@ -38,8 +38,7 @@ from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, SettingsError
 from instrument.plan import Plan
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.camera.registration import Registration, aligned, expected_shift, register

@@ -14,8 +14,7 @@ from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, aut
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, Part, Plan
 from instrument.runs.acquire import acquire
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.base.blocks import block_mean

@@ -25,10 +25,9 @@ from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import size
 from instrument.files.images import read_image
-from instrument.files.slm_correction import load_slm_correction
-from instrument.files.slm_image import levels_phase, read_slm_image
+from instrument.files.slm_image import levels_phase, load_slm_correction, read_slm_image
+from instrument.runs.catalogue import contact_sheet
 from instrument.runs.run import Run
-from instrument.runs.run_picture import contact_sheet
 from recon.base.declare import option
 from recon.holography import Display, HologramOptions
 

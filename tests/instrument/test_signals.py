@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 ROOT = Path(__file__).parents[2]
 SETUP = """
