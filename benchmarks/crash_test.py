@@ -9,7 +9,7 @@ every frame whose ``write`` has returned) must be there; no frame may be taken t
 log; every run must open and verify. Exit status 1 when any of it fails.
 
 ``kill -9`` ends the process, not the kernel: that everything is also synced in the right order, so that a
-power cut costs no more, is held by tests/instrument/test_store_order.py.
+power cut costs no more, is held by tests/instrument/runs/test_store_order.py.
 """
 
 from __future__ import annotations

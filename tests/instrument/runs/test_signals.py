@@ -13,7 +13,7 @@ import pytest
 
 from instrument.runs.run import Run, RunCondition
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SETUP = """
 import sys, time
 from importlib.metadata import EntryPoint
