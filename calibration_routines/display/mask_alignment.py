@@ -46,7 +46,7 @@ from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, 
 from instrument.bench.bench import Bench
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment, save_alignment
-from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
 from recon.holography import Display

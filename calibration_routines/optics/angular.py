@@ -48,8 +48,7 @@ from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
 from instrument.plan import Plan
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.base.declare import RARE, option

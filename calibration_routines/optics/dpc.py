@@ -29,8 +29,7 @@ from instrument.files.figures import save_figure
 from instrument.plan import OFF, Light, Part, Plan, check
 from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg

@@ -18,8 +18,7 @@ from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
 from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.base.blocks import block_mean

@@ -20,8 +20,7 @@ from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints
 from instrument.runs.acquire import acquire
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.runner import Progress
 
 

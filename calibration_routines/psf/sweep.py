@@ -63,8 +63,7 @@ from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.plan import Step
 from instrument.runs.acquire import acquire, prepare
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.runner import Progress, Runner
 from recon.types import Calibration, Geometry
