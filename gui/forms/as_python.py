@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any
 
 from calibration_routines.procedure import Procedure
 from instrument.plan import Plan
 from instrument.plan.file import plan_toml
-
-_LINE = 100
+from recon.base.declare import Imports, expression
 
 
 def script(procedure: Procedure, bench: Path | None) -> str:
@@ -23,15 +20,11 @@ def script(procedure: Procedure, bench: Path | None) -> str:
     bench : Path, optional
         Its bench.toml; None: the built-in simulated bench.
     """
-    imports: set[tuple[str, str]] = {("instrument.bench.bench", "open_bench")}
-    plain: set[str] = set()
-    made = expression(procedure, imports, plain)
-    lines = [f"import {name}" for name in sorted(plain)]
-    lines += [f"from pathlib import {name}" for module, name in sorted(imports) if module == "pathlib"]
-    lines += [""] if lines else []
-    lines += [f"from {module} import {name}" for module, name in sorted(imports) if module != "pathlib"]
+    imports = Imports({("instrument.bench.bench", "open_bench")})
+    made = expression(procedure, imports, special={Plan: _plan})
     opened = f"open_bench({str(bench)!r})" if bench is not None else "open_bench()"
-    lines += [
+    lines = [
+        *imports.lines(),
         "",
         f"procedure = {made}",
         f"with {opened} as bench:",
@@ -42,32 +35,7 @@ def script(procedure: Procedure, bench: Path | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def expression(value: Any, imports: set[tuple[str, str]], plain: set[str], indent: str = "") -> str:
-    """Return Python for a value; what must be imported for it is added to ``imports`` and ``plain``."""
-    if isinstance(value, Path):
-        imports.add(("pathlib", "Path"))
-        return f"Path({str(value)!r})"
-    if isinstance(value, Plan):
-        imports.add(("instrument.plan", "Plan"))
-        plain.add("tomllib")
-        return f"Plan.checked(tomllib.loads({plan_toml(value)!r}))"
-    if is_dataclass(value) and not isinstance(value, type):
-        imports.add((type(value).__module__, type(value).__name__))
-        inner = indent + "    "
-        parts = [
-            f"{field.name}={expression(getattr(value, field.name), imports, plain, inner)}"
-            for field in fields(value)
-            if getattr(value, field.name) != _default(field)
-        ]
-        one_line = f"{type(value).__name__}({', '.join(parts)})"
-        if len(one_line) + len(indent) < _LINE and "\n" not in one_line:
-            return one_line
-        listed = "".join(f"{inner}{part},\n" for part in parts)
-        return f"{type(value).__name__}(\n{listed}{indent})"
-    return repr(value)
-
-
-def _default(field: Any) -> Any:
-    if field.default is not MISSING:
-        return field.default
-    return field.default_factory() if field.default_factory is not MISSING else MISSING
+def _plan(plan: Plan, imports: Imports) -> str:
+    imports.names.add(("instrument.plan", "Plan"))
+    imports.modules.add("tomllib")
+    return f"Plan.checked(tomllib.loads({plan_toml(plan)!r}))"
