@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import (
     DisplayBench,
+    SpotCamera,
     bring_mask,
     refuse_existing,
     require_slm,
     writable,
 )
-from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.options import problems_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
 from instrument.bench.bench import Bench
