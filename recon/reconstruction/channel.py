@@ -20,14 +20,12 @@ from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolut
 from recon.camera.low_rank import low_rank
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.errors import InputError
+from recon.priors import L1, NonNegativity, Prior, TotalVariation
 from recon.reconstruction.preparation import Precision
 from recon.solvers import Solver, memory
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.gpu_camera import DepthCamera
-from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-from recon.solvers.gpu_total_variation import PlainTotalVariation
 from recon.solvers.operator_admm import OperatorAdmm
-from recon.solvers.tv_admm_volume import LeanTotalVariation
+from recon.solvers.splitting import Room, SensorData, Tuning
+from recon.solvers.tv_admm_volume import volume_solver
 
 Array = npt.NDArray[Any]
 VolumePrior = Literal["tv", "tv-isotropic", "l1", "nonnegative"]
@@ -268,74 +266,30 @@ class ChannelProblem:
         return self._solver(start), tau
 
     def _solver(self, start: Array | None) -> Solver:
-        weight = self.weight
+        data = SensorData(self.data, self.valid, self._removal)
         if isinstance(self.camera, SpatiallyVarying):
-            return self._general(self.camera, weight, start)
-        if self._namespace is not np:
-            return self._plain(self.camera, weight, start)
-        if not self.prior.startswith("tv"):
-            return DouglasRachford(
-                self.camera,
-                self.data,
-                weight,
-                valid=self.valid,
-                background=self._removal,
-                initial=start,
-                drop_empty=self.drop_empty,
-                keep_state=False,
-                storage=self._storage,
-            )
-        return LeanTotalVariation(
+            axes = np.broadcast_to(self.weights, (len(self.weights), 3)).mean(axis=0)
+            prior = self._penalty(axes, (False, False, False))
+            return OperatorAdmm(self.camera, self._central, data, prior, initial=start)
+        return volume_solver(
             self.camera,
-            self.data,
-            weight,
-            axis_weights=self.weights,
-            isotropic=self.prior == "tv-isotropic",
-            valid=self.valid,
-            background=self._removal,
+            data,
+            self._penalty(self.weights, (False, True, True)),
             initial=start,
-            keep_state=False,
-            storage=self._storage,
+            tuning=Tuning(drop_empty=self.drop_empty),
+            room=Room(self._namespace, self._storage, keep_state=False),
         )
 
-    def _plain(self, camera: Convolution3D, weight: float, start: Array | None) -> Solver:
-        """Return the solver that runs on the device's arrays."""
-        plain = DepthCamera(
-            self._namespace,
-            camera.channel_spectrum(0),
-            camera.grid_shape,
-            camera.sensor_window,
-            self.valid,
-            self._removal,
-        )
-        start = None if start is None else start[0]
+    def _penalty(self, axis_weights: Array, wrap: tuple[bool, ...]) -> Prior:
+        """Return the prior by name, with its weight."""
         if not self.prior.startswith("tv"):
-            return PlainDouglasRachford(plain, self.data[0], weight, initial=start)
-        return PlainTotalVariation(
-            plain,
-            self.data[0],
-            weight,
-            axis_weights=self.weights,
-            isotropic=self.prior == "tv-isotropic",
-            initial=start,
-        )
+            return L1(self.weight) + NonNegativity()
+        isotropic = self.prior == "tv-isotropic"
+        variation = TotalVariation(self.weight, isotropic=isotropic, axis_weights=axis_weights, wrap=wrap)
+        return variation + NonNegativity()
 
     def _peak(self, data: Array) -> float:
         """``max |A^H b|``, plane by plane: no volume for one number."""
         if isinstance(self.camera, SpatiallyVarying):
             return float(np.abs(self.camera.adjoint(data)).max())
         return max(float(np.abs(plane).max()) for plane in self.camera.adjoint_planes(data))
-
-    def _general(self, camera: SpatiallyVarying, weight: float, start: Array | None) -> Solver:
-        z, y, x = (float(w) for w in np.broadcast_to(self.weights, (len(self.weights), 3)).mean(axis=0))
-        return OperatorAdmm(
-            camera,
-            self._central,
-            self.data,
-            weight,
-            axis_weights=(z, y, x) if self.prior.startswith("tv") else None,
-            isotropic=self.prior == "tv-isotropic",
-            valid=self.valid,
-            background=self._removal,
-            initial=start,
-        )

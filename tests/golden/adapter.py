@@ -99,10 +99,10 @@ def numpy_as_device() -> Iterator[None]:
     twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
     with ExitStack() as patched:
         for name, value in (
-            ("recon.base.namespace.array_namespace", lambda _device: np),
+            ("recon.base.namespace.array_namespace", lambda _device: twin),
             ("recon.reconstruction.channel.array_namespace", lambda _device: twin),
-            ("recon.solvers.gpu_total_variation.require_memory", lambda *_: None),
-            ("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None),
+            ("recon.solvers.volume_admm.require_memory", lambda *_: None),
+            ("recon.solvers.douglas_rachford.require_memory", lambda *_: None),
         ):
             patched.enter_context(mock.patch(name, value))
         yield
