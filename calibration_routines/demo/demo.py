@@ -207,7 +207,7 @@ def _run(
             measured.calibration.calibration,
             z_um=settings.scene_z_um,
             time_s=settings.reconstruction_s,
-            callback=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
+            on_progress=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
         )
     comparison = compare(viewer.picture(result.image), viewer.truth, viewer.field)
     with stage("write the pictures"):

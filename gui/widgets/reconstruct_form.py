@@ -26,8 +26,6 @@ from gui.widgets.entry import Entry, PathEntry, existing_path, narrow, number
 from instrument.files.errors import BenchError
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import (
-    PICTURE_ITERATIONS,
-    VOLUME_ITERATIONS,
     PictureRequest,
     Settings,
     VolumeRequest,
@@ -37,8 +35,8 @@ from instrument.reconstruction.result_file import Outputs
 from instrument.reconstruction.words import parse_binning, parse_dark, parse_erasures, parse_noise
 from recon.camera.camera_model import MODELS
 from recon.priors import PRIORS
-from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
-from recon.solvers.methods import method_names
+from recon.reconstruction.solve import ITERATIONS
+from recon.reconstruction.solvers import SOLVERS, VOLUME_PRIORS
 
 CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
@@ -77,7 +75,7 @@ class ReconstructForm(QWidget):
         self.image = Entry(existing_path, tip="The photograph: TIFF, PNG or NumPy, raw counts")
         self.psfs = Entry(existing_path, tip="A calibration's folder, or a run that holds one")
         self.method = QComboBox()
-        self.method.addItems(method_names())
+        self.method.addItems(SOLVERS.names())
         self.method.setToolTip("admm: best; admm-sensor: dense scenes; fista: plain; wiener: one shot")
         self.model = QComboBox()
         self.model.addItems(MODELS)
@@ -342,8 +340,7 @@ class ReconstructForm(QWidget):
         )
         self.prior.clear()
         self.prior.addItems([_AUTOMATIC, *(VOLUME_PRIORS if volume else PRIORS)])
-        count = VOLUME_ITERATIONS if volume else PICTURE_ITERATIONS
-        self.iterations.setPlaceholderText(f"at most {count}; none with a time")
+        self.iterations.setPlaceholderText(f"at most {ITERATIONS}; none with a time")
         for widget, shown in (
             (self.method, not volume),
             (self.z_mm, not volume),

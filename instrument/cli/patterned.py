@@ -8,7 +8,7 @@ from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
-from recon.reconstruction.patterned import ITERATIONS
+from recon.reconstruction.solve import ITERATIONS
 from recon.solvers.stopping import IterationRecord, StopReason
 
 

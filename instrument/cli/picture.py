@@ -12,7 +12,7 @@ from instrument.cli.verdict import tell_verdict
 from instrument.files.checkpoint import CheckpointFolder
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
-from instrument.reconstruction.request import PICTURE_ITERATIONS, PictureRequest
+from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
@@ -66,7 +66,7 @@ def tell_choice(choice: Choice) -> None:
 
 def _solve(job: Job, request: PictureRequest, keeper: CheckpointFolder | None) -> Reconstruction:
     with progress_bar() as bar, first_interrupt_cancels() as cancel:
-        total = request.settings.limit(PICTURE_ITERATIONS) or 1000
+        total = request.settings.limit or 1000
         task = bar.add_task(request.method, total=total, note="")
 
         def show(record: IterationRecord, _picture: object) -> None:
@@ -92,9 +92,9 @@ def _tell(result: Reconstruction) -> None:
     if result.choice is not None:
         for line in result.choice.brief():
             typer.echo(line)
-    elif "model" in result.provenance:
-        typer.echo(f"{'Model':<12}{result.provenance['model']}: {result.provenance['model_reason']}")
-    typer.echo(f"{'Method':<12}{result.method}, prior {result.prior}{weight}")
+    else:
+        typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+    typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     count = len(result.history)
     if not count:
         typer.echo(f"{'Done':<12}in one step, {result.seconds:.1f} s")

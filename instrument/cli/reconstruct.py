@@ -154,11 +154,6 @@ def reconstruct(
         raise BenchError(
             f"--explain says what --model auto chooses; --model {model} leaves nothing to choose."
         )
-    if checkpoint is not None and not video and (explain or choices):
-        raise BenchError(
-            f"{'--explain' if explain else '--choose'} is about everything that --model auto chooses, which "
-            "it does not with --checkpoint. Leave one of the two out."
-        )
     if patterned is not None:
         not_patterned = {
             "--video": video,

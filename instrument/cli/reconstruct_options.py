@@ -10,7 +10,7 @@ import typer
 
 from instrument.reconstruction.mosaic import mosaic_named
 from instrument.reconstruction.preparation import Crop
-from instrument.reconstruction.request import PICTURE_ITERATIONS, Settings, known_model
+from instrument.reconstruction.request import Settings, known_model
 from instrument.reconstruction.words import (
     parse_binning,
     parse_dark,
@@ -19,6 +19,7 @@ from instrument.reconstruction.words import (
     parse_precision,
     parse_wishes,
 )
+from recon.reconstruction.solve import ITERATIONS
 
 
 class Method(enum.StrEnum):
@@ -26,7 +27,7 @@ class Method(enum.StrEnum):
 
     ADMM = "admm"
     ADMM_SENSOR = "admm-sensor"
-    ADMM_GPU = "admm-gpu"
+    ADMM_GPU = "admm-gpu"  # says what replaces it
     FISTA = "fista"
     WIENER = "wiener"
 
@@ -299,7 +300,7 @@ IterationsOption = Annotated[
         "-n",
         min=1,
         metavar="N",
-        help=f"At most N iterations. Default: {PICTURE_ITERATIONS}, or none with --time.",
+        help=f"At most N iterations. Default: {ITERATIONS}, or none with --time.",
         show_default=False,
     ),
 ]

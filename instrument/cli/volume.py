@@ -12,7 +12,7 @@ from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.cli.verdict import tell_verdict
 from instrument.files.plane_steps import uneven_steps
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
-from instrument.reconstruction.request import VOLUME_ITERATIONS, VolumeRequest
+from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.result_file import Outputs
 from instrument.reconstruction.volume_file import write_volume
 from recon.solvers.stopping import IterationRecord, StopReason
@@ -31,7 +31,7 @@ def reconstruct_to_volume(
         tell_choice(request.explain(request.prepare()))
         return
     outputs.check(0, overwrite=force)
-    limit = request.settings.limit(VOLUME_ITERATIONS)
+    limit = request.settings.limit
     with saying_what_is_left(*outputs.files()):
         job = request.prepare()
         for name, text in job.notes.items():
@@ -52,7 +52,8 @@ def reconstruct_to_volume(
                 typer.echo(line)
         else:
             typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
-        typer.echo(f"{'Memory':<12}{result.provenance['memory']}")
+        if memory := result.provenance.get("memory"):
+            typer.echo(f"{'Memory':<12}{memory}")
         count = max(len(history) for history in result.histories)
         typer.echo(
             f"{'Stopped':<12}after {count} iterations, {result.seconds:.1f} s: {result.stop_reasons[0]}"

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.files.atomic import sync_folder
-from recon.reconstruction.volume_result import VolumeGrid
+from recon.reconstruction.result import Grid
 
 SUFFIXES = (".ome.zarr", ".zarr")
 """Names that ask for OME-Zarr."""
@@ -27,7 +27,7 @@ def is_zarr_name(path: Path) -> bool:
 
 
 def write_volume_zarr(
-    path: Path, volume: npt.NDArray[np.float32], grid: VolumeGrid, attributes: dict[str, Any]
+    path: Path, volume: npt.NDArray[np.float32], grid: Grid, attributes: dict[str, Any]
 ) -> None:
     """Write a volume as OME-Zarr 0.5, whole or not at all; a folder of that name is replaced.
 
@@ -37,7 +37,7 @@ def write_volume_zarr(
         The folder to be.
     volume : ndarray, float32, (n_z, height, width) or (n_z, height, width, n_channels)
         Stored as ``z, y, x`` or, in OME-Zarr's order, ``c, z, y, x``.
-    grid : VolumeGrid
+    grid : Grid
         OME-Zarr knows one voxel size for all planes: that of the middle one is written where it is known, and
         every plane's own ``z_um`` and ``pitch_um`` beside it in the group's attribute ``diffuserbench``.
     attributes : dict
@@ -89,7 +89,7 @@ def _levels(
     return levels
 
 
-def _multiscale(name: str, grid: VolumeGrid, names: list[str], steps: list[int]) -> dict[str, Any]:
+def _multiscale(name: str, grid: Grid, names: list[str], steps: list[int]) -> dict[str, Any]:
     known = bool(np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all())
     middle = len(grid.z_um) // 2
     unit = {"unit": "micrometer"} if known else {}

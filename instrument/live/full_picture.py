@@ -10,14 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.reconstruction.preparation import bin_image
-from recon import reconstruct
+from recon import Measurement, reconstruct
 from recon.errors import InputError
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
-
-MOST_ITERATIONS = 200
-"""It mostly settles before."""
 
 
 def full_picture(
@@ -53,11 +50,9 @@ def full_picture(
         )
     background = None if calibration.background is None else np.moveaxis(calibration.background, 0, -1)
     return reconstruct(
-        bin_image(image, factor),
+        Measurement(bin_image(image, factor), background=background),
         calibration,
         z_um=z_um,
-        background=background,
-        iterations=MOST_ITERATIONS,
-        callback=callback,
+        on_progress=None if callback is None else lambda record, now: callback(record, lambda: now()[0]),
         cancel=cancel,
     )

@@ -12,8 +12,7 @@ from instrument.reconstruction.erasures import Choice
 from instrument.reconstruction.job import DarkChoice, NoiseChoice
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
-from recon.reconstruction.overrides import Wishes
-from recon.reconstruction.preparation import PRECISIONS, Precision
+from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
 
 
 def parse_dark(text: str) -> DarkChoice:

@@ -12,8 +12,9 @@ from recon.base.declare import option
 from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import MODELS, ModelName
 from recon.priors import PRIORS, Prior
-from recon.reconstruction.overrides import Wishes
-from recon.reconstruction.preparation import PRECISIONS, Field, Precision
+from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
+
+Field = Literal["sensor", "full"]
 
 _MAIN, _STOP, _CHOICE, _COMPUTE, _RARE = "Scene", "When to stop", "Camera model", "Computing", "Rarely needed"
 
@@ -23,9 +24,9 @@ def _priors() -> tuple[str, ...]:
 
 
 def _solvers() -> tuple[str, ...]:
-    from recon.solvers.methods import method_names
+    from recon.reconstruction.solvers import SOLVERS
 
-    return ("auto", *method_names())
+    return ("auto", *SOLVERS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +181,9 @@ class ReconstructionOptions:
     def __post_init__(self) -> None:
         """Raise InputError that names all mistakes at once."""
         from recon.base.declare import require
+        from recon.reconstruction.solvers import require_solver
 
+        require_solver(self.solver)
         require(self)
 
 

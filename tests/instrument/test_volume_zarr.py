@@ -7,11 +7,11 @@ from ome_zarr_models.v05 import Image
 
 from instrument.files.volume_zarr import write_volume_zarr
 from instrument.reconstruction.result_file import Outputs
-from recon.reconstruction.volume_result import VolumeGrid
+from recon.reconstruction.result import Grid
 
 Z_UM = np.array([9000.0, 10000.0, 11500.0])
-GRID = VolumeGrid((3, 300, 200), (150, 100), Z_UM, 2e-3 * Z_UM)
-UNKNOWN = VolumeGrid((3, 300, 200), (150, 100), np.full(3, np.nan), np.full(3, np.nan))
+GRID = Grid((3, 300, 200), (150, 100), Z_UM, 2e-3 * Z_UM)
+UNKNOWN = Grid((3, 300, 200), (150, 100), np.full(3, np.nan), np.full(3, np.nan))
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from recon.camera.low_rank import low_rank
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
-from recon.solvers.gpu_picture import picture_solver
 from recon.solvers.operator_admm import OperatorAdmm
 from recon.solvers.splitting import SensorData
 from recon.solvers.stopping import IterationRecord
@@ -63,7 +62,6 @@ SOLVERS = {
     "ADMM": (picture_camera, lambda A, b, x: Admm(A, b, TV, initial=x)),
     "exact-data ADMM": (picture_camera, lambda A, b, x: SensorAdmm(A, b, TV, initial=x)),
     "literal ADMM": (picture_camera, lambda A, b, x: LiteralAdmm(A, b, TV, (0.3, 3.0, 3.0), initial=x)),
-    "picture by namespace": (picture_camera, lambda A, b, x: picture_solver(np, A, b, TV, x)),
     "lean TV": (
         volume_camera,
         lambda A, b, x: LeanTotalVariation(A, SensorData(b, VALID[0]), VOLUME_TV, initial=x),

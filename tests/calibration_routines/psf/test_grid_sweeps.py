@@ -37,10 +37,10 @@ from instrument.files.errors import BenchError
 from instrument.runs.layout import FinishReason, RunCondition
 from instrument.runs.resume import prepare_resume
 from instrument.runs.runner import Runner, RunStatus
+from recon import reconstruct
 from recon.base import metrics
 from recon.camera.camera_model import ModelName
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
-from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Geometry
 
 TINY = """
@@ -118,7 +118,7 @@ def test_a_close_scene_needs_the_lateral_calibration(tmp_path: Path) -> None:
     assert done.findings == ()
     quality = {}
     for model in MODELS_COMPARED:
-        found = reconstruct_volume(
+        found = reconstruct(
             photo.measurement,
             load_calibration(done.path),
             model=model,
