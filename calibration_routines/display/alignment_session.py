@@ -12,7 +12,7 @@ from calibration_routines.options import Size, problems_of
 from instrument.files.errors import BenchError, SettingsError
 from recon.base.declare import RARE, option
 from recon.holography import Display
-from recon.holography.pose_fit import PoseProbe
+from recon.holography.spots import PoseProbe
 
 Progress = Callable[[str, int], object]
 ALIGNMENT_FILE = "alignment.json"

@@ -302,7 +302,7 @@ class AlignmentProcedure:
             bench.safe_state()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
-        from instrument.display.alignment_figure import (
+        from instrument.display.figures import (
             write_alignment_figure,  # matplotlib, only where it is drawn
         )
 

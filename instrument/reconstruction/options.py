@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,15 +11,57 @@ from instrument.reconstruction.erasures import Choice as ErasuresChoice
 from instrument.reconstruction.job import DarkChoice, NoiseChoice
 from instrument.reconstruction.mosaic import MosaicChoice, mosaic_named
 from instrument.reconstruction.preparation import Crop
-from instrument.reconstruction.words import parse_dark, parse_erasures, parse_noise
 from recon.base.declare import RARE, option
+from recon.base.noise import NoiseModel
 from recon.camera.bayer import PATTERNS
+from recon.errors import InputError
 from recon.streams.joint import OverTimeName
 from recon.streams.video import WARM_ITERATIONS
 
 _FILES, _PHOTOGRAPH, _VIDEO, _OUTPUT = "Input", "The photograph", "Videos", "Output"
 _KEPT = ("picture", "volume")
 _NOT_PATTERNED = ("picture", "volume", "video")
+
+
+def _dark(text: str) -> DarkChoice:
+    """Read ``auto``, an offset in counts, or the name of a dark frame."""
+    if text == "auto":
+        return "auto"
+    try:
+        counts = float(text)
+    except ValueError:
+        return Path(text).expanduser()
+    if not math.isfinite(counts):
+        raise InputError("the offset must be a finite number of counts.")
+    return counts
+
+
+def _erasures(text: str) -> ErasuresChoice:
+    """Read ``none``, ``saturated``, a share of the pixels, or the name of a mask."""
+    if text == "none":
+        return "none"
+    if text == "saturated":
+        return "saturated"
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text).expanduser()
+
+
+def _noise(text: str) -> NoiseChoice:
+    """Read ``COUNTS``, ``READ,GAIN`` (read noise in counts, counts per electron) or ``estimate``."""
+    if text == "estimate":
+        return "estimate"
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not all(math.isfinite(v) and v >= 0 for v in values):
+        raise InputError(
+            "write a standard deviation in counts (3.5), or read noise in counts and counts per electron "
+            "(2.1,0.13), or estimate."
+        )
+    return values[0] if len(values) == 1 else NoiseModel(*values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +71,7 @@ class SourceOptions:
     image: Path | None = option(
         None,
         help="The photograph (raw frame).",
+        label="Photograph",
         flags=("--image", "-i"),
         applies=("picture", "volume"),
         group=_FILES,
@@ -46,7 +90,12 @@ class SourceOptions:
         group=_FILES,
     )
     psf: Path | None = option(
-        None, help="The PSF image.", flags=("--psf", "-p"), applies=("picture", "video"), group=_FILES
+        None,
+        help="The PSF image.",
+        flags=("--psf", "-p"),
+        applies=("picture", "video"),
+        label="PSF image",
+        group=_FILES,
     )
     calibration: Path | None = option(
         None,
@@ -60,6 +109,7 @@ class SourceOptions:
         None,
         help="A volume: PSFs, one a depth (folder, stack or calibration).",
         metavar="FOLDER|STACK",
+        label="PSFs",
         applies=("volume",),
         group=_FILES,
     )
@@ -73,7 +123,7 @@ class InputOptions:
         "auto",
         help="Dark frame or offset; auto estimates the offset.",
         metavar="FILE|COUNTS",
-        parse=parse_dark,
+        parse=_dark,
         applies=_NOT_PATTERNED,
         group=_PHOTOGRAPH,
     )
@@ -100,7 +150,7 @@ class InputOptions:
         "saturated",
         help="Pixels to leave out: none, saturated, a mask FILE's zeros, a share.",
         metavar="WHICH",
-        parse=parse_erasures,
+        parse=_erasures,
         applies=_NOT_PATTERNED,
         group=_PHOTOGRAPH,
     )
@@ -120,13 +170,14 @@ class InputOptions:
         help="Deviation; READ,GAIN: counts, counts per electron; estimate.",
         default_words="by metadata",
         metavar="COUNTS",
-        parse=parse_noise,
+        parse=_noise,
         applies=_NOT_PATTERNED,
         group=_PHOTOGRAPH,
     )
     allow_saturated: bool = option(
         False,
         help="Accept a PSF image with much of its light in saturated pixels.",
+        label="PSF may be saturated",
         applies=("picture",),
         group=RARE,
     )
@@ -148,12 +199,14 @@ class OutputOptions:
         None,
         help="float32 TIFF (volumes: or, videos: .ome.zarr), beside it .png and .json.",
         flags=("--out", "-o"),
+        label="Result",
         group=_OUTPUT,
     )
     rotate_deg: Literal["0", "90", "180", "270"] = option(
         "0",
         help="Turn the picture counter-clockwise, degrees; 180 if upside down.",
         flags=("--rotate",),
+        label="Turned (degrees)",
         applies=("picture", "video", "patterned picture"),
         group=_OUTPUT,
     )

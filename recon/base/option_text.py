@@ -30,7 +30,10 @@ def read(o: Option, typed: str | Sequence[str]) -> Any:
         return tuple(read(one, word) for word in ([typed] if isinstance(typed, str) else typed))
     said = o.declaration
     if said.parse_all is not None:
-        return said.parse_all([typed] if isinstance(typed, str) else typed)
+        try:
+            return said.parse_all([typed] if isinstance(typed, str) else typed)
+        except ValueError as error:
+            raise InputError(f"{o.flag}: {error}") from None
     if isinstance(typed, str) and said.none_word and typed == said.none_word:
         return None
     kinds = next((typing.get_args(kind) for kind in o.kinds if typing.get_origin(kind) is tuple), ())

@@ -43,7 +43,7 @@ def _wishes(words: Sequence[str]) -> Wishes:
     for word in words:
         name, equals, value = word.partition("=")
         if not equals:
-            raise InputError(f"--choose {word!r} is not understood; write NAME=VALUE, say binning=1.")
+            raise InputError(f"{word!r} is not understood; write NAME=VALUE, say binning=1.")
         pairs[name.strip()] = value.strip()
     return Wishes.parse(pairs)
 

@@ -84,7 +84,7 @@ def test_voxel_sizes_of_a_calibration_reach_the_file(files, tmp_path, run):
         (["--model", "local"], "several places of the field"),
         (["--prior", "tv-haar"], "not for volumes"),
         (["--z-mm", "3"], "do not apply"),
-        (["--noise", "loud"], "--noise 'loud' is not understood"),
+        (["--noise", "loud"], "--noise 'loud': write a standard deviation"),
         (["--noise", "1,2,3"], "read noise in counts"),
         (["--noise=-1"], "standard deviation in counts"),
         (["--memory", "0.00001"], "Bin the images or take fewer depths"),

@@ -1,10 +1,19 @@
-"""Running a map: every cell once, in an order that shows the whole map early; known cells are skipped."""
+"""All maps by name, and how one is run: every cell once, the coarse ones first, known cells skipped."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
 
+from recon.errors import InputError
+from recon.evaluation import (
+    maps_calibration,
+    maps_display,
+    maps_light,
+    maps_scene,
+    maps_solver,
+    maps_time,
+)
 from recon.verdict.map import Cell, Size, StressMap, cell_of
 
 
@@ -47,3 +56,24 @@ def run_map(
         draws = stress.draws if size == "full" else 1
         trials = [stress.trial(method, x[ix], y[iy], seed + k, size) for k in range(draws)]
         yield cell_of(method, ix, iy, trials, time.perf_counter() - began)
+
+
+MAPS: dict[str, StressMap] = {
+    stress.name: stress
+    for module in (
+        maps_light,
+        maps_scene,
+        maps_time,
+        maps_calibration,
+        maps_solver,
+        maps_display,
+    )
+    for stress in module.MAPS
+}
+
+
+def map_named(name: str) -> StressMap:
+    """Return a map by its name."""
+    if name not in MAPS:
+        raise InputError(f"There is no map {name!r}. Maps: {', '.join(MAPS)}.")
+    return MAPS[name]
