@@ -12,7 +12,7 @@ from instrument.cli.app import App, examples
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
-from instrument.reconstruction.request import PictureRequest, Settings, VolumeRequest
+from instrument.reconstruction.request import VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
 from recon.reconstruction.options import ReconstructionOptions
 
@@ -39,28 +39,6 @@ class _Asked:
     output: OutputOptions
     video: VideoOptions
     given: Given
-
-    @property
-    def settings(self) -> Settings:
-        """What pictures, volumes and videos are all asked for."""
-        inputs, options = self.inputs, self.options
-        return Settings(
-            model=options.model,
-            dark=inputs.dark,
-            crop=inputs.crop,
-            binning=inputs.binning,
-            erasures=inputs.erasures,
-            noise=inputs.noise,
-            prior=None if options.prior is None else str(options.prior),
-            tau=options.tau,
-            iterations=options.iterations,
-            time_s=options.time_s,
-            tolerance=options.tolerance,
-            stop_at_noise=options.stop_at_noise,
-            mosaic=inputs.mosaic,
-            wishes=options.choose,
-            precision=None if options.precision == "auto" else options.precision,
-        )
 
 
 @app.command(
@@ -90,61 +68,36 @@ def reconstruct(
     video is taken up again by the same command.
     """
     asked = _Asked(source, inputs, options, output, video, given)
+    if options.choose is not None and options.choose.precision is not None and "precision" in given:
+        raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
     if source.patterned is not None:
         _patterned(asked, run, source.patterned)
     elif source.video:
         _video(asked, run)
     elif run is not None:
         raise BenchError("RUN: for videos; give --video as well, or leave it out.")
-    elif source.image is None:
-        raise BenchError("Give a photograph with --image FILE, or a recording: RUN --video.")
-    elif source.volume is not None:
-        _volume(asked, source.image, source.volume)
     else:
-        _picture(asked, source.image)
+        _photograph(asked)
 
 
-def _picture(asked: _Asked, image: Path) -> None:
+def _photograph(asked: _Asked) -> None:
     from instrument.cli.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
-    given.refuse("a picture (give --volume, or --video with a recording)", "picture")
+    request = request_of(source, asked.inputs, asked.options)
+    is_volume = isinstance(request, VolumeRequest)
+    if is_volume:
+        given.refuse("--volume", "volume")
+    else:
+        given.refuse("a picture (give --volume, or --video with a recording)", "picture")
     if source.calibration is not None and (flags := given.flags("allow_saturated", "allow_mixed_depth")):
         raise BenchError(
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
             "were measured. Leave it out."
         )
     _require_auto(asked)
-    request = PictureRequest(
-        image=image,
-        psf=source.psf,
-        calibration=source.calibration,
-        z_um=asked.options.z_um,
-        method=asked.options.solver,
-        allow_saturated=asked.inputs.allow_saturated,
-        allow_mixed_depth=asked.inputs.allow_mixed_depth,
-        settings=asked.settings,
-    )
-    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, output.figure), output)
-
-
-def _volume(asked: _Asked, image: Path, psfs: Path) -> None:
-    from instrument.cli.solving import reconstruct_photograph
-
-    options, output = asked.options, asked.output
-    asked.given.refuse("--volume", "volume")
-    _require_auto(asked)
-    request = VolumeRequest(
-        image=image,
-        psfs=psfs,
-        estimate_background=options.estimate_background,
-        positive_background=options.positive_background,
-        scratch=options.scratch,
-        memory_gib=options.memory_gib,
-        device=options.device,
-        settings=asked.settings,
-    )
-    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, volume=True), output)
+    outputs = Outputs.named(output.out or _PICTURE, output.figure, volume=is_volume)
+    reconstruct_photograph(request, outputs, output)
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
@@ -164,8 +117,8 @@ def _video(asked: _Asked, run: Path | None) -> None:
         out=output.out or Path("video.ome.zarr"),
         psf=source.psf,
         calibration=source.calibration,
-        z_um=asked.options.z_um,
-        settings=asked.settings,
+        inputs=asked.inputs,
+        options=asked.options,
         rotate_deg=int(output.rotate_deg),
         fps=video.fps,
         film=video.film,
@@ -211,5 +164,3 @@ def _require_auto(asked: _Asked) -> None:
         raise BenchError(
             f"--choose overrules what --model auto chooses; it does not go with --model {model}."
         )
-    if wishes is not None and wishes.precision is not None and "precision" in asked.given:
-        raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
