@@ -30,7 +30,7 @@ from instrument.reconstruction.result_file import Outputs
 from recon.base.declare import option, options_of
 from recon.reconstruction.options import ReconstructionOptions
 
-CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
+CALIBRATION, PSF, VOLUME = "Picture (calibration)", "Picture (PSF image)", "Volume (PSFs)"
 SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}
 """The option that names the PSFs of each kind."""
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
