@@ -161,7 +161,7 @@ class HologramsPanel(Panel):
         whole.addWidget(left)
         whole.addWidget(self.views)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([300, 880])
+        whole.setSizes([330, 850])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)
