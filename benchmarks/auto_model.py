@@ -58,7 +58,7 @@ def solve(scene: TestScene, model: str, background: bool | None) -> dict[str, An
         )
         found = result.image
     else:
-        result = recon.reconstruct_volume(
+        result = recon.reconstruct(
             scene.measurement, scene.calibration, model=model, estimate_background=background, **settings
         )
         found = result.volume[0] if scene.spec.is_picture else result.volume

@@ -101,7 +101,7 @@ def run(case: Case, method: str, iterations: int = 300) -> tuple[int, float, Arr
     result = reconstruct(
         case.measurement,
         case.psf,
-        method=method,
+        solver=method,
         model="convolution",
         erasures=case.erasures,
         iterations=iterations,

@@ -1,4 +1,4 @@
-"""The holographic display: ``etendue``, and the dissertation's ``table7.1``."""
+"""Holographic displays in figures: ``etendue``, and the dissertation's ``table7.1``."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def reconstruct(
 
 
 def _picture(asked: _Asked) -> None:
-    from instrument.cli.picture import reconstruct_to_picture
+    from instrument.cli.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
     given.refuse("a picture (give --volume, or --video with a recording)", "picture")
@@ -104,33 +104,16 @@ def _picture(asked: _Asked) -> None:
             "were measured. Leave it out."
         )
     _require_auto(asked)
-    request = asked.request
-    assert isinstance(request, PictureRequest)
-    reconstruct_to_picture(
-        request,
-        Outputs.named(output.out or _PICTURE, output.figure),
-        rotate_deg=int(output.rotate_deg),
-        checkpoint=output.checkpoint,
-        force=output.force,
-        explain=output.explain,
-    )
+    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, output.figure), output)
 
 
 def _volume(asked: _Asked) -> None:
-    from instrument.cli.volume import reconstruct_to_volume
+    from instrument.cli.solving import reconstruct_photograph
 
     output = asked.output
     asked.given.refuse("--volume", "volume")
     _require_auto(asked)
-    request = asked.request
-    assert isinstance(request, VolumeRequest)
-    reconstruct_to_volume(
-        request,
-        Outputs.named(output.out or _PICTURE, volume=True),
-        checkpoint=output.checkpoint,
-        force=output.force,
-        explain=output.explain,
-    )
+    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, volume=True), output)
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
@@ -170,7 +153,7 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
             "--patterned needs a run and a calibration: "
             "diffuserbench reconstruct RUN --patterned SHEET --calibration FOLDER"
         )
-    from instrument.cli.patterned import reconstruct_to_patterned
+    from instrument.cli.solving import reconstruct_patterns
     from instrument.reconstruction.patterned import PatternedRequest
 
     request = PatternedRequest(
@@ -183,8 +166,7 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
         tau=options.tau,
         iterations=options.iterations,
     )
-    outputs = Outputs.named(output.out or _PICTURE)
-    reconstruct_to_patterned(request, outputs, rotate_deg=int(output.rotate_deg), force=output.force)
+    reconstruct_patterns(request, Outputs.named(output.out or _PICTURE), output)
 
 
 def _require_auto(asked: _Asked) -> None:
@@ -200,8 +182,3 @@ def _require_auto(asked: _Asked) -> None:
         )
     if wishes is not None and wishes.precision is not None and "precision" in asked.given:
         raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
-    if asked.output.checkpoint is not None and (asked.output.explain or wishes is not None):
-        raise BenchError(
-            f"{'--explain' if asked.output.explain else '--choose'} is about everything that --model auto "
-            "chooses, which it does not with --checkpoint. Leave one of the two out."
-        )

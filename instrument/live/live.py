@@ -20,15 +20,12 @@ from instrument.bench.bench import Bench
 from instrument.files.calibration_file import load_calibration
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.preparation import bin_image
-from recon import reconstruct
+from recon import Measurement, reconstruct
 from recon.errors import InputError
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.stopping import IterationRecord
 from recon.streams.live import LivePicture, LiveReconstructor
 from recon.types import Calibration
-
-MOST_ITERATIONS = 200
-"""It mostly settles before."""
 
 
 def full_picture(
@@ -64,12 +61,10 @@ def full_picture(
         )
     background = None if calibration.background is None else np.moveaxis(calibration.background, 0, -1)
     return reconstruct(
-        bin_image(image, factor),
+        Measurement(bin_image(image, factor), background=background),
         calibration,
         z_um=z_um,
-        background=background,
-        iterations=MOST_ITERATIONS,
-        callback=callback,
+        on_progress=None if callback is None else lambda record, now: callback(record, lambda: now()[0]),
         cancel=cancel,
     )
 

@@ -63,8 +63,8 @@ class Declaration:
         ValueError with a sentence. Given once for each word of a repeated option.
     parse_all : callable, optional
         Makes one value of all the words of an option that may be repeated (``NAME=VALUE``, say).
-    replaced : mapping of str to str
-        Words that it could be once, and what replaces them, as a sentence.
+    replaced : callable, optional
+        Returns words that it could be once, and what replaces each, as a sentence.
     none_word : str
         What people type for None ("auto", say); empty: None cannot be typed.
     """
@@ -88,7 +88,7 @@ class Declaration:
     identifies: bool = True
     parse: Callable[[str], Any] | None = None
     parse_all: Callable[[Sequence[str]], Any] | None = None
-    replaced: Mapping[str, str] = field(default_factory=dict)
+    replaced: Callable[[], Mapping[str, str]] = dict
     none_word: str = ""
 
     def words(self) -> tuple[str, ...]:
@@ -177,8 +177,8 @@ class Option:
             one = dataclasses.replace(self, type=self.item, default=0)
             return next((wrong for v in value if (wrong := one.mistake(v, typed=typed))), None)
         if (words := self.words) and isinstance(value, str) and value not in words:
-            if value in self.declaration.replaced:
-                return f"{name} {value!r} is no more: {self.declaration.replaced[value]}"
+            if instead := self.declaration.replaced().get(value):
+                return f"{name}: {instead}"
             near = difflib.get_close_matches(value, words, 1)
             meant = f"; {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,8 +14,9 @@ from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import MODELS, ModelName
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
-from recon.reconstruction.overrides import Wishes
-from recon.reconstruction.preparation import PRECISIONS, Field, Precision
+from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
+
+Field = Literal["sensor", "full"]
 
 _MAIN, _STOP, _CHOICE, _COMPUTE, _RARE = "Scene", "When to stop", "Camera model", "Computing", "Rarely needed"
 
@@ -25,9 +26,15 @@ def _priors() -> tuple[str, ...]:
 
 
 def _solvers() -> tuple[str, ...]:
-    from recon.solvers.methods import method_names
+    from recon.reconstruction.solvers import SOLVERS
 
-    return ("auto", *method_names())
+    return ("auto", *SOLVERS)
+
+
+def _replaced() -> Mapping[str, str]:
+    from recon.reconstruction.solvers import REPLACED
+
+    return REPLACED
 
 
 def _wishes(words: Sequence[str]) -> Wishes:
@@ -79,7 +86,7 @@ class ReconstructionOptions:
         choices=_solvers,
         flags=("--solver", "--method", "-m"),
         group=_MAIN,
-        replaced={"admm-gpu": "write --solver admm --device gpu."},
+        replaced=_replaced,
         applies=("picture",),
     )
     iterations: int | None = option(
@@ -213,7 +220,9 @@ class ReconstructionOptions:
     def __post_init__(self) -> None:
         """Raise InputError that names all mistakes at once."""
         from recon.base.declare import require
+        from recon.reconstruction.solvers import require_solver
 
+        require_solver(self.solver)
         require(self)
 
 

@@ -23,7 +23,7 @@ from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
 from recon.priors import PRIORS
-from recon.solvers.methods import method_names
+from recon.reconstruction.solvers import SOLVERS
 from recon.types import Calibration, Geometry
 
 RNG = np.random.default_rng(3)
@@ -403,7 +403,7 @@ def count_runs(line: npt.NDArray[np.bool_]) -> int:
 def test_every_solver_and_prior_is_on_offer(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["reconstruct", "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"[auto, {', '.join(method_names())}; default: auto]" in shown
+    assert f"[auto, {', '.join(SOLVERS)}; default: auto]" in shown
     assert f"[{', '.join(PRIORS)}; default" in shown
 
 

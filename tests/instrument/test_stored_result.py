@@ -16,10 +16,10 @@ from instrument.files.volume_zarr import write_volume_zarr
 from instrument.reconstruction.result_list import find_results, free_result
 from instrument.reconstruction.stored_result import open_result, record_file
 from instrument.reconstruction.volume_views import in_colour_of_depth, project
-from recon.reconstruction.volume_result import VolumeGrid
+from recon.reconstruction.result import Grid
 
 SHAPE = (5, 40, 30)
-UNKNOWN = VolumeGrid(SHAPE, (20, 15), np.full(5, np.nan), np.full(5, np.nan))
+UNKNOWN = Grid(SHAPE, (20, 15), np.full(5, np.nan), np.full(5, np.nan))
 
 
 @pytest.fixture
