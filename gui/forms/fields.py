@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QSignalBlocker
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
@@ -47,6 +47,8 @@ class Behaviour:
     require : callable, optional
         Called with a value that the declaration allows; returns why it cannot be all the same, empty where
         it can.
+    help_of : callable, optional
+        Returns what is said of one of the words to choose from; empty for nothing.
     offers : callable, optional
         Returns the words on offer now, where a device and not the declaration knows them.
     enabled_when : callable, optional
@@ -61,6 +63,7 @@ class Behaviour:
     needed_when: Callable[[], str] | None = None
     understand: Callable[[str], Any] | None = None
     require: Callable[[Any], str] | None = None
+    help_of: Callable[[str], str] | None = None
     offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
 
@@ -280,6 +283,8 @@ class ChoiceField(OptionField):
     def _add(self, words: Sequence[str]) -> None:
         for word in words:
             self.widget.addItem(word, read(self._spoken, word))
+            said = "" if self.behaviour.help_of is None else self.behaviour.help_of(word)
+            self.widget.setItemData(self.widget.count() - 1, said or None, Qt.ItemDataRole.ToolTipRole)
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
