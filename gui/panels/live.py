@@ -20,9 +20,9 @@ from PySide6.QtWidgets import (
 )
 
 from drivers.frame import Frame
+from gui.forms.camera import CameraForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.panels.camera_form import CameraForm
 from gui.session import BenchSession
 from gui.theme import NAMES
 from gui.widgets.image_view import ImageView

@@ -234,7 +234,7 @@ def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
     more.setFocus()
     qtbot.keyClick(more, Qt.Key.Key_Space)
     assert widgets["allow_saturated"].isVisible()
-    assert not widgets["positive_background"].isVisible()  # of volumes
+    assert not widgets["volume"].isVisible()  # of volumes
     assert "bit depth" in widgets["allow_mixed_depth"].toolTip()
     choose(panel, mosaic=None, rotate_deg="90", precision="float64")
     put(panel, "tolerance", "1e-9")
