@@ -40,7 +40,7 @@ from instrument.plan import Plan
 from instrument.runs.acquire import prepare
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon.camera.registration import Registration, aligned, expected_shift, register
 
 Emission = Literal["pinhole", "bead"]
@@ -198,7 +198,7 @@ def measure_angular_response(
     sweep: AngularSweep,
     folder: Path | str | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     on_exposures: Callable[[SweepExposures], None] | None = None,
     control: RunControl | None = None,
 ) -> tuple[AngularResponse, Path]:

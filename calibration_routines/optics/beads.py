@@ -18,7 +18,7 @@ from calibration_routines.psf.analysis import binned
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, OperatorNeededError, SettingsError
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress as RunProgress
+from instrument.runs.runner import RunProgress
 from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
 from recon.types import Calibration, Geometry
 

@@ -16,7 +16,7 @@ from instrument.plan import OFF, Part, Plan
 from instrument.runs.acquire import acquire
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon.base.blocks import block_mean
 
 
@@ -85,7 +85,7 @@ def photograph(
     average: int = 1,
     dark_frames: int = 4,
     binning: int = 1,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     control: RunControl | None = None,
 ) -> Photograph:
     """Photograph the scene into a run; ends with everything dark.
