@@ -402,6 +402,6 @@ def _leave_out(data: Any, location: Sequence[int | str]) -> None:
     """Take a key out of nested data; the names of a union's members, which are no keys, are passed over."""
     *way, last = location
     for step in way:
-        if (isinstance(data, Mapping) and step in data) or (isinstance(data, list) and isinstance(step, int)):
+        if isinstance(step, int) or step in data:
             data = data[step]
     data.pop(last, None)
