@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from recon import Measurement, reconstruct
 from recon.base import fft as project_fft
 from recon.base.metrics import psnr
 from recon.evaluation.content import dense_picture
 from recon.evaluation.lenslets import build_camera
-from recon.reconstruction.patterned import reconstruct_patterned
 
 COUNTS = (1, 4, 9, 16, 36)
 PHOTONS = (300.0, 10000.0)
@@ -71,7 +71,7 @@ def case(side: int, count: int, photons: float, seed: int, even_frames: int = 1)
     pixel_rows, pixel_columns = (i + 0.5 for i in np.mgrid[:side, :side].reshape(2, -1).astype(float))
     known = spots(count, side, pixel_rows, pixel_columns).reshape(count, side, side)
     known = known * (1 + PATTERN_ERROR * rng.standard_normal((count, 1, 1)) * (count > 1))
-    found = reconstruct_patterned(frames, known, psf, iterations=ITERATIONS).image
+    found = reconstruct(Measurement(frames, patterns=known), psf, iterations=ITERATIONS).image
     truth = picture.reshape(side, 2, side, 2).mean(axis=(1, 3))
     gain = float(np.vdot(found, truth) / np.vdot(found, found))
     return float(psnr(gain * found, truth))

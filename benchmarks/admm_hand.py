@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
-from recon.reconstruction.preparation import prepare
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
 from recon.solvers import Admm, Solver
 from tests.recon.solvers.literal_admm import LiteralAdmm
 
@@ -86,16 +87,16 @@ def main() -> None:
     print("  sensor      grid         ours (ms)  CPU (ms)   plain (ms)  CPU (ms)   ratio wall  ratio CPU")
     for binning in (4, 2):
         psf, raw = inputs(binning)
-        problem = prepare(raw, psf)
+        part = Part(Problem.of(raw, psf), slice(0, 1))
         prior = TotalVariation(1.0) + NonNegativity()
-        ours = Admm(problem.operator, problem.data, prior)
+        ours = Admm(part.picture_operator, part.data, prior)
         double = PadCropConvolution(np.asarray(psf, np.float64)[None], raw.shape, dtype=np.float64)
-        plain = LiteralAdmm(double, problem.data, prior)
+        plain = LiteralAdmm(double, part.data, prior)
         seconds(ours)
         seconds(plain)
         times = np.array([[seconds(ours), seconds(plain)] for _ in range(options.rounds)]) * 1e3
         (a_wall, a_cpu), (b_wall, b_cpu) = np.median(times, axis=0)
-        height, width = problem.camera.grid_shape
+        height, width = part.camera.domain_shape[2:]
         print(
             f"  {raw.shape[0]:4} x {raw.shape[1]:4} {height:5} x {width:4} {a_wall:10.2f} {a_cpu:9.2f} "
             f"{b_wall:12.1f} {b_cpu:9.1f} {b_wall / a_wall:12.1f} {b_cpu / a_cpu:10.1f}"

@@ -42,7 +42,7 @@ from admm_hand import DATA, inputs, processor
 from recon.base.threads import get_threads, set_threads
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
-from recon.reconstruction.preparation import prepare
+from recon.reconstruction.problem import Problem as Scaled
 from recon.solvers import Admm, SensorAdmm, Solver
 
 REQUIREMENT = "lensless==1.0.8"
@@ -71,10 +71,9 @@ class Problem:
             copies = ((1.0, 0, 0), (0.8, 5, -7), (0.6, -9, 4))
             raw = np.stack([share * np.roll(raw, shift, (0, 1)) for share, *shift in copies], axis=2)
             psf = np.repeat(psf[..., None], 3, axis=2)
-        prepared = prepare(raw, psf)
         psfs = np.atleast_3d(psf)
         self.psfs = np.moveaxis(psfs / np.linalg.norm(psfs, axis=(0, 1)), 2, 0).astype(np.float32)
-        self.data = prepared.data
+        self.data = Scaled.of(raw, psf).data
         self.prior = TotalVariation(tau) + NonNegativity()
         self.scale = float(self.data.max())
         self.tau = tau

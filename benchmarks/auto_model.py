@@ -36,8 +36,8 @@ from auto_scenes import FAMILY_PRIOR, JUDGED, TUNING
 import recon
 from recon.base.threads import set_threads
 from recon.camera import registration_cache as remembered
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
-from recon.evaluation.scene_score import score
 from recon.reconstruction.choice import Choice
 
 FIXED = tuple(f"{m}{b}" for m in ("convolution", "lowrank", "local") for b in ("", " + background"))
@@ -58,7 +58,7 @@ def solve(scene: TestScene, model: str, background: bool | None) -> dict[str, An
         )
         found = result.image
     else:
-        result = recon.reconstruct_volume(
+        result = recon.reconstruct(
             scene.measurement, scene.calibration, model=model, estimate_background=background, **settings
         )
         found = result.volume[0] if scene.spec.is_picture else result.volume

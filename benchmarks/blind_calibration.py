@@ -23,14 +23,13 @@ import numpy as np
 from scipy.optimize import minimize
 
 from drivers.simulated.options import WorldOptions
-from drivers.simulated.scene_choice import LUMINANCE, sample_picture
-from drivers.simulated.world import SimulatedWorld
+from drivers.simulated.world import LUMINANCE, SimulatedWorld, sample_picture
+from recon import reconstruct
 from recon.base.threads import set_threads
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.point_psfs import support_of
 from recon.camera.registration import displacement, shifted
 from recon.optics.scenes import bead_volume, picture
-from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Calibration, Geometry
 
 GREEN = (0.0, 1.0, 0.0)
@@ -228,7 +227,7 @@ def main() -> None:
     shown = {}
     for name, made in methods.items():
         model = "local" if len(made.psfs) > 1 else "convolution"
-        result = reconstruct_volume(image, made, model=model, estimate_background=False, iterations=150)
+        result = reconstruct(image, made, model=model, estimate_background=False, iterations=150)
         psnr, shown[name] = score(result.volume[0], bench)
         print(f"{name}: {psnr:.2f} dB", flush=True)
         shown[f"{name}\n{psnr:.1f} dB"] = shown.pop(name)

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from recon import reconstruct
 from recon.base import metrics
 from recon.optics.fall_off import gaussian_fall_off
-from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Calibration, Geometry
 
 Image = npt.NDArray[np.float32]
@@ -137,7 +137,7 @@ def compare(
     for spacing in spacings_um:
         calibration = camera.calibration(spacing, half_um)
         start = time.perf_counter()
-        found = reconstruct_volume(
+        found = reconstruct(
             measured,
             calibration,
             model="convolution" if spacing is None else "local",

@@ -2,7 +2,7 @@
 
     python benchmarks/defaults_3d.py [--iterations 150]
 
-For every scene the default (``reconstruct_volume`` with nothing but the prior) is compared with the best tau
+For every scene the default (``reconstruct`` with nothing but the prior) is compared with the best tau
 of a search over three decades. PSNR against the true scene on the voxel grid, in decibels.
 """
 
@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lenslet_scene import Camera, beads, expose, tilted_bars
 
-from recon import Calibration, reconstruct_volume
+from recon import Calibration, reconstruct
 from recon.base.threads import set_threads
 
 SCENES = (
@@ -61,7 +61,7 @@ def main() -> None:
         def judged(
             tau: float | None, counts=counts, calibration=calibration, prior=prior, truth=truth
         ) -> tuple[float, float]:
-            r = reconstruct_volume(counts, calibration, prior=prior, tau=tau, iterations=a.iterations)
+            r = reconstruct(counts, calibration, prior=prior, tau=tau, iterations=a.iterations)
             return psnr(r.volume, truth), r.tau
 
         default, tau = judged(None)

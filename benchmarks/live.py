@@ -148,7 +148,7 @@ def run(height: int, width: int, seconds: float, budget_ms: float) -> dict[str, 
     }
     for name, (phase, picture) in kept.items():
         converged = reconstruct(
-            frames[phase].astype(np.float32), psf, method="admm-sensor", iterations=200, tolerance=0
+            frames[phase].astype(np.float32), psf, solver="admm-sensor", iterations=200, tolerance=0
         ).image
         shown = cv2.resize(picture.image, (width, height), interpolation=cv2.INTER_CUBIC)
         row[f"{name}_db"] = round(float(psnr(shown, converged)), 1)

@@ -23,12 +23,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from lenslet_scene import expose
 
-from recon import Calibration, NoiseModel
+from recon import Calibration, Measurement, NoiseModel, Options, Problem
 from recon.base.threads import set_threads
 from recon.evaluation.lenslets import stamp
 from recon.priors import NonNegativity, TotalVariation
-from recon.reconstruction.channel import ChannelProblem
-from recon.reconstruction.volume import prepare_volume
+from recon.reconstruction.part import Part
+from recon.reconstruction.solvers import SOLVERS
 from recon.solvers import Fista, Solver, StoppingRules
 
 READ_NOISE = 2.0
@@ -99,22 +99,22 @@ def main() -> None:
     places = [(r, c) for r in np.linspace(-0.4, 0.4, 5) * size for c in np.linspace(-0.4, 0.4, 5) * size]
     psfs = np.stack([cast(size, np.array([[r, c, 1.0]]))[None] for r, c in places])
     positions = np.array([(-10 * c, -10 * r, 20_000.0) for r, c in places])
-    scaled = prepare_volume(counts, Calibration(psfs, positions), None, None, NoiseModel(READ_NOISE, 1.0))
+    measurement = Measurement(counts, NoiseModel(READ_NOISE, 1.0))
     top = size - 1 - size // 2  # of the sensor's part of a field of sensor and PSF
     window = slice(top, top + size)
     curves: dict[str, list[tuple[float, float]]] = {}
     for model, method in (("local", "OperatorAdmm"), ("local", "Fista"), ("convolution", "one PSF")):
-        weights = np.array([[0.0, 1.0, 1.0]])
-        run = ChannelProblem(scaled, 0, model, smooth=False, prior="tv", weights=weights)
+        options = Options(model=model, prior="tv", solver="admm")
+        part = Part(Problem.of(measurement, Calibration(psfs, positions), options), slice(0, 1))
+        part.weigh(None)
 
-        def build(run=run, method=method) -> Solver:
-            solver, _ = run.solver(None, None)
+        def build(part=part, method=method) -> Solver:
             if method != "Fista":
-                return solver
+                return SOLVERS["admm"].make(part, None)
             tv = TotalVariation(
-                run.weight, axis_weights=(0.0, 1.0, 1.0), wrap=(False,) * 3, tolerance=1e-4, max_inner=20
+                part.weight, axis_weights=(0.0, 1.0, 1.0), wrap=(False,) * 3, tolerance=1e-4, max_inner=20
             )
-            return Fista(run.operator, run.data, tv + NonNegativity())
+            return Fista(part.operator, part.data, tv + NonNegativity())
 
         build().step()  # compile
         curve: list[tuple[float, float]] = []
@@ -127,7 +127,7 @@ def main() -> None:
             now = time.process_time()
             seconds = now - began - looked[0]
             if len(curve) < 8 or seconds > 1.08 * curve[-1][0]:
-                curve.append((seconds, psnr(s.solution[0, 0, window, window].astype(float), truth)))
+                curve.append((seconds, psnr(s.solution[..., window, window].squeeze().astype(float), truth)))
             if seconds > a.budget:
                 cancel.set()
             looked[0] += time.process_time() - now

@@ -26,13 +26,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+
 from benchmarks.admm_hand import DATA, inputs
 from benchmarks.against_lensless import resized
 from benchmarks.dense_2d import binned, caustic, photograph
-from recon import Reconstruction, reconstruct
+from recon import Measurement, Problem, Reconstruction, reconstruct
 from recon.base.metrics import psnr
 from recon.priors import TotalVariation
-from recon.reconstruction.preparation import prepare
+from recon.reconstruction.part import Part
 
 METHODS = ("admm", "admm-sensor")
 FINE = 3
@@ -116,18 +117,19 @@ def quality(case: Case, image: np.ndarray) -> float:
 
 def objective(case: Case, result: Reconstruction) -> float:
     """Judge a result's non-negative object, by one function for both methods."""
-    problem = prepare(case.measurement, case.psf, noise=case.noise, erasures=case.erasures)
-    weight = float(result.tau or 0.0) * float(np.max(np.abs(problem.operator.adjoint(problem.data))))
+    problem = Problem.of(Measurement(case.measurement, case.noise, erasures=case.erasures), case.psf)
+    part = Part(problem, slice(0, problem.n_channels))
+    weight = float(result.tau or 0.0) * part.peak()
     x = np.asarray(result.state / problem.image_scale)
-    misfit = problem.operator.forward(x) - problem.data
+    misfit = part.operator.forward(x) - part.data
     return 0.5 * float(np.sum(misfit**2, dtype=np.float64)) + TotalVariation(weight).value(x)
 
 
 def run(case: Case, method: str, at: int, taus: list[float]) -> dict[str, float]:
     """Reconstruct with defaults; then with other weights."""
-    given = {"erasures": case.erasures, "noise": case.noise, "method": method}
+    given = {"erasures": case.erasures, "noise": case.noise, "solver": method}
     tiny = np.random.default_rng(0).random((2, 9, 9))
-    reconstruct(*tiny, method=method, iterations=3)  # compiles
+    reconstruct(*tiny, solver=method, iterations=3)  # compiles
     began = time.process_time()
     result = reconstruct(case.measurement, case.psf, iterations=300, **given)
     seconds = time.process_time() - began

@@ -26,8 +26,8 @@ from benchmarks.lenslet_scene import Camera, expose
 from recon import reconstruct
 from recon.base.threads import set_threads
 from recon.camera.base import Array
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 
 LOOK_AT = 16
 """Iterations of ``admm-sensor`` after which the edges are measured."""
@@ -101,7 +101,7 @@ def run(case: Case, method: str, iterations: int = 300) -> tuple[int, float, Arr
     result = reconstruct(
         case.measurement,
         case.psf,
-        method=method,
+        solver=method,
         model="convolution",
         erasures=case.erasures,
         iterations=iterations,

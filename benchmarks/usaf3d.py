@@ -19,7 +19,7 @@ import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from recon import Calibration, VolumeReconstruction, reconstruct_volume
+from recon import Calibration, Reconstruction, reconstruct
 from recon.base.threads import set_threads
 
 ROOT = Path(os.environ.get("DIFFUSERBENCH_DATA", Path(__file__).parents[1] / "../shared/data"))
@@ -54,7 +54,7 @@ def main() -> None:
     calibration, image = load(a.bin)
     results = {}
     for prior in a.prior:
-        r = reconstruct_volume(
+        r = reconstruct(
             image, calibration, prior=prior, iterations=a.iterations, tau=a.tau, tolerance=1e-3,
             estimate_background=True,
         )  # fmt: skip
@@ -70,7 +70,7 @@ def main() -> None:
     _draw(results, a.picture)
 
 
-def _draw(results: dict[str, VolumeReconstruction], path: Path) -> None:
+def _draw(results: dict[str, Reconstruction], path: Path) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")

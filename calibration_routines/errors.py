@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from instrument.files.errors import BenchError
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 
 class CalibrationError(BenchError):

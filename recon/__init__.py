@@ -2,21 +2,28 @@
 
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
-from recon.reconstruction.picture import reconstruct
-from recon.reconstruction.result import ImageGrid, Reconstruction
-from recon.reconstruction.volume import reconstruct_volume
-from recon.reconstruction.volume_result import VolumeGrid, VolumeReconstruction
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import Options, ReconstructionOptions
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reconstruct import reconstruct
+from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.selection import choose
+from recon.reconstruction.solve import judged, solve
 from recon.types import Calibration, Geometry
 
 __all__ = [
     "Calibration",
     "Geometry",
-    "ImageGrid",
+    "Grid",
     "InputError",
+    "Measurement",
     "NoiseModel",
+    "Options",
+    "Problem",
     "Reconstruction",
-    "VolumeGrid",
-    "VolumeReconstruction",
+    "ReconstructionOptions",
+    "choose",
+    "judged",
     "reconstruct",
-    "reconstruct_volume",
+    "solve",
 ]

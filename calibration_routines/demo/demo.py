@@ -27,7 +27,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.files.interrupt import CtrlC
+from instrument.runs.finish import CtrlC
 from instrument.runs.runner import Progress
 from recon import Reconstruction, reconstruct
 
@@ -207,7 +207,7 @@ def _run(
             measured.calibration.calibration,
             z_um=settings.scene_z_um,
             time_s=settings.reconstruction_s,
-            callback=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
+            on_progress=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
         )
     comparison = compare(viewer.picture(result.image), viewer.truth, viewer.field)
     with stage("write the pictures"):

@@ -141,7 +141,7 @@ class Viewer:
         def look(record: IterationRecord, image: Callable[[], Float]) -> None:
             if not self.seconds or record.seconds - self.seconds[-1] >= _LOOK_EVERY_S:
                 self.seconds.append(record.seconds)
-                self.psnr_db.append(compare(self.picture(image()), self.truth, self.field).psnr_db)
+                self.psnr_db.append(compare(self.picture(image()[0]), self.truth, self.field).psnr_db)
                 advance(record.seconds)
 
         return look
@@ -247,7 +247,7 @@ def _summary(
             ),
             (
                 "reconstruction",
-                f"{result.method} + {result.prior}, {width} x {height}, {len(result.history)} iterations",
+                f"{result.solver} + {result.prior}, {width} x {height}, {len(result.history)} iterations",
             ),
             ("compared", "inside the screen, linear light, one scale factor"),
         ),

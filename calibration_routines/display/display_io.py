@@ -20,8 +20,7 @@ from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError, FileError
-from instrument.files.slm_correction import SlmCorrection
-from instrument.files.slm_image import phase_levels
+from instrument.files.slm_image import SlmCorrection, phase_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.folder import dated_name, free_name
 from recon.holography import Display

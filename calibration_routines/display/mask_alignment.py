@@ -49,7 +49,7 @@ from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, 
 from instrument.bench.bench import Bench
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment, save_alignment
-from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
 from recon.holography import Display
@@ -305,7 +305,7 @@ class AlignmentProcedure:
             bench.safe_state()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
-        from instrument.display.alignment_figure import (
+        from instrument.display.figures import (
             write_alignment_figure,  # matplotlib, only where it is drawn
         )
 

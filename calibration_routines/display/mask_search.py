@@ -20,10 +20,9 @@ from instrument.files.errors import BenchError, SettingsError
 from recon.base.declare import RARE, option
 from recon.holography import Display
 from recon.holography.pose import NAMES, Pose
-from recon.holography.pose_fit import PoseProbe
 from recon.holography.sections import Sections, SectionShifts, SmoothField, fit_field, fit_shifts, hypotheses
 from recon.holography.sections import response as spot_response
-from recon.holography.spots import depth_um
+from recon.holography.spots import PoseProbe, depth_um
 
 Progress = Callable[[str, int], object]
 ALIGNMENT_FILE = "alignment.json"

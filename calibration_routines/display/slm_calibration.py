@@ -24,7 +24,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError, SettingsError
-from instrument.files.slm_correction import SlmCorrection
+from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
 from recon.holography import Display

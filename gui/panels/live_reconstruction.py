@@ -30,11 +30,11 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.formatting import duration
-from instrument.live.full_picture import MOST_ITERATIONS, full_picture
-from instrument.live.live import LiveResult
+from instrument.live.live import LiveResult, full_picture
 from instrument.reconstruction.job import find_calibration
-from instrument.runs.snapshot import Light, light_of
+from instrument.runs.snapshot import LightState, light_of
 from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.solve import ITERATIONS
 from recon.streams.live import LiveReconstructor
 from recon.types import Calibration
 
@@ -296,7 +296,7 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        dark = light_of(self.session.bench) is Light.DARK
+        dark = light_of(self.session.bench) is LightState.DARK
         warning = "Nothing is lit: this is a picture of noise. " if dark else ""
         self.status.setText(
             f"{warning}latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}"
@@ -355,7 +355,7 @@ class LiveReconstructionPanel(Panel):
                 nonlocal shown_s
                 if not context.cancel.is_set() and time.monotonic() - shown_s > _PROGRESS_S:
                     shown_s = time.monotonic()
-                    left = max(MOST_ITERATIONS - record.iteration, 0)
+                    left = max(ITERATIONS - record.iteration, 0)
                     left_s = left * record.seconds / record.iteration
                     context.report(_SoFar(record.iteration, left_s, np.array(present())))
 
@@ -374,16 +374,16 @@ class LiveReconstructionPanel(Panel):
         so_far = cast(_SoFar, value)
         self._show_picture(so_far.image)
         left = f"at most {duration(so_far.most_left_s)} left"
-        self.status.setText(f"Refining: iteration {so_far.iteration} of at most {MOST_ITERATIONS}, {left}")
+        self.status.setText(f"Refining: iteration {so_far.iteration} of at most {ITERATIONS}, {left}")
 
     def _refined(self, value: object) -> None:
         result = cast(Reconstruction, value)
         self._holds = True
         self._show_picture(result.image)
-        reason = f", {result.stop_reason}" if result.stop_reason is not None else ""
+        reason = f", {result.stop_reason}"
         elided(
             self.status,
-            f"Refined: {result.method} with {result.prior}, {len(result.history)} iterations, "
+            f"Refined: {result.solver} with {result.prior}, {len(result.history)} iterations, "
             f"{result.seconds:.1f} s{reason}. {' '.join(result.warnings)}",
         )
 

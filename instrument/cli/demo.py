@@ -74,7 +74,7 @@ class _Terminal:
             self._say(f"  {name:<30} {path}")
         solved, comparison = result.reconstruction, result.comparison
         self._say(
-            f"\nReconstruction: {solved.method} with {solved.prior}, {len(solved.history)} iterations in "
+            f"\nReconstruction: {solved.solver} with {solved.prior}, {len(solved.history)} iterations in "
             f"{solved.seconds:.1f} s; stopped because {solved.stop_reason}."
         )
         for warning in solved.warnings:

@@ -1,4 +1,4 @@
-"""The holographic display: ``etendue``, and the dissertation's ``table7.1``."""
+"""Holographic displays in figures: ``etendue``, and the dissertation's ``table7.1``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.table import Table
 
 from instrument.cli.app import App, examples, require_new, saying_what_is_left
 from instrument.cli.progress import progress_bar
-from instrument.display.table71_figure import rows, write_chart, write_csv
+from instrument.display.figures import rows, write_chart, write_csv
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from recon.base.declare import option
 from recon.base.option_text import size

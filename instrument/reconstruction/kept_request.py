@@ -20,7 +20,7 @@ _WITHOUT_BEARING = ("allow_saturated", "allow_mixed_depth", "memory_gib", "scrat
 
 
 def require_kept(request: PictureRequest | VolumeRequest) -> None:
-    """Refuse to keep what has no iterations, or what is chosen only while it is solved.
+    """Refuse to keep what has no iterations.
 
     Raises
     ------
@@ -28,11 +28,6 @@ def require_kept(request: PictureRequest | VolumeRequest) -> None:
     """
     if isinstance(request, PictureRequest) and request.method == "wiener":
         raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
-    if request.settings.wishes is not None:
-        raise BenchError(
-            "--choose is about everything that --model auto chooses, which it does not with --checkpoint. "
-            "Leave one of the two out."
-        )
 
 
 def checkpoint_for(

@@ -19,8 +19,7 @@ from instrument.plan.illumination import DARK, PATTERN
 from instrument.reconstruction.job import Job, find_calibration, refocused
 from instrument.reconstruction.preparation import reduce
 from instrument.runs.run import Run
-from recon import reconstruct
-from recon.reconstruction.patterned import ITERATIONS, reconstruct_patterned
+from recon import Measurement, reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
@@ -155,15 +154,14 @@ def solve_patterned(
 ) -> Reconstruction:
     """Reconstruct the one picture that explains all frames, in the brightness of all groups together."""
     request = prepared.request
-    return reconstruct_patterned(
-        prepared.frames,
-        prepared.patterns,
+    return reconstruct(
+        Measurement(prepared.frames, patterns=prepared.patterns),
         prepared.job.calibration,
         z_um=request.z_um,
-        prior=request.prior or "tv-haar",
+        prior=request.prior,
         tau=request.tau,
-        iterations=request.iterations or ITERATIONS,
-        watch=watch,
+        iterations=request.iterations,
+        on_progress=None if watch is None else lambda record, _: watch(record),
         cancel=cancel,
     )
 
@@ -254,7 +252,7 @@ def _patterns_of(
     told(0, len(sheet))
     for frame in sheet:
         found = reconstruct(
-            frame, job.calibration, z_um=request.z_um, method="admm", iterations=SHEET_ITERATIONS,
+            frame, job.calibration, z_um=request.z_um, solver="admm", iterations=SHEET_ITERATIONS,
             model="convolution", judged=False,
         )  # fmt: skip
         pictures.append(np.maximum(gaussian_filter(found.image, sigma), 0))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,35 +26,34 @@ from instrument.reconstruction.job import (
 from instrument.reconstruction.mosaic import MosaicChoice
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.volume_job import volume_job
+from recon.base.checks import select_psf
 from recon.base.namespace import DEVICES, Device
 from recon.base.options import require_options
-from recon.camera.camera_model import MODELS, ModelName
-from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
-from recon.reconstruction.channel import VolumePrior
+from recon.camera.camera_model import MODELS, ModelName, members_of_depths
 from recon.reconstruction.choice import Choice
-from recon.reconstruction.decide import choose
-from recon.reconstruction.overrides import Wishes
-from recon.reconstruction.picture import reconstruct, require_prior
-from recon.reconstruction.preparation import Precision
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.overrides import Precision, Wishes
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.selection_picture import choose_picture
-from recon.reconstruction.volume import reconstruct_volume
-from recon.reconstruction.volume_result import VolumeReconstruction
+from recon.reconstruction.selection import choice_for
+from recon.reconstruction.solve import ITERATIONS
+from recon.reconstruction.solvers import VOLUME_PRIORS, require_solver
+from recon.reconstruction.weights import require_prior
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
+from recon.types import Calibration
 
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
 """Called after each iteration with its record and what makes the present picture or volume."""
 
-PICTURE_ITERATIONS = 300
-VOLUME_ITERATIONS = 150
 
-
-def _require_choice(asked: str, prevented_by: str | None) -> None:
+def _require_choice(asked: str, model: ModelName) -> None:
     """Refuse to explain or overrule what is not chosen; BenchError says which option prevents it."""
-    if prevented_by is not None:
+    if model != "auto":
         raise BenchError(
-            f"{asked} is about everything that --model auto chooses, which it does not with {prevented_by}. "
+            f"{asked} is about everything that --model auto chooses, which it does not with --model {model}. "
             "Leave one of the two out."
         )
 
@@ -66,12 +66,9 @@ def known_model(name: str) -> ModelName:
     return found
 
 
-def known_volume_prior(name: str) -> VolumePrior:
-    """Return the volume's prior of that name; BenchError where there is none."""
-    found = next((prior for prior in VOLUME_PRIORS if prior == name), None)
-    if found is None:
+def _require_volume_prior(name: str) -> None:
+    if name not in VOLUME_PRIORS:
         raise BenchError(f"--prior {name} is not for volumes; choose one of {', '.join(VOLUME_PRIORS)}.")
-    return found
 
 
 def known_device(name: str) -> Device:
@@ -132,22 +129,43 @@ class Settings:
             noise=None if isinstance(self.noise, str) else self.noise,
         )
 
-    def exactness(self, *, all_chosen: bool) -> tuple[Wishes | None, Precision]:
-        """Return wishes and precision: where all is chosen, the precision is one of the wishes."""
-        if not all_chosen or self.precision is None:
-            return self.wishes, self.precision or "float32"
-        return replace(self.wishes or Wishes(), precision=self.precision), "float32"
+    def asked(self, **more: Any) -> ReconstructionOptions:
+        """Return what is asked of the reconstruction."""
+        return ReconstructionOptions(
+            model=self.model,
+            prior=self.prior,
+            tau=self.tau,
+            iterations=self.iterations,
+            time_s=self.time_s,
+            tolerance=self.tolerance,
+            stop_at_noise=self.stop_at_noise,
+            choose=self.wishes,
+            precision=self.precision or "auto",
+            **more,
+        )
 
-    def limit(self, default: int) -> int | None:
-        """Return the largest count of iterations: as given, or the default, or none where time is the end."""
-        return default if self.iterations is None and self.time_s is None else self.iterations
+    @property
+    def limit(self) -> int | None:
+        """The largest count of iterations: as given, or the default, or none where time is the end."""
+        return ITERATIONS if self.iterations is None and self.time_s is None else self.iterations
 
-    def done_share(self, record: IterationRecord, default: int) -> float:
+    def done_share(self, record: IterationRecord) -> float:
         """Return how much of the work is done, 0 to 1: whichever of count and time is nearer to its end."""
-        limit = self.limit(default)
-        by_count = 0.0 if limit is None else record.iteration / limit
+        by_count = 0.0 if self.limit is None else record.iteration / self.limit
         by_time = 0.0 if self.time_s is None else record.seconds / self.time_s
         return min(max(by_count, by_time), 1.0)
+
+
+def _require_one_depth(calibration: Calibration, z_um: float | None) -> None:
+    """Refuse a picture of a calibration of several depths without one of them."""
+    if z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
+        select_psf(calibration, z_um)  # which says what there is
+
+
+def _measured(job: Job, noise: NoiseChoice) -> Measurement:
+    """Return a job's photograph with what is known of it."""
+    erasures = None if job.valid is None else ~job.valid
+    return Measurement(job.measurement, job.binned_noise(noise), erasures=erasures)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,7 +181,7 @@ class PictureRequest:
     z_um : float or None
         Distance of the scene; a PSF is refocused to it.
     method : str
-        One of :func:`recon.solvers.methods.method_names`.
+        One of :func:`recon.reconstruction.solvers.SOLVERS`.
     allow_saturated, allow_mixed_depth : bool
         With ``psf``: as :func:`instrument.reconstruction.job.job_from_files`.
     settings : Settings
@@ -179,15 +197,9 @@ class PictureRequest:
     settings: Settings = field(default_factory=Settings)
 
     @property
-    def nothing_chosen_by(self) -> str | None:
-        """The option that leaves auto nothing, or only the model, to choose; None where there is none."""
-        prior = self.settings.prior
-        options = {
-            f"--model {self.settings.model}": self.settings.model != "auto",
-            f"--method {self.method}": self.method != "admm",
-            f"--prior {prior}": prior is not None and prior not in VOLUME_PRIORS,
-        }
-        return next((option for option, prevents in options.items() if prevents), None)
+    def options(self) -> ReconstructionOptions:
+        """What is asked of the reconstruction."""
+        return self.settings.asked(z_um=self.z_um, solver=self.method)
 
     def prepare(self) -> Job:
         """Read the files and bring them together; the options are checked first.
@@ -201,10 +213,11 @@ class PictureRequest:
         """
         given = self.settings
         given.require(z_um=self.z_um)
+        require_solver(self.method)
         if given.prior is not None:
             require_prior(given.prior)
         if given.wishes is not None:
-            _require_choice("--choose", self.nothing_chosen_by)
+            _require_choice("--choose", given.model)
         rules = (given.iterations, given.time_s, given.tolerance, given.stop_at_noise or None)
         if self.method == "wiener" and rules != (None, None, None, None):
             raise BenchError(
@@ -252,25 +265,12 @@ class PictureRequest:
         InputError
             When the input does not allow it.
         """
-        given = self.settings
-        wishes, precision = given.exactness(all_chosen=self.nothing_chosen_by is None and keeper is None)
+        _require_one_depth(job.calibration, self.z_um)
         return reconstruct(
-            job.measurement,
+            _measured(job, self.settings.noise),
             job.calibration,
-            z_um=self.z_um,
-            model=given.model,
-            method=self.method,
-            prior=given.prior or ("none" if self.method == "wiener" else "tv"),
-            noise=job.binned_noise(given.noise),
-            tau=given.tau,
-            iterations=given.limit(PICTURE_ITERATIONS),
-            time_s=given.time_s,
-            erasures=None if job.valid is None else ~job.valid,
-            tolerance=given.tolerance,
-            stop_at_noise=given.stop_at_noise,
-            wishes=wishes,
-            precision=precision,
-            callback=watch,
+            self.options,
+            on_progress=None if watch is None else lambda record, volume: watch(record, lambda: volume()[0]),
             cancel=cancel,
             keeper=keeper,
         )
@@ -283,24 +283,13 @@ class PictureRequest:
         BenchError
             Where it would not be asked for all of it.
         """
-        _require_choice("--explain", self.nothing_chosen_by)
-        given = self.settings
-        wishes = given.exactness(all_chosen=True)[0] or Wishes()
-        if wishes.tolerance is None:
-            wishes = replace(wishes, tolerance=given.tolerance)
-        return choose_picture(
-            job.measurement,
-            job.calibration,
-            z_um=self.z_um,
-            prior=given.prior or "tv",
-            noise=job.binned_noise(given.noise),
-            erasures=None if job.valid is None else ~job.valid,
-            wishes=wishes,
-        )
+        _require_choice("--explain", self.settings.model)
+        _require_one_depth(job.calibration, self.z_um)
+        return choice_for(Problem.of(_measured(job, self.settings.noise), job.calibration, self.options))
 
     def share(self, record: IterationRecord) -> float:
         """Return how much of the work is done, 0 to 1."""
-        return self.settings.done_share(record, PICTURE_ITERATIONS)
+        return self.settings.done_share(record)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,7 +312,7 @@ class VolumeRequest:
         Memory that may be taken; None: what is free.
     device : "cpu" or "gpu"
     settings : Settings
-        Its prior must be one of :data:`recon.reconstruction.channel.PRIORS`.
+        Its prior must be one of :data:`recon.reconstruction.solvers.VOLUME_PRIORS`.
     """
 
     image: Path
@@ -336,23 +325,23 @@ class VolumeRequest:
     settings: Settings = field(default_factory=Settings)
 
     @property
-    def nothing_chosen_by(self) -> str | None:
-        """The option that leaves auto nothing, or only the model, to choose; None where there is none."""
-        options = {
-            f"--model {self.settings.model}": self.settings.model != "auto",
-            "--memory": self.memory_gib is not None,
-            "--scratch": self.scratch is not None,
-            f"--device {self.device}": self.device != "cpu",
-        }
-        return next((option for option, prevents in options.items() if prevents), None)
+    def options(self) -> ReconstructionOptions:
+        """What is asked of the reconstruction."""
+        return self.settings.asked(
+            estimate_background=self.estimate_background,
+            positive_background=self.positive_background,
+            scratch=self.scratch,
+            memory_gib=self.memory_gib,
+            device=self.device,
+        )
 
     def prepare(self) -> Job:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
         given = self.settings
         given.require()
-        known_volume_prior(given.prior or "tv")
+        _require_volume_prior(given.prior or "tv")
         if given.wishes is not None:
-            _require_choice("--choose", self.nothing_chosen_by)
+            _require_choice("--choose", given.model)
         if self.positive_background and self.estimate_background is False:
             raise BenchError("--positive-background and --no-background exclude each other.")
         return volume_job(
@@ -372,30 +361,13 @@ class VolumeRequest:
         watch: Watch | None = None,
         cancel: threading.Event | None = None,
         keeper: Keeper | None = None,
-    ) -> VolumeReconstruction:
+    ) -> Reconstruction:
         """Reconstruct what :meth:`prepare` returned; errors as :meth:`PictureRequest.solve`."""
-        given = self.settings
-        wishes, precision = given.exactness(all_chosen=self.nothing_chosen_by is None and keeper is None)
-        return reconstruct_volume(
-            job.measurement,
+        return reconstruct(
+            _measured(job, self.settings.noise),
             job.calibration,
-            prior=known_volume_prior(given.prior or "tv"),
-            tau=given.tau,
-            model=given.model,
-            estimate_background=self.estimate_background,
-            positive_background=self.positive_background,
-            erasures=None if job.valid is None else ~job.valid,
-            noise=job.binned_noise(given.noise),
-            scratch=self.scratch,
-            memory_gib=self.memory_gib,
-            device=self.device,
-            iterations=given.limit(VOLUME_ITERATIONS),
-            time_s=given.time_s,
-            stop_at_noise=given.stop_at_noise,
-            tolerance=given.tolerance,
-            wishes=wishes,
-            precision=precision,
-            callback=watch,
+            self.options,
+            on_progress=watch,
             cancel=cancel,
             keeper=keeper,
         )
@@ -408,23 +380,9 @@ class VolumeRequest:
         BenchError
             Where it would not be asked for all of it.
         """
-        _require_choice("--explain", self.nothing_chosen_by)
-        given = self.settings
-        wishes = given.exactness(all_chosen=True)[0] or Wishes()
-        if wishes.background is None:
-            asked = True if self.positive_background else self.estimate_background
-            wishes = replace(wishes, background=asked)
-        if wishes.tolerance is None:
-            wishes = replace(wishes, tolerance=given.tolerance)
-        return choose(
-            job.measurement,
-            job.calibration,
-            prior=known_volume_prior(given.prior or "tv"),
-            noise=job.binned_noise(given.noise),
-            erasures=None if job.valid is None else ~job.valid,
-            wishes=wishes,
-        )
+        _require_choice("--explain", self.settings.model)
+        return choice_for(Problem.of(_measured(job, self.settings.noise), job.calibration, self.options))
 
     def share(self, record: IterationRecord) -> float:
         """Return how much of the work is done, 0 to 1."""
-        return self.settings.done_share(record, VOLUME_ITERATIONS)
+        return self.settings.done_share(record)

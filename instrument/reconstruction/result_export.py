@@ -12,12 +12,11 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.files.plane_steps import middle_step_um
 from instrument.files.volume_source import VolumeSource
-from instrument.files.volume_zarr import is_zarr_name, write_volume_zarr
+from instrument.files.volume_zarr import is_zarr_name, middle_step_um, write_volume_zarr
 from instrument.reconstruction.result_file import preview
 from instrument.reconstruction.stored_result import StoredResult
-from recon.reconstruction.volume_result import VolumeGrid
+from recon.reconstruction.result import Grid
 
 Advance = Callable[[int, int], object]
 PICTURE_SUFFIXES = (".tif", ".tiff", ".npy", ".png")
@@ -105,7 +104,7 @@ def _to_zarr(result: StoredResult, source: VolumeSource, target: Path, advance: 
     unknown = np.full(source.shape[0], np.nan)
     z_um, pitch_um = result.planes_um or (unknown, unknown)
     centre = (source.shape[1] // 2, source.shape[2] // 2)
-    grid = VolumeGrid(source.shape, centre, z_um, pitch_um)
+    grid = Grid(source.shape, centre, z_um, pitch_um)
     write_volume_zarr(target, voxels, grid, {"simulated": result.simulated})
 
 

@@ -36,11 +36,10 @@ def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:
         Panel("Photograph", _shown(job.measurement), caption="dark level subtracted"),
         Panel("Reconstruction", _shown(image), caption=f"{height} x {width}"),
     )
-    facts = [("method", result.method), ("prior", result.prior)]
+    facts = [("method", result.solver), ("prior", result.prior)]
     if result.tau is not None:
         facts.append(("tau", f"{result.tau:.3g}"))
-    if result.stop_reason is not None:
-        facts.append(("stopped", str(result.stop_reason)))
+    facts.append(("stopped", str(result.stop_reason)))
     facts.append(("time", f"{result.seconds:.1f} s"))
     return Summary("Reconstruction", panels, _convergence(result), lines=facts, simulated=job.simulated)
 

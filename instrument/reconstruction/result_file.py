@@ -18,7 +18,7 @@ from instrument.files.images import write_image
 from instrument.files.record import plain
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.job import Job
-from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.result import Grid, Reconstruction
 
 WHITE_PERCENTILE = 99.9
 """The preview's white; brighter pixels are shown white too."""
@@ -111,6 +111,21 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
     write_text(outputs.record, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
+def picture_grid(grid: Grid) -> dict[str, Any]:
+    """Return where a picture's pixels lie, JSON-compatible: None for what is not known."""
+
+    def known(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    return {
+        "shape": grid.shape[1:],
+        "centre": grid.centre,
+        "sensor_pitch_um": grid.sensor_pitch_um,
+        "object_pitch_um": known(grid.pitch_um[0]),
+        "z_um": known(grid.z_um[0]),
+    }
+
+
 def preview(image: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float]:
     """Return 8-bit pixels, linear from zero to the white level, and that level in the image's units."""
     white = white_level(image)
@@ -132,16 +147,19 @@ def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "simulated": job.simulated,
         "inputs": job.provenance,
-        "method": result.method,
+        "model": result.model,
+        "model_reason": result.reason,
+        "method": result.solver,
         "prior": result.prior,
         "tau": result.tau,
         "noise_norm": result.noise_norm,
-        "stop_reason": None if result.stop_reason is None else str(result.stop_reason),
+        "stop_reason": str(result.stop_reason),
         "iterations": len(result.history),
         "seconds": result.seconds,
         "warnings": [*job.warnings, *result.warnings],
         "verdict": None if result.verdict is None else result.verdict.as_json(),
-        "grid": asdict(result.grid),
+        "background_estimated": result.background is not None,
+        "grid": picture_grid(result.grid),
         "provenance": result.provenance,
         "history": [asdict(entry) for entry in result.history],
     }

@@ -7,13 +7,13 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from instrument.reconstruction.volume_views import in_colour_of_depth
-from recon.reconstruction.volume_result import VolumeReconstruction
+from recon.reconstruction.result import Reconstruction
 
 _SLICES = 4
 _WHITE_PERCENTILE = 99.8
 
 
-def volume_figure(result: VolumeReconstruction, *, simulated: bool = False) -> Figure:
+def volume_figure(result: Reconstruction, *, simulated: bool = False) -> Figure:
     """Draw a volume: brightest over each axis, depth as colour, slices, and how the solver converged."""
     volume = result.volume if result.volume.ndim == 3 else result.volume.mean(axis=-1)
     figure = Figure(figsize=(15, 8), layout="constrained")
@@ -53,6 +53,6 @@ def _white(image: npt.NDArray[np.float32]) -> float:
     return level if level > 0 else max(float(image.max()), 1e-30)
 
 
-def _depth(result: VolumeReconstruction, plane: int) -> str:
+def _depth(result: Reconstruction, plane: int) -> str:
     z_um = result.grid.z_um[plane]
     return f"{plane}" if not np.isfinite(z_um) else f"{plane} (z = {z_um / 1000:.2f} mm)"

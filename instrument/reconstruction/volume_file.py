@@ -13,15 +13,14 @@ import numpy as np
 
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.figures import save_figure
-from instrument.files.plane_steps import middle_step_um, uneven_steps
 from instrument.files.record import plain
-from instrument.files.volume_zarr import is_zarr_name, write_volume_zarr
+from instrument.files.volume_zarr import is_zarr_name, middle_step_um, uneven_steps, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs
-from recon.reconstruction.volume_result import VolumeGrid, VolumeReconstruction
+from recon.reconstruction.result import Grid, Reconstruction
 
 
-def write_volume(outputs: Outputs, result: VolumeReconstruction, job: Job) -> None:
+def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     """Write volume, page of views and record, each whole or not at all.
 
     A TIFF holds ``ZYX`` or ``ZCYX`` float32, an OME-Zarr ``zyx`` or ``czyx``; the name says which. OME knows
@@ -44,7 +43,7 @@ def write_volume(outputs: Outputs, result: VolumeReconstruction, job: Job) -> No
     write_text(outputs.record, json.dumps(volume_record(result, job), indent=1, allow_nan=False) + "\n")
 
 
-def _write_tiff(path: Path, result: VolumeReconstruction) -> None:
+def _write_tiff(path: Path, result: Reconstruction) -> None:
     import tifffile
 
     volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
@@ -53,7 +52,7 @@ def _write_tiff(path: Path, result: VolumeReconstruction) -> None:
         tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
 
 
-def volume_record(result: VolumeReconstruction, job: Job) -> dict[str, Any]:
+def volume_record(result: Reconstruction, job: Job) -> dict[str, Any]:
     """Return all that is known of a volume but its voxels, JSON-compatible."""
     record = {
         "program": f"diffuserbench {version('diffuserbench')}",
@@ -88,7 +87,7 @@ def _known(values: np.ndarray[Any, Any]) -> list[float] | None:
     return [float(v) for v in values] if np.isfinite(values).all() else None
 
 
-def _voxel_size(grid: VolumeGrid) -> dict[str, Any]:
+def _voxel_size(grid: Grid) -> dict[str, Any]:
     if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
         return {}
     middle = len(grid.z_um) // 2

@@ -1,4 +1,4 @@
-"""Sums and means of blocks of pixels: binning, the one way to do it."""
+"""Sums and means of blocks of pixels, and the way back: binning, the one way to do it."""
 
 from __future__ import annotations
 
@@ -72,3 +72,23 @@ def blocks_about_axis(n: int, factor: int) -> tuple[int, int]:
         count -= 1
         first = n // 2 - (count // 2) * factor
     return first, count
+
+
+def enlarged(image: Array, factor: int, shape: tuple[int, int]) -> Array:
+    """Bring a binned object (..., height, width) back to pixels, linearly between them.
+
+    PSF and measurement were binned alike, so that an object's pixel ``k`` blocks from the axis lies ``k *
+    factor`` pixels from it. Light is kept: ``factor^2`` pixels share that of one.
+    """
+    if factor == 1:
+        return np.asarray(image, np.float32)
+    out = np.asarray(image, np.float32)
+    for axis, n in ((-2, shape[0]), (-1, shape[1])):
+        m = out.shape[axis]
+        at = m // 2 + (np.arange(n) - n // 2) / factor
+        low = np.clip(np.floor(at).astype(int), 0, m - 1)
+        high = np.minimum(low + 1, m - 1)
+        part = np.clip(at - low, 0, 1).astype(np.float32)
+        shaped = part[:, None] if axis == -2 else part
+        out = np.take(out, low, axis=axis) * (1 - shaped) + np.take(out, high, axis=axis) * shaped
+    return np.asarray(out / np.float32(factor**2), np.float32)

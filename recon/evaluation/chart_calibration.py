@@ -24,7 +24,7 @@ from recon.blind.point_psfs import support_of
 from recon.camera.registration import displacement
 from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.reconstruction.volume import reconstruct_volume
+from recon.reconstruction.reconstruct import reconstruct
 from recon.solvers.stopping import StopReason
 from recon.types import Calibration, Geometry
 
@@ -183,7 +183,7 @@ class CalibrationProblem:
             left = None if limit_s is None else limit_s - (time.perf_counter() - began)
             if left is not None and left <= 0:
                 return Curve(tuple(points), finished=False)
-            found = reconstruct_volume(
+            found = reconstruct(
                 scene.image,
                 calibration if scene.name != "flat picture" else self._flat(calibration),
                 model="local" if setting.grid > 1 or setting.slides else "convolution",
@@ -236,10 +236,10 @@ class CalibrationProblem:
                 source_positions_um=np.array([(1e2 * x, 1e2 * y, 1e3) for x, y in _square(3)]),
             )
         for prior in ("tv", "l1"):
-            reconstruct_volume(
+            reconstruct(
                 rng.random((size, size)),
                 calibration,
-                model=model,  # type: ignore[arg-type]
+                model=model,
                 prior=prior,
                 estimate_background=False,
                 iterations=2,

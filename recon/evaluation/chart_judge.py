@@ -17,19 +17,76 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.blocks import block_mean, blocks_about_axis, enlarged
 from recon.camera.background import BackgroundRemoval
-from recon.camera.local_convolution import field_of
 from recon.evaluation.chart_settings import Setting, binnings_of
-from recon.evaluation.scene_score import score
 from recon.evaluation.scored import Point
-from recon.reconstruction.channel import BACKGROUND_FREQUENCIES, ChannelProblem
-from recon.reconstruction.preparation import channel_noise, data_of
-from recon.reconstruction.reduced import binned, blocks, enlarged, reduced_calibration
-from recon.reconstruction.volume import prepare_volume
+from recon.reconstruction.measurement import Measurement, channel_noise
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
+from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.reduction import reduced_calibration
 from recon.types import Calibration
 
 if TYPE_CHECKING:
     from recon.evaluation.chart_reconstruction import ChartProblem
+from dataclasses import dataclass
+
+from recon.base import metrics
+from recon.errors import InputError
+
+VOLUME_BLUR_PX = 1.0
+"""Volumes are compared through a blur of this deviation in every direction: a bead at a voxel's border is not
+wrong by being in its neighbour."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors against the truth, after the one factor that fits the result to it best."""
+
+    psnr_db: float
+    ssim: float
+    nrmse: float
+
+
+def score(found: npt.NDArray[Any], truth: npt.NDArray[Any], *, volume: bool | None = None) -> Score:
+    """Judge a reconstruction.
+
+    Parameters
+    ----------
+    found, truth : ndarray
+        Pictures (height, width[, n_channels]), or volumes (n_z, height, width[, n_channels]) of one shape.
+    volume : bool, optional
+        Whether the first axis is depth; default: 3 axes of which the last is longer than 4, or 4 axes.
+
+    Raises
+    ------
+    InputError
+        When the shapes differ.
+    """
+    if found.shape != truth.shape:
+        raise InputError(f"The reconstruction is {found.shape} and the truth {truth.shape}.")
+    if volume is None:
+        volume = truth.ndim == 4 or (truth.ndim == 3 and truth.shape[2] > 4)
+    a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+    if not volume:
+        return Score(
+            metrics.psnr(a, b, fit_scale=True),
+            metrics.ssim(a, b, fit_scale=True),
+            metrics.nrmse(a, b, fit_scale=True),
+        )
+    from scipy.ndimage import gaussian_filter
+
+    sigma = (VOLUME_BLUR_PX,) * 3 + (0.0,) * (b.ndim - 3)
+    a, b = (gaussian_filter(v, sigma, mode="constant") for v in (a, b))
+    # Planes side by side make one picture: one scale and one peak for all of the volume.
+    wide_a, wide_b = (v.reshape(-1, *v.shape[2:]) for v in (a, b))
+    return Score(
+        metrics.psnr(wide_a, wide_b, fit_scale=True),
+        metrics.ssim(wide_a, wide_b, fit_scale=True),
+        metrics.nrmse(wide_a, wide_b, fit_scale=True),
+    )
+
 
 Array = npt.NDArray[Any]
 
@@ -58,17 +115,16 @@ class Judge:
         held[tuple(slice(first, first + count * block) for first, count in spans)] = np.repeat(
             np.repeat(chosen, block, 0), block, 1
         )
-        self.measurement = binned(problem.measurement, factor)
+        self.measurement = block_mean(problem.measurement, factor, about_axis=True)
         self.calibration = reduced_calibration(problem.calibration, factor, None)
-        self.held = binned((held & kept).astype(np.float32), factor) > 0.5
-        self.kept = binned(kept.astype(np.float32), factor) > 1 - 1e-6
+        self.held = block_mean((held & kept).astype(np.float32), factor, about_axis=True) > 0.5
+        self.kept = block_mean(kept.astype(np.float32), factor, about_axis=True) > 1 - 1e-6
         self.erasures = self.held | ~self.kept
-        data, valid, _ = data_of(problem.measurement, None, None if kept.all() else ~kept)
-        pixel_noise = channel_noise(data[0], valid[0], problem.noise)
+        pixel_noise = channel_noise(problem.measurement, kept, problem.noise)
         self.noise = pixel_noise / factor
         self._block_noise = pixel_noise / block
         starts = [
-            blocks(n, self._together)[1] // 2 - (whole // 2 - first) // block
+            blocks_about_axis(n, self._together)[1] // 2 - (whole // 2 - first) // block
             for n, whole, (first, _) in zip(self.held.shape, shape, spans, strict=True)
         ]
         self._common = tuple(
@@ -77,11 +133,13 @@ class Judge:
         self._scored = self._blocks(self.held & self.kept) > 0.5
         used = self._blocks(~self.erasures) > 1 - 1e-6
         self._waves, self._block_waves = _slow_waves(~self.erasures), _slow_waves(used)
-        self._camera: ChannelProblem | None = None
+        self._camera: Part | None = None
 
     def _blocks(self, image: Array) -> Array:
         """Average over the coarsest binning's blocks, those that every binning has."""
-        return np.asarray(binned(np.asarray(image, np.float32), self._together)[self._common])
+        return np.asarray(
+            block_mean(np.asarray(image, np.float32), self._together, about_axis=True)[self._common]
+        )
 
     @property
     def central(self) -> Calibration:
@@ -123,40 +181,32 @@ class Judge:
 
     def _on_sensor(self, planes: Array) -> Array:
         height, width = self.measurement.shape
-        (_, (row, column)) = field_of((height, width), self.calibration.psfs.shape[2:])
-        top, left = row - height // 2, column - width // 2
-        return planes[:, top : top + height, left : left + width]
+        psf = self.calibration.psfs.shape
+        (rows, columns), _ = window_of("sensor", (height, width), (psf[2], psf[3]))
+        return planes[:, rows, columns]
 
     def _predict(self, planes: Array) -> Array:
         """Return the measurement that the setting's own model makes of what was found."""
-        camera = self._problem()
-        full = tuple(
-            s + p - 1 for s, p in zip(self.measurement.shape, self.calibration.psfs.shape[2:], strict=True)
-        )
-        window = (slice(0, full[0]), slice(0, full[1]))
-        placed = camera.start(planes, window)
-        predicted: Array = camera.camera.forward(placed)[0]
+        part = self._part()
+        placed = np.zeros(part.camera.domain_shape, part.dtype)
+        placed[0, :, : planes.shape[1], : planes.shape[2]] = planes / part.problem.image_scale[0, 0]
+        predicted: Array = part.camera.forward(placed)[0]
         if self.setting.background:
-            predicted = predicted + camera.background(placed)
+            predicted = predicted + part.background(placed)[0]
         return predicted * np.float32(self.noise)
 
-    def _problem(self) -> ChannelProblem:
+    def _part(self) -> Part:
         if self._camera is None:
-            scaled = prepare_volume(
-                self.measurement,
+            problem = Problem.of(
+                Measurement(self.measurement, self.noise, erasures=self.erasures),
                 self.central if self.setting.method != "volume" else self.calibration,
-                None,
-                self.erasures,
-                self.noise,
+                ReconstructionOptions(
+                    model=self.setting.model,
+                    estimate_background=self.setting.background,
+                    prior="nonnegative",
+                ),
             )
-            self._camera = ChannelProblem(
-                scaled,
-                0,
-                self.setting.model,
-                smooth=self.setting.background,
-                prior="nonnegative",
-                weights=np.ones((len(scaled.depths.z_um), 3)),
-            )
+            self._camera = Part(problem, slice(0, 1))
         return self._camera
 
 
@@ -186,6 +236,6 @@ def _common_blocks(n: int, binnings: Sequence[int]) -> tuple[int, int]:
     block = binnings[-1]
     before, behind = n, n
     for factor in binnings:
-        _, count = blocks(blocks(n, factor)[1], block // factor)
+        _, count = blocks_about_axis(blocks_about_axis(n, factor)[1], block // factor)
         before, behind = min(before, count // 2), min(behind, count - count // 2)
     return n // 2 - before * block, before + behind

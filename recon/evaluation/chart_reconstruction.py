@@ -17,11 +17,10 @@ import numpy.typing as npt
 
 from recon.base.noise import NoiseModel
 from recon.evaluation.chart_judge import Judge
-from recon.evaluation.chart_settings import Setting, left_out, require_applicable, settings_for
+from recon.evaluation.chart_settings import ON_DEVICE, Setting, left_out, require_applicable, settings_for
 from recon.evaluation.scene import Family, make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.reconstruction.picture import reconstruct
-from recon.reconstruction.volume import reconstruct_volume
+from recon.reconstruction.reconstruct import reconstruct
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.types import Calibration
 
@@ -137,14 +136,14 @@ def run_setting(
         "judged": False,
     }
     if setting.method == "volume":
-        volume = reconstruct_volume(
+        volume = reconstruct(
             judge.measurement,
             judge.calibration,
-            prior=setting.prior,  # type: ignore[arg-type]
+            prior=setting.prior,
             model=setting.model,
             estimate_background=setting.background,
             tolerance=1e-7,
-            callback=note,
+            on_progress=note,
             precision=setting.precision,
             **common,
         )
@@ -155,11 +154,12 @@ def run_setting(
     result = reconstruct(
         judge.measurement,
         judge.central,
-        method=setting.method,
+        solver="auto" if setting.method == ON_DEVICE else setting.method,
+        device="gpu" if setting.method == ON_DEVICE else "cpu",
         model="convolution",
         prior=setting.prior,
         tolerance=None if one_shot else 1e-7,
-        callback=None if one_shot else note,
+        on_progress=None if one_shot else note,
         precision=setting.precision,
         **common,
     )

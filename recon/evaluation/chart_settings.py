@@ -10,8 +10,8 @@ from recon.base.namespace import array_namespace
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.errors import InputError
 from recon.priors import PRIORS
-from recon.reconstruction.channel import PRIORS as VOLUME_PRIORS
-from recon.reconstruction.preparation import PRECISIONS, Precision
+from recon.reconstruction.overrides import PRECISIONS, Precision
+from recon.reconstruction.solvers import VOLUME_PRIORS
 
 if TYPE_CHECKING:
     from recon.evaluation.chart_reconstruction import ChartProblem
@@ -23,8 +23,8 @@ PICTURE_METHODS: dict[str, tuple[str, ...]] = {
     "fista": tuple(PRIORS),
 }
 """Methods of a picture, each with the priors that it has a way for. Wiener's knows bounds only."""
-GPU_PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
-"""Those of ``admm-gpu``, where there is a GPU."""
+ON_DEVICE = "admm-gpu"
+"""How charts call ``"admm"`` of a picture with its arrays on a GPU, where there is one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Setting:
     Attributes
     ----------
     method : str
-        A name of :func:`recon.solvers.methods.method_names`, or ``"volume"``.
+        A name of ``recon.reconstruction.solvers.SOLVERS``, :data:`ON_DEVICE`, or ``"volume"``.
     model, prior : str
     binning : int
     background : bool
@@ -87,9 +87,9 @@ def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
             ]
             if _has_gpu():
                 found += [
-                    Setting("admm-gpu", "convolution", prior, binning, precision=precision)
+                    Setting(ON_DEVICE, "convolution", prior, binning, precision=precision)
                     for precision in PRECISIONS
-                    for prior in GPU_PRIORS
+                    for prior in VOLUME_PRIORS
                 ]
         found += [
             Setting("volume", model, prior, binning, background, precision)
@@ -120,7 +120,7 @@ def left_out(problem: ChartProblem) -> tuple[str, ...]:
             f"binning: {'too few pixels would be left' if small else 'erased pixels cannot be averaged'}"
         )
     if not problem.volume and not _has_gpu():
-        found.append("admm-gpu: there is no GPU that CuPy can use")
+        found.append(f"{ON_DEVICE}: there is no GPU that CuPy can use")
     return tuple(found)
 
 
@@ -153,7 +153,7 @@ def binnings_of(problem: ChartProblem) -> list[int]:
 def _cost(setting: Setting) -> float:
     """Rough order of time, and of how much there is to learn."""
     slow = {"convolution": 1.0, "lowrank": 20.0, "local": 30.0}[setting.model]
-    methods = {"wiener": 0.01, "admm": 1.0, "fista": 1.5, "admm-sensor": 2.0, "admm-gpu": 2.0, "volume": 3.0}
+    methods = {"wiener": 0.01, "admm": 1.0, "fista": 1.5, "admm-sensor": 2.0, ON_DEVICE: 2.0, "volume": 3.0}
     # What differs from the usual way by little comes after what differs by much.
     usual = setting.prior in ("tv", "l1") or setting.method == "wiener"
     rank = (1 if usual else 4) * (1 if setting.precision == "float32" else 8)

@@ -13,11 +13,13 @@ from recon.camera.base import LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
 from recon.evaluation.maps_light import PICTURE
-from recon.evaluation.scene import SceneSpec
+from recon.evaluation.scene import SceneSpec, TestScene
 from recon.evaluation.scene_trial import judge_image, scene_of, spec_at
 from recon.priors import NonNegativity, TotalVariation
 from recon.priors.base import Prior
-from recon.reconstruction.preparation import Prepared, prepare
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
 from recon.solvers import StoppingRules
 from recon.solvers.admm import Admm, Penalties
 from recon.solvers.base import Outcome
@@ -43,21 +45,24 @@ VOLUME_DEPTHS = 4
 
 
 @lru_cache(maxsize=2)
-def _problem(pixels: int, seed: int) -> Prepared:
-    scene = scene_of(SceneSpec("sparse-picture", size=pixels, seed=1000 + seed, photons=1000.0))
-    return prepare(scene.measurement, scene.calibration)
+def _part(pixels: int, seed: int) -> Part:
+    return _part_of(scene_of(SceneSpec("sparse-picture", size=pixels, seed=1000 + seed, photons=1000.0)))
+
+
+def _part_of(scene: TestScene) -> Part:
+    options = ReconstructionOptions(model="convolution")
+    return Part(Problem.of(scene.measurement, scene.calibration, options), slice(0, 1))
 
 
 def _precision(method: str, x: float, y: float, seed: int, _size: Size) -> Trial:
-    problem = _problem(int(y), seed)
+    part = _part(int(y), seed)
+    psf = part.problem.depths.central[0]
     solutions = []
     for dtype in (np.float32, np.float64):
-        camera = PadCropConvolution(
-            problem.psfs / np.linalg.norm(problem.psfs), problem.camera.sensor_shape, dtype=dtype
-        )
+        camera = PadCropConvolution(psf / np.linalg.norm(psf), part.problem.sensor_shape, dtype=dtype)
         prior = TotalVariation(1.0) + NonNegativity()
         rules = StoppingRules(iterations=int(x), tolerance=0)
-        solver = (Admm if method == "admm tv" else Fista)(camera, problem.data.astype(dtype), prior)
+        solver = (Admm if method == "admm tv" else Fista)(camera, part.data.astype(dtype), prior)
         solutions.append(solver.run(rules).solution.astype(np.float64))
     norm = float(np.linalg.norm(solutions[1]))
     difference = float(np.linalg.norm(solutions[0] - solutions[1])) / max(norm, 1e-30)
@@ -69,9 +74,9 @@ def _penalties(method: str, x: float, y: float, seed: int, size: Size) -> Trial:
         return _volume_penalties(method, x, y, seed, size)
     spec = spec_at(PICTURE, size, seed, photons=1000.0)
     scene = scene_of(spec)
-    problem = prepare(scene.measurement, scene.calibration)
-    outcome = _PICTURE_SOLVERS[method](problem, x, y)
-    found = problem.picture(outcome.solution, "sensor")[None]
+    part = _part_of(scene)
+    outcome = _PICTURE_SOLVERS[method](part, x, y)
+    found = part.problem.measured(part.lifted(outcome.solution), part.channels)
     error, severities = judge_image(scene, found, scene.truth[None])
     settled = convergence_severity(outcome.history, outcome.stop_reason, TOLERANCE)
     return Trial(error, {**severities, Failure.CONVERGENCE: settled})
@@ -81,18 +86,18 @@ def _rules() -> StoppingRules:
     return StoppingRules(iterations=STEPS, tolerance=TOLERANCE)
 
 
-def _admm(problem: Prepared, penalty: float, weight: float) -> Outcome:
+def _admm(part: Part, penalty: float, weight: float) -> Outcome:
     prior = TotalVariation(weight) + NonNegativity()
     default = Penalties()
     penalties = Penalties(data=default.data * penalty, separable=default.separable * penalty)
-    return Admm(problem.operator, problem.data, prior, penalties=penalties).run(_rules())
+    return Admm(part.picture_operator, part.data, prior, penalties=penalties).run(_rules())
 
 
-def _fista(problem: Prepared, step: float, weight: float) -> Outcome:
+def _fista(part: Part, step: float, weight: float) -> Outcome:
     prior = TotalVariation(weight) + NonNegativity()
-    length = step / problem.operator.norm_bound**2
+    length = step / part.picture_operator.norm_bound**2
     with np.errstate(over="ignore", invalid="ignore"):  # too long a step diverges: that is what is asked
-        return Fista(problem.operator, problem.data, prior, step=length).run(_rules())
+        return Fista(part.picture_operator, part.data, prior, step=length).run(_rules())
 
 
 class _OffBalance(SensorAdmm):
@@ -109,12 +114,12 @@ class _OffBalance(SensorAdmm):
         return super()._balanced_penalties() * self._factor
 
 
-def _sensor_admm(problem: Prepared, penalty: float, weight: float) -> Outcome:
+def _sensor_admm(part: Part, penalty: float, weight: float) -> Outcome:
     prior = TotalVariation(weight) + NonNegativity()
-    return _OffBalance(problem.operator, problem.data, prior, penalty).run(_rules())
+    return _OffBalance(part.picture_operator, part.data, prior, penalty).run(_rules())
 
 
-_PICTURE_SOLVERS: dict[str, Callable[[Prepared, float, float], Outcome]] = {
+_PICTURE_SOLVERS: dict[str, Callable[[Part, float, float], Outcome]] = {
     "admm tv": _admm,
     "admm-sensor tv": _sensor_admm,
     "fista tv": _fista,

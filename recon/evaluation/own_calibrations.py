@@ -21,11 +21,10 @@ from recon.evaluation.chart_reconstruction import SCORES, ChartProblem, run_sett
 from recon.evaluation.chart_settings import Setting
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.reconstruction.channel import VolumePrior
-from recon.reconstruction.volume import reconstruct_volume
+from recon.reconstruction.reconstruct import reconstruct
 from recon.solvers.stopping import StopReason
 
-_SCENES: dict[VolumePrior, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
+_SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
 """What a photograph is of is for its owner to say: both fronts are drawn."""
 
 
@@ -137,7 +136,7 @@ class OwnCalibrationsProblem:
         spent = 0.0
         for prior, group in _SCENES.items():
             judge = Judge(problem, Setting("volume", setting.model, prior, background=True), 0)
-            found = reconstruct_volume(
+            found = reconstruct(
                 judge.measurement,
                 judge.calibration,
                 prior=prior,

@@ -15,10 +15,10 @@ from recon.camera.camera_model import ModelName
 from recon.errors import InputError
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.evaluation.stability_spots import REACH_PX, spot_severity
-from recon.reconstruction.picture import reconstruct
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
-from recon.reconstruction.volume import reconstruct_volume
-from recon.reconstruction.volume_result import VolumeReconstruction
+from recon.reconstruction.solvers import SOLVERS
 from recon.verdict.failure import (
     WORST,
     Failure,
@@ -39,20 +39,18 @@ LEVEL = 0.7
 LEAST_RESOLVED_PX = 2.0
 """No grid of pixels tells neighbours apart that are nearer: there must be a darker pixel between them."""
 ITERATIONS = {"quick": 150, "full": 200}
-TOLERANCE = {"admm": 2e-3, "admm-sensor": 2e-3, "fista": 5e-4, "volume": 1e-3}
 METHODS: Mapping[str, Mapping[str, str]] = {
-    "admm tv": {"method": "admm", "prior": "tv"},
-    "admm l1": {"method": "admm", "prior": "l1"},
-    "admm-sensor tv": {"method": "admm-sensor", "prior": "tv"},
-    "fista tv": {"method": "fista", "prior": "tv"},
-    "fista l1": {"method": "fista", "prior": "l1"},
-    "wiener": {"method": "wiener", "prior": "none"},
+    "admm tv": {"solver": "admm", "prior": "tv"},
+    "admm l1": {"solver": "admm", "prior": "l1"},
+    "admm-sensor tv": {"solver": "admm-sensor", "prior": "tv"},
+    "fista tv": {"solver": "fista", "prior": "tv"},
+    "fista l1": {"solver": "fista", "prior": "l1"},
+    "wiener": {"solver": "wiener", "prior": "none"},
     "volume tv": {"prior": "tv"},
     "volume l1": {"prior": "l1"},
     "volume nonnegative": {"prior": "nonnegative"},
 }
-"""Methods by the name they have on the maps, with what :func:`recon.reconstruct` or
-:func:`recon.reconstruct_volume` is told."""
+"""Methods by the name they have on the maps, with what :func:`recon.reconstruct` is told."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +92,7 @@ def run_scene(spec: SceneSpec, method: str, options: Options, size: Size) -> Tri
     return judge(scene, result)
 
 
-def solve(
-    scene: TestScene, method: str, options: Options, iterations: int | None
-) -> Reconstruction | VolumeReconstruction:
+def solve(scene: TestScene, method: str, options: Options, iterations: int | None) -> Reconstruction:
     """Reconstruct a scene as a user would."""
     erasures = scene.erasures
     if options.leave_out_saturated:
@@ -107,46 +103,30 @@ def solve(
     # The local model of a picture has a solver of its own: ADMM.
     able = method.startswith(("volume", "admm ")) and len(scene.calibration.psfs) > len(scene.z_um)
     model: ModelName = options.model or ("local" if able else "convolution")
-    if not method.startswith("volume"):
-        limit: dict[str, Any] = {} if given["method"] == "wiener" else {"iterations": iterations}
-        return reconstruct(
-            scene.measurement,
-            scene.calibration,
-            model=model,
-            erasures=erasures,
-            background=background,
-            **given,
-            **limit,
-        )
-    return reconstruct_volume(
-        scene.measurement,
-        scene.calibration,
-        model=model,
-        erasures=erasures,
-        background=background,
-        estimate_background=options.estimate_background,
-        iterations=iterations,
-        **given,
-    )
+    if method.startswith("volume"):
+        given["estimate_background"] = options.estimate_background
+    if not SOLVERS.named(given.get("solver", "admm")).one_step:
+        given["iterations"] = iterations
+    measurement = Measurement(scene.measurement, background=background, erasures=erasures)
+    return reconstruct(measurement, scene.calibration, model=model, **given)
 
 
-def judge(scene: TestScene, result: Reconstruction | VolumeReconstruction) -> Trial:
+def judge(scene: TestScene, result: Reconstruction) -> Trial:
     """Judge a reconstruction against the truth."""
-    found = result.image[None] if isinstance(result, Reconstruction) else result.volume
+    found = result.volume
     truth = scene.truth.reshape(found.shape)
     error, severities = judge_image(scene, np.asarray(found), truth)
     evidence = {} if result.verdict is None else result.verdict.evidence
     return Trial(error, {**severities, Failure.CONVERGENCE: _convergence(result)}, evidence)
 
 
-def _convergence(result: Reconstruction | VolumeReconstruction) -> float:
-    if isinstance(result, VolumeReconstruction):
-        return max(
-            convergence_severity(h, r, TOLERANCE["volume"])
-            for h, r in zip(result.histories, result.stop_reasons, strict=True)
-        )
-    tolerance = TOLERANCE.get(result.method, TOLERANCE["volume"])
-    return convergence_severity(result.history, result.stop_reason, tolerance)
+def _convergence(result: Reconstruction) -> float:
+    offered, plain = SOLVERS[result.solver], result.is_picture and result.model == "convolution"
+    tolerance = offered.tolerance if isinstance(offered.tolerance, float) else 2e-3 if plain else 1e-3
+    return max(
+        convergence_severity(h, r, tolerance)
+        for h, r in zip(result.histories, result.stop_reasons, strict=True)
+    )
 
 
 def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Severities]:

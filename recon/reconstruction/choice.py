@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from recon.camera.camera_model import ModelName
-from recon.reconstruction.preparation import Precision
+from recon.reconstruction.overrides import Precision
 
 Name = Literal[
     "model", "planes", "between", "field", "binning", "channels", "background", "iterations", "precision"

@@ -8,7 +8,10 @@ from typing import Any, Literal
 
 from recon.camera.camera_model import MODELS, ModelName
 from recon.errors import InputError
-from recon.reconstruction.preparation import PRECISIONS, Precision
+
+Precision = Literal["float32", "float64"]
+PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
+"""Of all arithmetic in a solver."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,18 +93,3 @@ def _indices(text: str) -> tuple[int, ...]:
             raise InputError(f"planes={text}: all, or depths counted from 0 as in 0-3,7, is expected.")
         chosen |= set(range(int(first), int(last or first) + 1))
     return tuple(sorted(chosen))
-
-
-def require_choice(wishes: Wishes | None, prevented_by: str) -> None:
-    """Refuse wishes where nothing, or only the model, is chosen: they would be ignored.
-
-    Raises
-    ------
-    InputError
-        What prevents the choice that they are about.
-    """
-    if wishes not in (None, Wishes()):
-        raise InputError(
-            f"Wishes are about everything that model='auto' chooses, which it does not with {prevented_by}. "
-            "Leave one of the two out."
-        )

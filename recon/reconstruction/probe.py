@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.correlation import autocorrelate
-from recon.base.noise import estimate_deviation
 from recon.camera.camera_model import Depths, ModelName
 from recon.camera.spatially_varying import SpatiallyVarying
-from recon.reconstruction.channel import ChannelProblem, Scaled, VolumePrior
-from recon.reconstruction.reduced import Colours
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.solvers import SOLVERS
 from recon.solvers import StoppingRules
 
 Array = npt.NDArray[Any]
@@ -25,10 +25,6 @@ pattern's edge: on fewer pixels all depths look alike."""
 COARSE_ITERATIONS = 40
 VARYING_ITERATIONS = 20
 """The same with PSFs that vary over the field, whose solver goes further in one."""
-CHANNEL_NOISE = 1.1
-"""Misfit, in units of the noise, up to which colour channels are taken to be proportional."""
-CHANNEL_PSF = 0.05
-"""The same of their PSFs, relative to them."""
 ACCEPTED = 0.005
 """Brightness, relative to the axis, below which the sensor counts as accepting nothing."""
 LIGHT_LOST = 2e-4
@@ -61,15 +57,15 @@ class CoarsePass:
 
 
 def coarse_passes(
-    channels: list[Scaled],
-    prior: VolumePrior,
+    channels: list[Problem],
+    prior: str,
     *,
     background: bool,
     model: ModelName = "convolution",
     iterations: int = COARSE_ITERATIONS,
 ) -> CoarsePass:
     """Reconstruct every channel in few iterations; misfits are their root mean square, shares their mean."""
-    passes = [coarse_pass(c, model, prior, background=background, iterations=iterations) for c in channels]
+    passes = [coarse_pass(_as(c, model, prior, background), iterations=iterations) for c in channels]
     return CoarsePass(
         float(np.sqrt(np.mean([p.misfit**2 for p in passes]))),
         np.concatenate([p.light for p in passes]),
@@ -79,35 +75,34 @@ def coarse_passes(
     )
 
 
-def coarse_pass(
-    scaled: Scaled, model: ModelName, prior: VolumePrior, *, background: bool, iterations: int
-) -> CoarsePass:
-    """Reconstruct the first channel in few iterations."""
-    n_z = len(scaled.depths.z_um)
-    run = ChannelProblem(
-        scaled,
-        0,
-        model,
-        smooth=background,
-        prior=prior,
-        weights=np.ones((n_z, 3)) * ([0.0, 1.0, 1.0] if n_z == 1 else [1.0, 1.0, 1.0]),
-        drop_empty=False,
-    )
+def _as(problem: Problem, model: ModelName, prior: str, background: bool) -> Problem:
+    """Return a coarse copy with another model and prior; TV of planes as far apart as their pixels."""
+    weights = None if problem.n_planes == 1 else (1.0, 1.0, 1.0)
+    options = replace(problem.options, prior=prior, axis_weights=weights, drop_empty=False)
+    return replace(problem, options=options, model=model, smooth=background)
+
+
+def coarse_pass(problem: Problem, *, iterations: int) -> CoarsePass:
+    """Reconstruct a problem of one channel in few iterations."""
+    part = Part(problem, slice(0, 1))
     try:
-        solver, _ = run.solver(None, None)
+        part.weigh(None)
+        solver = SOLVERS["admm"].make(part, None)
         began = time.process_time()
         outcome = solver.run(StoppingRules(iterations=iterations, tolerance=0.0))
         seconds = (time.process_time() - began) / iterations
-        smooth = run.background(outcome.solution) if background else None
-        residual = run.residual(outcome.solution, smooth)
-        volume = np.abs(np.asarray(outcome.solution[0], np.float64))
+        solution = part.lifted(outcome.solution)
+        smooth = part.background(solution)[0] if problem.smooth else None
+        residual = part.residual(solution, smooth)[0]
+        volume = np.abs(np.asarray(solution[0], np.float64))
     finally:
-        run.close()
-    per_plane = volume.sum(axis=(1, 2)) * scaled.depths.central[:, 0].sum(axis=(1, 2), dtype=np.float64)
-    valid = scaled.valid[0]
+        part.close()
+    psfs = problem.levelled[0].central
+    per_plane = volume.sum(axis=(1, 2)) * psfs[:, 0].sum(axis=(1, 2), dtype=np.float64)
+    valid = problem.valid[0]
     misfit = float(np.sqrt(np.mean(residual[valid].astype(np.float64) ** 2)))
     share = per_plane / max(float(per_plane.sum()), 1e-30)
-    light = float(scaled.data[0][valid].mean(dtype=np.float64))
+    light = float(problem.data[0][valid].mean(dtype=np.float64))
     smooth_share = 0.0 if smooth is None or light <= 0 else float(smooth[valid].mean()) / light
     return CoarsePass(misfit, share[None], seconds, smooth_share, outcome.history[-1].objective)
 
@@ -128,60 +123,18 @@ class CameraCost:
     fft_pixels: int
 
 
-def camera_cost(scaled: Scaled, model: ModelName) -> CameraCost:
+def camera_cost(problem: Problem, model: ModelName) -> CameraCost:
     """Measure a forward and an adjoint of the coarse copy's camera."""
-    run = ChannelProblem(
-        scaled, 0, model, smooth=False, prior="nonnegative", weights=np.ones((len(scaled.depths.z_um), 3))
-    )
+    part = Part(_as(problem, model, "nonnegative", background=False), slice(0, 1))
     try:
-        camera = run.camera
+        camera = part.camera
         camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
         began = time.process_time()
         camera.adjoint(camera.forward(np.zeros(camera.domain_shape, np.float32)))
         seconds = max(time.process_time() - began, 1e-6)
         return CameraCost(seconds, camera.fft_pixels if isinstance(camera, SpatiallyVarying) else 0)
     finally:
-        run.close()
-
-
-def colours(data: Array, noise: Array, valid: Array, psfs: Array) -> Colours | None:
-    """Fit channels that are proportional to one another; None where there is one channel.
-
-    Parameters
-    ----------
-    data : ndarray, (n_channels, height, width)
-        Counts.
-    noise : ndarray, (n_channels,)
-        Its deviation.
-    valid : ndarray of bool, as ``data``
-    psfs : ndarray, (n_sources, 1 or n_channels, height, width)
-    """
-    if len(data) == 1:
-        return None
-    mask = valid.all(axis=0)
-    flat = data[:, mask].astype(np.float64) / noise[:, None]
-    scene, misfit = _proportional(flat)
-    scene = scene * noise
-    if psfs.shape[1] == 1:
-        psf, psf_misfit = np.ones(len(data)), 0.0
-    else:
-        light = np.moveaxis(psfs, 1, 0).reshape(psfs.shape[1], -1).astype(np.float64)
-        psf, rest = _proportional(light)
-        spread = float(np.sqrt(np.mean((psf[:, None] * (psf @ light / (psf @ psf))) ** 2)))
-        # Noise of the photographs of the source is no difference between them.
-        shot = float(np.mean([estimate_deviation(p) for p in psfs[0]]))
-        psf_misfit = float(np.sqrt(max(rest**2 - shot**2, 0.0))) / max(spread, 1e-30)
-    weights = scene / noise.astype(np.float64) ** 2
-    weights = weights / float(weights @ scene)
-    return Colours(scene / scene.mean(), psf / psf.mean(), weights * scene.mean(), misfit, psf_misfit)
-
-
-def _proportional(rows: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
-    """Best factors of one pattern, and the root mean square that they leave, per degree of freedom."""
-    values, vectors = np.linalg.eigh(rows @ rows.T)
-    factors = vectors[:, -1] * np.sign(vectors[:, -1].sum())
-    left = max(float(values[:-1].sum()), 0.0)
-    return factors, float(np.sqrt(left / (rows.shape[1] * (len(rows) - 1))))
+        part.close()
 
 
 def resolution_px(psf: Array) -> float:

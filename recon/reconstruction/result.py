@@ -9,80 +9,159 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.solvers.empty_planes import EmptyPlanes
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.verdict import Verdict
 
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
+    from recon.reconstruction.problem import Problem
 
 
 @dataclass(frozen=True, slots=True)
-class ImageGrid:
-    """Where the pixels of a reconstructed image lie.
+class Grid:
+    """Where the voxels of a reconstruction lie: every depth has its own lateral pitch (Kuo 2020, sec. 4.4).
 
     Attributes
     ----------
-    shape : (int, int)
-        ``(height, width)`` in pixels.
+    shape : (int, int, int)
+        ``(n_z, height, width)``.
     centre : (int, int)
         ``(row, column)`` of the pixel on the axis.
+    z_um : ndarray, (n_z,)
+        Depth of each plane in front of the diffuser; NaN where not known.
+    pitch_um : ndarray, (n_z,)
+        Lateral pitch of each plane, ``sensor pitch * z / d`` (Eq. 3.1); NaN where not known.
     sensor_pitch_um : float or None
-        Pixel pitch of the sensor: one image pixel is what shifts the PSF by one sensor pixel.
-    object_pitch_um : float or None
-        Pitch in the object's plane, ``sensor_pitch_um * z / d`` (Kuo 2020, Eq. 3.1).
-    z_um : float or None
-        Depth of the object's plane in front of the diffuser.
+        Pixel pitch of the sensor: one pixel is what shifts the PSF by one sensor pixel.
     """
 
-    shape: tuple[int, int]
+    shape: tuple[int, int, int]
     centre: tuple[int, int]
+    z_um: npt.NDArray[np.float64]
+    pitch_um: npt.NDArray[np.float64]
     sensor_pitch_um: float | None = None
-    object_pitch_um: float | None = None
-    z_um: float | None = None
+
+    @property
+    def spacing_um(self) -> npt.NDArray[np.float64]:
+        """Distance from each plane to the next, positive; the last one's is that of the plane before it."""
+        if len(self.z_um) < 2:
+            return np.full(len(self.z_um), np.nan)
+        steps = np.abs(np.diff(self.z_um))
+        return np.append(steps, steps[-1])
+
+    def axis_weights(self) -> npt.NDArray[np.float64]:
+        """Weights (n_z, 3) of the z, y and x differences for total variation in space instead of in voxels.
+
+        A step between neighbours counts by the area of the face between their voxels; the x face of a plane
+        is ``pitch * spacing``, the z face ``pitch^2``, so relative to x a z difference weighs ``pitch /
+        spacing``. One throughout where the geometry is not known; nothing along z where there is one plane.
+        """
+        weights = np.ones((len(self.z_um), 3))
+        if len(self.z_um) == 1:
+            weights[:, 0] = 0.0
+            return weights
+        ratio = self.pitch_um / self.spacing_um
+        if np.isfinite(ratio).all():
+            weights[:, 0] = ratio
+        return weights
 
 
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
-    """A reconstructed picture with all that is needed to judge it.
+    """A reconstructed picture or volume with all that is needed to judge it: a picture is one plane.
 
     Attributes
     ----------
-    image : ndarray, float32, (height, width) or (height, width, n_channels)
-        In the units in which ``measurement = PSF * image`` holds with the PSF as calibrated.
-    grid : ImageGrid
-    method, prior : str
+    volume : ndarray, float32, (n_z, height, width) or (n_z, height, width, n_channels)
+        In the units in which ``measurement = sum_z PSF_z * volume_z`` holds with the PSFs as calibrated.
+    grid : Grid
+    model : str
+        Camera model, and in ``reason`` why.
+    solver, prior : str
     tau : float or None
-        Regularisation used, relative (see :func:`recon.reconstruct`).
-    noise_norm : float or None
-        Expected norm of the measurement's noise, measurement units.
-    history : tuple of IterationRecord
-        Empty for one-shot methods.
-    stop_reason : StopReason or None
-        None for one-shot methods.
+        Regularisation that was solved with, relative to ``max |A^H b|`` (for ``"wiener"`` as
+        :func:`recon.solvers.wiener`); None where nothing is weighted. The largest of all channels.
+    noise_norm : float
+        Expected norm of the noise, in the units of the histories' residuals.
+    histories : tuple of tuple of IterationRecord
+        One history a run: one, or one a channel; residuals in units of the noise' standard deviation. Empty
+        ones for solvers in one step.
+    stop_reasons : tuple of StopReason
+        One a run.
     seconds : float
         Wall time of the solver.
+    background : ndarray or None
+        The smooth background that was estimated along with the volume, measurement units; shaped as the
+        measurement.
+    empty_planes : tuple of EmptyPlanes
+        One a channel, with l1: depth planes that were left out because they stayed empty, and whether the
+        optimality condition certifies it.
     warnings : tuple of str
         What may be wrong with the result, in sentences.
-    state : ndarray or None
-        The whole object on the operator's grid, (n_channels, ...): pass as ``initial`` for a warm start.
-    provenance : mapping
-        Software and settings, JSON-compatible.
     verdict : Verdict or None
         Whether to trust it, from the data alone; None where nobody asked for one.
+    choice : Choice or None
+        What was chosen and why, where the program chose (``model="auto"``).
+    state : ndarray or None
+        The whole object on the operator's grid in measurement units, (n_channels, n_z, grid height, grid
+        width), for a start that forgets nothing; None where that would take too much memory, or does not fit
+        the measurement's own pixels: a start is then taken from ``volume``.
+    provenance : mapping
+        Software and settings, JSON-compatible.
+    basis : (Problem, Reconstruction) or None
+        The smaller problem that was solved where the program chose, and its own result, from which
+        :func:`~recon.reconstruction.solve.judged` takes the verdict.
     """
 
-    image: npt.NDArray[np.float32]
-    grid: ImageGrid
-    method: str
+    volume: npt.NDArray[np.float32]
+    grid: Grid
+    model: str
+    reason: str
+    solver: str
     prior: str
     tau: float | None
-    noise_norm: float | None
-    history: tuple[IterationRecord, ...]
-    stop_reason: StopReason | None
+    noise_norm: float
+    histories: tuple[tuple[IterationRecord, ...], ...]
+    stop_reasons: tuple[StopReason, ...]
     seconds: float
+    background: npt.NDArray[np.float32] | None = None
+    empty_planes: tuple[EmptyPlanes, ...] = ()
     warnings: tuple[str, ...] = ()
-    state: npt.NDArray[Any] | None = None
-    provenance: Mapping[str, Any] = field(default_factory=dict)
     verdict: Verdict | None = None
     choice: Choice | None = None
-    """What was chosen and why, where the program chose (``model="auto"``)."""
+    state: npt.NDArray[Any] | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    basis: tuple[Problem, Reconstruction] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether there is one plane."""
+        return len(self.volume) == 1
+
+    @property
+    def image(self) -> npt.NDArray[np.float32]:
+        """The picture, (height, width[, n_channels]).
+
+        Raises
+        ------
+        ValueError
+            When there are several planes.
+        """
+        if not self.is_picture:
+            raise ValueError(f"This is a volume of {len(self.volume)} planes: take .volume.")
+        return np.ascontiguousarray(self.volume[0])
+
+    @property
+    def history(self) -> tuple[IterationRecord, ...]:
+        """The iterations of the run that took most: channels may run one after the other."""
+        return self.histories[self._longest]
+
+    @property
+    def stop_reason(self) -> StopReason:
+        """Why the run that took most iterations ended."""
+        return self.stop_reasons[self._longest]
+
+    @property
+    def _longest(self) -> int:
+        return max(range(len(self.histories)), key=lambda run: len(self.histories[run]))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import members_of_depths
-from recon.reconstruction.channel import ChannelProblem
+from recon.reconstruction.part import Part
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -49,10 +49,10 @@ def signs_of_light(
     return np.array(signs)
 
 
-def limit_of(run: ChannelProblem) -> float:
+def limit_of(part: Part) -> float:
     """Return what noise alone reaches, or the prior holds down: no sign of light."""
-    noise = float(np.sqrt(2 * np.log(np.prod(run.camera.domain_shape)))) + 1
-    return max(noise * (TV_LEAVES if run.prior.startswith("tv") else 1.0), run.weight)
+    noise = float(np.sqrt(2 * np.log(np.prod(part.camera.domain_shape)))) + 1
+    return max(noise * (TV_LEAVES if part.problem.prior_name.startswith("tv") else 1.0), part.weight)
 
 
 def signs_in_words(signs: Sequence[float]) -> list[str]:

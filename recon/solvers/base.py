@@ -26,6 +26,8 @@ class Outcome:
     history: tuple[IterationRecord, ...]
     stop_reason: StopReason
     seconds: float
+    tau: float | None = None
+    """The regularisation that a solver settled for itself."""
 
 
 class Keeper(Protocol):

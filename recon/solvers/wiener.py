@@ -39,7 +39,7 @@ def wiener(operator: LinearOperator, data: Array, regularisation: float | None =
     Returns
     -------
     Outcome
-        With an empty history.
+        With an empty history; ``tau`` is the regularisation.
     """
     began = time.perf_counter()
     structure = as_cropped_convolution(operator)
@@ -53,7 +53,7 @@ def wiener(operator: LinearOperator, data: Array, regularisation: float | None =
     B *= np.conj(convolution.spectrum)
     B /= power + power.dtype.type(regularisation) * penalty
     solution = fft.irfft(B, width)
-    return Outcome(solution, (), StopReason.ONE_STEP, time.perf_counter() - began)
+    return Outcome(solution, (), StopReason.ONE_STEP, time.perf_counter() - began, float(regularisation))
 
 
 class WienerFilter:

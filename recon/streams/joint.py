@@ -17,8 +17,8 @@ from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.errors import InputError
-from recon.priors import PRIORS as PICTURE_PRIORS
 from recon.priors.base import Prior
+from recon.reconstruction.weights import penalty_of
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.streams.over_time import LowRankPlusSparse, OverTime, TemporalTotalVariation
 from recon.streams.video import Floats, VideoCamera
@@ -134,7 +134,7 @@ def solve_together(
         if over_time == "tv"
         else LowRankPlusSparse(RANK_SHARE * scale * float(np.sqrt(np.prod(shape))), SPARSE_SHARE * scale)
     )
-    solver = JointAdmm(operator, data, PICTURE_PRIORS[camera.prior](camera.weight), prior_over_time)
+    solver = JointAdmm(operator, data, penalty_of(camera.prior, camera.weight), prior_over_time)
     for _ in range(iterations):
         if ended():
             return None

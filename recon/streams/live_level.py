@@ -13,8 +13,8 @@ from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
-from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT
-from recon.reconstruction.preparation import channel_noise
+from recon.reconstruction.measurement import channel_noise
+from recon.reconstruction.weights import default_tau
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.solvers.wiener import WienerFilter, cross_validated
 
@@ -72,7 +72,7 @@ class Level(FilterLevel):
         super().__init__(psfs, binning, frame, noise)
         data = self.data(frame)
         peak = float(np.max(np.abs(self.camera.adjoint(data))))
-        weight = max(NOISE_WEIGHT, LEAST_TAU * peak)
+        weight = default_tau("tv", "picture", peak) * peak
         self.solver = SensorAdmm(self.camera, data, TotalVariation(weight) + NonNegativity())
         self.solver.compile()
         self.solver.advance()  # the first finds memory and threads, at a picture's cost
@@ -123,6 +123,4 @@ class ComingLevel:
 def _noise(channel: Floats, noise: NoiseModel | float | None, binning: int) -> float:
     """Return a binned pixel's noise: averaging divides the deviation of white noise by ``binning``."""
     valid = np.ones(channel.shape, bool)
-    if noise is None:
-        return channel_noise(channel, valid, None)
     return channel_noise(channel, valid, averaged_noise(noise, binning**2))

@@ -15,15 +15,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, select_psf
 from recon.base.noise import NoiseModel
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.errors import InputError
-from recon.priors import PRIORS as PICTURE_PRIORS
-from recon.reconstruction.picture import LEAST_TAU, NOISE_WEIGHT
-from recon.reconstruction.preparation import like_data, prepare
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.weights import penalty_of
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.types import Calibration
 
@@ -101,23 +102,20 @@ def video_camera(
     """
     if prior not in PRIORS:
         raise InputError(f"The prior {prior!r} is not for videos; choose one of {', '.join(PRIORS)}.")
-    problem = prepare(frame, calibration, z_um=z_um, noise=noise, erasures=erasures)
-    peak = float(np.max(np.abs(problem.operator.adjoint(problem.data))))
-    if tau is not None and not 0 <= tau < np.inf:
-        raise InputError(f"tau must be 0 or more, and finite; got {tau}.")
-    weight = max(NOISE_WEIGHT, LEAST_TAU * peak) if tau is None else tau * peak
-    if isinstance(calibration, Calibration):
-        psfs, _ = select_psf(calibration, z_um)
-    else:
-        psfs = as_channels(calibration, "PSF")
-    energy = np.sqrt(np.sum(psfs.astype(np.float64) ** 2, axis=(1, 2), keepdims=True))
+    problem = Problem.of(
+        Measurement(frame, noise, erasures=erasures),
+        calibration,
+        ReconstructionOptions(z_um=z_um, prior=prior, tau=tau, model="convolution", solver="admm-sensor"),
+    )
+    part = Part(problem, slice(0, problem.n_channels))
+    part.weigh(tau)
     return VideoCamera(
-        psfs=(psfs / energy).astype(np.float32),
+        psfs=(problem.depths.central[0] / problem.energy[:, None, None]).astype(np.float32),
         deviation=problem.noise,
-        image_scale=problem.image_scale,
-        valid=None if erasures is None else like_data(erasures, problem.data, "erasures") == 0,
+        image_scale=problem.image_scale[:, 0],
+        valid=None if erasures is None else problem.valid,
         prior=prior,
-        weight=weight,
+        weight=part.weight,
         flat=problem.flat,
     )
 
@@ -153,7 +151,7 @@ class VideoSolver:
         if camera.valid is not None:
             operator = Erasures(camera.valid, operator.range_shape) @ operator
         blank = np.zeros(operator.range_shape, np.float32)
-        self._solver = SensorAdmm(operator, blank, PICTURE_PRIORS[camera.prior](camera.weight))
+        self._solver = SensorAdmm(operator, blank, penalty_of(camera.prior, camera.weight))
         self._solver.compile()
         self._cold = True
 

@@ -32,7 +32,6 @@ from recon.holography import (
     judge,
     random_mask,
 )
-from recon.reconstruction.patterned import reconstruct_patterned
 
 Result = dict[str, Any]
 Calibration = Mapping[str, Any]
@@ -77,13 +76,13 @@ def picture(
 
 def volume(measurement: npt.NDArray[Any], calibration: Calibration, **options: Any) -> Result:
     """Reconstruct a volume."""
-    return _of_volume(recon.reconstruct_volume(measurement, _calibration(calibration), **_iterated(options)))
+    return _of_volume(recon.reconstruct(measurement, _calibration(calibration), **_iterated(options)))
 
 
 def picture_on_device(measurement: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any) -> Result:
     """Reconstruct a picture as on a GPU, its array library played by NumPy."""
     with numpy_as_device():
-        return picture(measurement, psf, method="admm-gpu", **options)
+        return picture(measurement, psf, device="gpu", **options)
 
 
 def volume_on_device(measurement: npt.NDArray[Any], calibration: Calibration, **options: Any) -> Result:
@@ -99,8 +98,7 @@ def numpy_as_device() -> Iterator[None]:
     twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
     with ExitStack() as patched:
         for name, value in (
-            ("recon.base.namespace.array_namespace", lambda _device: np),
-            ("recon.reconstruction.channel.array_namespace", lambda _device: twin),
+            ("recon.reconstruction.part.array_namespace", lambda _device: twin),
             ("recon.solvers.gpu_total_variation.require_memory", lambda *_: None),
             ("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None),
         ):
@@ -113,15 +111,15 @@ def started_picture(
 ) -> Result:
     """Reconstruct a picture from where that of another measurement ended."""
     cold = recon.reconstruct(first, psf, **_iterated(options))
-    return picture(second, psf, initial=cold, **options)
+    return picture(second, psf, warm=cold, **options)
 
 
 def started_volume(
     first: npt.NDArray[Any], second: npt.NDArray[Any], calibration: Calibration, **options: Any
 ) -> Result:
     """Reconstruct a volume from where that of another measurement ended."""
-    cold = recon.reconstruct_volume(first, _calibration(calibration), **_iterated(options))
-    return volume(second, calibration, initial=cold, **options)
+    cold = recon.reconstruct(first, _calibration(calibration), **_iterated(options))
+    return volume(second, calibration, warm=cold, **options)
 
 
 def resumed(
@@ -144,7 +142,7 @@ def scratch_volume(
 ) -> Result:
     """Reconstruct a volume with a memory limit, the rest in files."""
     with TemporaryDirectory() as folder:
-        found = recon.reconstruct_volume(
+        found = recon.reconstruct(
             measurement,
             _calibration(calibration),
             memory_gib=memory_gib,
@@ -158,7 +156,8 @@ def patterned(
     frames: npt.NDArray[Any], light: npt.NDArray[Any], psf: npt.NDArray[Any], **options: Any
 ) -> Result:
     """Reconstruct one picture from frames under patterns of light."""
-    return _of_picture(reconstruct_patterned(frames, light, psf, **options))
+    measurement = recon.Measurement(frames, patterns=light)
+    return _of_picture(recon.reconstruct(measurement, psf, tolerance=2e-4, **options))
 
 
 def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: int, **options: Any) -> Result:
@@ -318,8 +317,7 @@ def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts:
 
 def stability_map(name: str, methods: Sequence[str]) -> Result:
     """Make a map of where methods fail; times are left out."""
-    from recon.evaluation.catalogue import map_named
-    from recon.evaluation.stability_run import run_map
+    from recon.evaluation.maps import map_named, run_map
 
     cells = [c.as_json() for c in run_map(map_named(name), "quick", methods=list(methods))]
     cells.sort(key=lambda c: (c["method"], c["ix"], c["iy"]))
@@ -341,7 +339,8 @@ def _iterated(options: Mapping[str, Any]) -> dict[str, Any]:
     found = {"tolerance": 0.0, **options}
     if options.get("method") == "wiener" or found["tolerance"] is None:
         del found["tolerance"]
-    return found
+    renamed = {"method": "solver", "wishes": "choose"}
+    return {renamed.get(name, name): value for name, value in found.items()}
 
 
 def _of_picture(found: recon.Reconstruction) -> Result:
@@ -352,7 +351,7 @@ def _of_picture(found: recon.Reconstruction) -> Result:
         if found.choice is None
         else "; ".join(f"{d.name} {d.value}" for d in found.choice.decisions),
         "iterations": len(found.history),
-        "stopped": "" if found.stop_reason is None else found.stop_reason.name,
+        "stopped": found.stop_reason.name,
         "verdict": "" if found.verdict is None else str(found.verdict.region),
         "tau": found.tau,
         "noise_norm": found.noise_norm,
@@ -362,7 +361,7 @@ def _of_picture(found: recon.Reconstruction) -> Result:
     return _known(result)
 
 
-def _of_volume(found: recon.VolumeReconstruction) -> Result:
+def _of_volume(found: recon.Reconstruction) -> Result:
     lasts = [history[-1] for history in found.histories]
     decided = "" if found.choice is None else "; ".join(f"{d.name} {d.value}" for d in found.choice.decisions)
     result: Result = {

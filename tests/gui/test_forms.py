@@ -15,8 +15,8 @@ from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from gui.forms.as_python import script
 from gui.forms.routines import PLAN, forms
+from gui.procedure_run import script
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, led_microscope_text
 from instrument.files.errors import BenchError, SettingsError

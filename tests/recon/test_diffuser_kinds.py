@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from recon import Calibration, reconstruct_volume
+from recon import Calibration, reconstruct
 
 SIZE = 64
 
@@ -46,7 +46,7 @@ def error(diffuser, photons):
         )
         data = rng.poisson(clean).astype(float)
         calibration = Calibration(psf[None, None].astype(np.float32), np.full((1, 3), np.nan))
-        found = reconstruct_volume(
+        found = reconstruct(
             data, calibration, prior="l1", noise=float(np.sqrt(data.mean()) + 1e-3), estimate_background=False
         ).volume[0]
         # A point that is found a pixel off is found.

@@ -17,7 +17,6 @@ from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.gpu_camera import DepthCamera
 from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-from recon.solvers.gpu_picture import picture_solver
 from recon.solvers.gpu_total_variation import PlainTotalVariation
 from recon.solvers.operator_admm import OperatorAdmm
 from recon.solvers.stopping import IterationRecord
@@ -69,7 +68,6 @@ SOLVERS = {
     "ADMM": (picture_camera, lambda A, b, x: Admm(A, b, TV, initial=x)),
     "exact-data ADMM": (picture_camera, lambda A, b, x: SensorAdmm(A, b, TV, initial=x)),
     "literal ADMM": (picture_camera, lambda A, b, x: LiteralAdmm(A, b, TV, (0.3, 3.0, 3.0), initial=x)),
-    "picture by namespace": (picture_camera, lambda A, b, x: picture_solver(np, A, b, TV, x)),
     "lean TV": (
         volume_camera,
         lambda A, b, x: LeanTotalVariation(A, b, 0.02, valid=VALID[0], initial=x),

@@ -5,13 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import InputError, reconstruct
+from recon import InputError, Measurement, Problem, reconstruct
 from recon.base.metrics import psnr
 from recon.camera.base import estimate_norm
 from recon.camera.convolution import PadCropConvolution
-from recon.reconstruction.patterned import PatternedCamera, reconstruct_patterned
+from recon.camera.convolution3d import Convolution3D
+from recon.camera.patterned import PatternedCamera
+from recon.reconstruction.problem import window_of
 
 SHAPE = (24, 30)
+
+
+def camera_of(lit: np.ndarray, dtype: type) -> PatternedCamera:
+    """One PSF, lit by patterns."""
+    window, _ = window_of("sensor", SHAPE, SHAPE)
+    return PatternedCamera(Convolution3D(psf()[None, None], SHAPE, dtype=dtype), lit, window)
 
 
 def psf() -> np.ndarray:
@@ -45,12 +53,12 @@ def scene() -> np.ndarray:
 
 def test_adjoint_norm_and_the_plain_sum() -> None:
     rng = np.random.default_rng(2)
-    camera = PatternedCamera(psf().astype(float), patterns(3), np.float64)
+    camera = camera_of(patterns(3), np.float64)
     x, y = rng.standard_normal(camera.domain_shape), rng.standard_normal(camera.range_shape)
     assert np.vdot(camera.forward(x), y) == pytest.approx(np.vdot(x, camera.adjoint(y)), rel=1e-10)
     assert estimate_norm(camera) <= camera.norm_bound * (1 + 1e-9)
     inside = np.zeros(camera.domain_shape)
-    inside[0][camera.window] = scene()
+    inside[0, 0][camera.window] = scene()
     expected = [cast(scene() * pattern) for pattern in patterns(3)]
     np.testing.assert_allclose(camera.forward(inside), expected, rtol=1e-5)
 
@@ -59,11 +67,11 @@ def test_one_pattern_of_ones_is_the_ordinary_camera() -> None:
     ones = np.ones((1, *SHAPE))
     x = np.random.default_rng(3).random(PadCropConvolution(psf()[None], SHAPE).domain_shape, np.float32)
     plain = PadCropConvolution(psf()[None], SHAPE).forward(x)
-    np.testing.assert_allclose(PatternedCamera(psf(), ones).forward(x), plain, rtol=1e-4)
+    np.testing.assert_allclose(camera_of(ones, np.float32).forward(x[:, None]), plain, rtol=1e-4)
     measured = cast(scene())
     settings = {"iterations": 150, "tau": 1e-3, "noise": 1.0, "prior": "tv-haar"}
-    together = reconstruct_patterned(measured[None], ones, psf(), **settings)
-    alone = reconstruct(measured, psf(), method="fista", tolerance=0, **settings)
+    together = reconstruct(Measurement(measured[None], patterns=ones), psf(), **settings)
+    alone = reconstruct(measured, psf(), solver="fista", tolerance=0, **settings)
     assert psnr(together.image, alone.image) > 30
 
 
@@ -74,7 +82,7 @@ def test_more_patterns_of_the_same_light_give_a_better_picture() -> None:
         lit = patterns(count)
         clean = np.stack([cast(scene() * pattern) for pattern in lit])
         counts = rng.poisson(clean * 2000 / clean.sum(axis=0).max()) / 2000 * clean.sum(axis=0).max()
-        picture = reconstruct_patterned(counts, lit, psf(), iterations=200).image
+        picture = reconstruct(Measurement(counts, patterns=lit), psf(), iterations=200).image
         gain = float(np.vdot(picture, scene()) / np.vdot(picture, picture))
         found.append(float(psnr(gain * picture, scene())))
     assert found[1] > found[0] + 1
@@ -83,13 +91,34 @@ def test_more_patterns_of_the_same_light_give_a_better_picture() -> None:
 @pytest.mark.parametrize(
     ("frames", "lit", "says"),
     [
-        (np.ones(SHAPE), np.ones(SHAPE), "One pattern a frame"),
+        (np.ones(SHAPE), np.ones(SHAPE), "Patterns are"),
         (np.ones((2, *SHAPE)), np.ones((3, *SHAPE)), "One pattern a frame"),
-        (np.ones((1, 5, 5)), np.ones((1, 5, 5)), "grey PSF"),
+        (np.ones((1, 5, 5)), np.ones((1, 5, 5)), "24 x 30 pixels"),
         (np.ones((1, *SHAPE)), -np.ones((1, *SHAPE)), "negative"),
         (np.full((1, *SHAPE), np.nan), np.ones((1, *SHAPE)), "finite"),
     ],
 )
 def test_what_does_not_fit_is_refused(frames: np.ndarray, lit: np.ndarray, says: str) -> None:
     with pytest.raises(InputError, match=says):
-        reconstruct_patterned(frames, lit, psf())
+        reconstruct(Measurement(frames, patterns=lit), psf())
+
+
+def test_patterned_light_is_a_camera_and_goes_with_what_other_cameras_go_with() -> None:
+    lit = patterns(3)
+    frames = np.stack([cast(scene() * pattern) for pattern in lit]) + 50.0
+    plain = reconstruct(Measurement(frames, background=50.0, patterns=lit), psf(), iterations=60)
+    assert plain.solver == "fista"
+    assert plain.image.shape == SHAPE
+    assert plain.verdict is None
+    assert any("Not judged" in text for text in plain.warnings)
+    exact = reconstruct(
+        Measurement(frames, background=50.0, patterns=lit), psf(), iterations=60, precision="float64"
+    )
+    assert psnr(exact.image, plain.image) > 30
+    hazy = reconstruct(Measurement(frames, patterns=lit), psf(), iterations=60, estimate_background=True)
+    assert hazy.background is not None
+    assert hazy.background.mean() > 40
+    with pytest.raises(InputError, match="one light"):
+        reconstruct(Measurement(frames, patterns=lit), psf(), solver="admm")
+    problem = Problem.of(Measurement(frames, patterns=lit), psf())
+    assert (problem.n_channels, problem.n_planes, len(problem.data)) == (1, 1, 3)

@@ -7,8 +7,8 @@ import recon
 from recon.camera.camera_model import Depths, sort_by_depth
 from recon.camera.light import LEAST_GAIN, levelled
 from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 
 
 def depths_of(gains: list[float]) -> Depths:
@@ -52,7 +52,7 @@ def test_l1_finds_beads_at_the_edge_of_a_field_that_falls_off():
     settings = {"prior": "l1", "estimate_background": False, "judged": False}
 
     def reached(model: str) -> float:
-        found = recon.reconstruct_volume(
+        found = recon.reconstruct(
             scene.measurement, scene.calibration, model=model, iterations=60, **settings
         )
         return score(found.volume, scene.truth).psnr_db
@@ -63,10 +63,8 @@ def test_l1_finds_beads_at_the_edge_of_a_field_that_falls_off():
 def test_a_start_is_taken_as_it_was_returned():
     scene = make_scene("beads", size=24, depths=3, grid=3, fall_off_deg=16.0, density=0.3, seed=4)
     settings = {"prior": "l1", "model": "local", "estimate_background": False, "judged": False}
-    first = recon.reconstruct_volume(scene.measurement, scene.calibration, iterations=60, **settings)
-    near = recon.reconstruct_volume(
-        scene.measurement, scene.calibration, iterations=1, initial=first, **settings
-    )
-    far = recon.reconstruct_volume(scene.measurement, scene.calibration, iterations=1, **settings)
+    first = recon.reconstruct(scene.measurement, scene.calibration, iterations=60, **settings)
+    near = recon.reconstruct(scene.measurement, scene.calibration, iterations=1, warm=first, **settings)
+    far = recon.reconstruct(scene.measurement, scene.calibration, iterations=1, **settings)
     error = [float(np.linalg.norm(v.volume - first.volume)) for v in (near, far)]
     assert error[0] < 0.5 * error[1]

@@ -34,13 +34,13 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
-from instrument.runs.layout import FinishReason, RunCondition
 from instrument.runs.resume import prepare_resume
+from instrument.runs.run import FinishReason, RunCondition
 from instrument.runs.runner import Runner, RunStatus
+from recon import reconstruct
 from recon.base import metrics
 from recon.camera.camera_model import ModelName
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
-from recon.reconstruction.volume import reconstruct_volume
 from recon.types import Geometry
 
 TINY = """
@@ -120,7 +120,7 @@ def test_a_close_scene_needs_the_lateral_calibration(tmp_path: Path) -> None:
     assert done.findings == ()
     quality = {}
     for model in MODELS_COMPARED:
-        found = reconstruct_volume(
+        found = reconstruct(
             photo.measurement,
             load_calibration(done.path),
             model=model,

@@ -113,7 +113,7 @@ def test_every_frame_is_there_and_like_its_own_reconstruction(recording: Path, v
     assert [t for t in range(11) if np.isnan(stack[t]).any()] == [MISSING]
     for t in (0, 3, 10):  # cold, warm, and the last of a block
         alone = reconstruct(
-            scene(t), np.load(recording.parent / "psf.npy"), method="admm-sensor", background=20.0,
+            scene(t), np.load(recording.parent / "psf.npy"), solver="admm-sensor", background=20.0,
             iterations=200, tolerance=0,
         ).image  # fmt: skip
         assert psnr(stack[t], alone) > 30

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from dataclasses import replace
 
@@ -9,15 +10,25 @@ import pytest
 
 import recon
 from recon import InputError
+from recon.base.blocks import block_mean, enlarged
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
-from recon.reconstruction.decide import choose
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.precision import drift, precision_of
-from recon.reconstruction.reduced import binned, enlarged, reduced_calibration
-from recon.reconstruction.selection_picture import choose_picture
+from recon.reconstruction.reduction import reduced_calibration
 from recon.solvers.stopping import StopReason
+
+solving = sys.modules[recon.solve.__module__]
+
+
+def choose(measurement, calibration, **asked):
+    """Return what is chosen for a measurement."""
+    background = asked.pop("background", None)
+    problem = recon.Problem.of(
+        recon.Measurement(measurement, background=background), calibration, recon.Options(**asked)
+    )
+    return recon.choose(problem).choice
 
 
 def decision(choice, name):
@@ -31,7 +42,7 @@ def beads():
 
 @pytest.fixture(scope="module")
 def chosen_beads(beads):
-    return recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1")
+    return recon.reconstruct(beads.measurement, beads.calibration, prior="l1")
 
 
 def test_empty_planes_are_left_out_and_come_back_empty(beads, chosen_beads):
@@ -78,19 +89,19 @@ def test_planes_of_every_colour_stay():
 
 def test_the_sharpest_colour_and_the_widest_decide():
     scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0, channels=3, grid=1)
-    assert choose_picture(scene.measurement, scene.calibration).binning > 1
+    assert choose(scene.measurement, scene.calibration).binning > 1
     psfs = np.repeat(scene.calibration.psfs[:, :1], 3, axis=1)
     psfs[:, 2] = make_scene("sparse-picture", size=64, grid=1).calibration.psfs[:, 0]
     apart = replace(scene.calibration, psfs=psfs)
-    assert choose_picture(scene.measurement, apart, wishes=Wishes(channels="all")).binning == 1
+    assert choose(scene.measurement, apart, choose=Wishes(channels="all")).binning == 1
 
 
 def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, monkeypatch):
     assert 0 < max(chosen_beads.provenance["light_in_planes_left_out"]) < 1
     assert not any("left out" in w for w in chosen_beads.warnings)
     wrong = replace(chosen_beads.choice, planes=(0, 1, 2), n_planes=6)
-    monkeypatch.setattr("recon.reconstruction.selection_volume.choose", lambda *_, **__: wrong)
-    result = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", judged=False)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
+    result = recon.reconstruct(beads.measurement, beads.calibration, prior="l1", judged=False)
     assert result.choice is not None
     assert set(result.choice.planes) > {0, 1, 2}
     assert "were tried" in decision(result.choice, "planes").why
@@ -107,21 +118,22 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
 ):
     scene = make_scene("beads", size=40, depths=6, grid=3, layers=(0.0, 0.3), density=0.5, seed=31)
     wrong = replace(choose(scene.measurement, scene.calibration, prior=prior), planes=tried)
-    monkeypatch.setattr("recon.reconstruction.selection_volume.choose", lambda *_, **__: wrong)
+    monkeypatch.setattr("recon.reconstruction.selection.choice_for", lambda _: wrong)
     runs = []
+    solve = solving._solve
 
-    def second_is_cancelled(*arguments, **settings):
+    def second_is_cancelled(problem, warm, _progress, _cancel, *kept):
         stop = threading.Event()
 
         def count(record, _):
             if runs and record.iteration == stopped_at:
                 stop.set()
 
-        runs.append(recon.reconstruct_volume(*arguments, **{**settings, "callback": count, "cancel": stop}))
+        runs.append(solve(problem, warm, count, stop, *kept))
         return runs[-1]
 
-    monkeypatch.setattr("recon.reconstruction.selection_volume.reconstruct_volume", second_is_cancelled)
-    result = recon.reconstruct_volume(scene.measurement, scene.calibration, prior=prior, judged=False)
+    monkeypatch.setattr(solving, "_solve", second_is_cancelled)
+    result = recon.reconstruct(scene.measurement, scene.calibration, prior=prior, judged=False)
     assert [len(run.histories[0]) for run in runs][1:] == [stopped_at]
     assert result.stop_reasons == (StopReason.CANCELLED,)
     assert result.histories == runs[later].histories
@@ -131,12 +143,12 @@ def test_a_run_with_planes_put_back_that_is_cut_short_serves_only_where_it_came_
 
 
 def test_planes_that_the_user_left_out_stay_so_and_light_there_is_warned_of(beads):
-    result = recon.reconstruct_volume(
+    result = recon.reconstruct(
         beads.measurement,
         beads.calibration,
         prior="l1",
         judged=False,
-        wishes=Wishes.parse({"planes": "0-2"}),
+        choose=Wishes.parse({"planes": "0-2"}),
     )
     assert result.choice is not None
     assert result.choice.planes == (0, 1, 2)
@@ -159,8 +171,8 @@ def test_planes_are_put_back_with_their_neighbours_and_then_all(chosen_beads):
 def test_unlike_depths_get_planes_between_and_their_light_comes_back_to_the_calibrated_ones():
     scene = make_scene("beads", size=48, depths=3, density=0.3, seed=52)
     fine, coarse = (
-        recon.reconstruct_volume(
-            scene.measurement, scene.calibration, prior="l1", judged=False, wishes=Wishes(between=between)
+        recon.reconstruct(
+            scene.measurement, scene.calibration, prior="l1", judged=False, choose=Wishes(between=between)
         )
         for between in (None, False)
     )
@@ -177,7 +189,7 @@ def test_unlike_depths_get_planes_between_and_their_light_comes_back_to_the_cali
 
 def test_a_depth_that_gets_light_of_a_plane_between_is_not_called_empty():
     scene = make_scene("beads", size=48, depths=4, density=0.1, seed=53)
-    found = recon.reconstruct_volume(scene.measurement, scene.calibration, prior="l1", judged=False)
+    found = recon.reconstruct(scene.measurement, scene.calibration, prior="l1", judged=False)
     assert found.choice is not None
     assert found.choice.between
     (empty,) = found.empty_planes
@@ -191,13 +203,13 @@ def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
     assert choice.between == ()
     assert decision(choice, "between").numbers["least_likeness"] > 0.8
     with pytest.raises(InputError, match="vary over the field"):
-        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(between=True))
+        choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(between=True))
 
 
 def test_float64_is_offered_everywhere(beads):
     scene = make_scene("sparse-picture", size=32, grid=1)
     usual, exact = (
-        recon.reconstruct(scene.measurement, scene.calibration, wishes=Wishes(precision=p), judged=False)
+        recon.reconstruct(scene.measurement, scene.calibration, choose=Wishes(precision=p), judged=False)
         for p in (None, "float64")
     )
     assert usual.choice is not None
@@ -208,7 +220,7 @@ def test_float64_is_offered_everywhere(beads):
     assert exact.state is not None
     assert exact.state.dtype == np.float64
     np.testing.assert_allclose(exact.image, usual.image, atol=1e-3 * float(usual.image.max()))
-    volume = choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(precision="float64"))
+    volume = choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(precision="float64"))
     assert volume.precision == "float64"
 
 
@@ -226,7 +238,7 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
 
 
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
-    whole = recon.reconstruct_volume(beads.measurement, beads.calibration, prior="l1", model="local")
+    whole = recon.reconstruct(beads.measurement, beads.calibration, prior="l1", model="local")
     auto_db = score(chosen_beads.volume, beads.truth).psnr_db
     assert auto_db > score(whole.volume, beads.truth).psnr_db - 0.5
     assert auto_db > score(np.roll(chosen_beads.volume, 1, axis=1), beads.truth).psnr_db + 1
@@ -236,7 +248,7 @@ def test_every_choice_says_why_and_can_be_overruled(beads):
     wishes = Wishes.parse(
         {"model": "local", "planes": "all", "binning": "1", "background": "off", "field": "all"}
     )
-    choice = choose(beads.measurement, beads.calibration, prior="l1", wishes=wishes)
+    choice = choose(beads.measurement, beads.calibration, prior="l1", choose=wishes)
     assert (choice.model, choice.planes, choice.background) == ("local", tuple(range(6)), False)
     assert choice.psf_window == (40, 40)
     assert [d.name for d in choice.decisions if d.overruled] == [
@@ -267,7 +279,7 @@ def test_one_psf_that_does_not_vary_takes_a_convolution():
 def test_pictures_of_one_convolution_stop_where_the_choice_says():
     scene = make_scene("sparse-picture", size=40, grid=1)
     usual = recon.reconstruct(scene.measurement, scene.calibration)
-    wished = recon.reconstruct(scene.measurement, scene.calibration, wishes=Wishes(tolerance=5e-2))
+    wished = recon.reconstruct(scene.measurement, scene.calibration, choose=Wishes(tolerance=5e-2))
     assert usual.choice is not None
     assert wished.choice is not None
     assert (usual.choice.model, usual.choice.background) == ("convolution", False)
@@ -287,7 +299,7 @@ def test_soft_psfs_are_binned_and_sharp_ones_are_not():
     # In the same units, not only of the same look.
     assert result.image.sum() == pytest.approx(fine.image.sum(), rel=0.05)
     sharp = make_scene("sparse-picture", size=64)
-    assert choose_picture(sharp.measurement, sharp.calibration).binning == 1
+    assert choose(sharp.measurement, sharp.calibration).binning == 1
 
 
 def test_equal_colours_are_merged_and_different_ones_are_not():
@@ -296,14 +308,14 @@ def test_equal_colours_are_merged_and_different_ones_are_not():
     assert result.choice is not None
     assert result.choice.merged
     assert result.image.shape == (40, 40, 3)
-    apart = recon.reconstruct(grey.measurement, grey.calibration, wishes=Wishes(channels="all"))
+    apart = recon.reconstruct(grey.measurement, grey.calibration, choose=Wishes(channels="all"))
     assert score(result.image, grey.truth).psnr_db > score(apart.image, grey.truth).psnr_db - 0.3
     assert result.image.sum() == pytest.approx(apart.image.sum(), rel=0.03)
     colourful = make_scene("sparse-picture", size=40, channels=3, colourful=True)
-    assert not choose_picture(colourful.measurement, colourful.calibration).merged
+    assert not choose(colourful.measurement, colourful.calibration).merged
     # A prism: colours differ in the PSF and not in the scene.
     rainbow = make_scene("sparse-picture", size=40, channels=3, dispersion=0.8, optics="smooth")
-    assert not choose_picture(rainbow.measurement, rainbow.calibration).merged
+    assert not choose(rainbow.measurement, rainbow.calibration).merged
 
 
 def test_a_strong_background_is_noticed_and_none_is_added_to_one_that_was_given():
@@ -326,7 +338,7 @@ def test_binned_and_enlarged_keep_place_and_light(n, factor):
     place = n // 2 + factor
     image[place, n // 2] = 1.0
     # A point two blocks' worth off the axis: the binned camera finds it at its binned place.
-    small_psf, small = binned(psf, factor), binned(image, factor)
+    small_psf, small = (block_mean(i, factor, about_axis=True) for i in (psf, image))
     m = small.shape[0]
     camera = PadCropConvolution(small_psf / small_psf.sum(), (m, m))
     x = np.zeros(camera.domain_shape, np.float32)
@@ -359,30 +371,98 @@ def test_mistakes_are_named(beads):
         Wishes.parse({"planes": "3-1"})
     assert Wishes.parse({"planes": "0-2,5"}).planes == (0, 1, 2, 5)
     with pytest.raises(InputError, match="numbered from 0 to 5"):
-        choose(beads.measurement, beads.calibration, prior="l1", wishes=Wishes(planes=(2, 6)))
+        choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(planes=(2, 6)))
     with pytest.raises(InputError, match="one of on, off"):
         Wishes.parse({"background": "maybe"})
-    with pytest.raises(InputError, match="priors"):
-        choose_picture(beads.measurement, beads.calibration, prior="none")
 
 
-def test_wishes_that_would_be_ignored_are_refused(beads):
+def test_wishes_that_would_be_ignored_are_refused():
     picture = make_scene("sparse-picture", size=32, grid=1)
-    wishes = Wishes(binning=1)
-    for options, what in (
-        ({"method": "fista"}, "method='fista'"),
-        ({"prior": "tv-haar", "method": "fista"}, "method='fista'"),
-        ({"prior": "none"}, "prior='none'"),
-        ({"model": "convolution"}, "model='convolution'"),
-    ):
-        with pytest.raises(InputError, match=what):
-            recon.reconstruct(picture.measurement, picture.calibration, wishes=wishes, **options)
-    with pytest.raises(InputError, match="bare PSF"):
-        recon.reconstruct(picture.measurement, picture.calibration.psfs[0, 0], wishes=wishes)
-    for options in ({"memory_gib": 1.0}, {"scratch": "."}, {"model": "convolution"}):
-        with pytest.raises(InputError, match=f"which it does not with .*{next(iter(options)).split('_')[0]}"):
-            recon.reconstruct_volume(beads.measurement, beads.calibration, wishes=wishes, **options)
+    for given in (picture.calibration, picture.calibration.psfs[0, 0]):
+        with pytest.raises(InputError, match="model='convolution'"):
+            recon.reconstruct(
+                picture.measurement, given, choose=Wishes(binning=1), model="convolution", judged=False
+            )
     # No wish is none that is ignored.
     recon.reconstruct(
-        picture.measurement, picture.calibration, method="fista", iterations=2, wishes=Wishes(), judged=False
+        picture.measurement,
+        picture.calibration,
+        model="convolution",
+        iterations=2,
+        choose=Wishes(),
+        judged=False,
     )
+
+
+class Kept:
+    """Keeps nothing, and counts what it is shown."""
+
+    def __init__(self):
+        self.parts = set()
+
+    def resume(self, part, solver):
+        return ()
+
+    def keep(self, part, solver, history, *, ended):
+        self.parts.add(part)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"solver": "fista", "prior": "tv-haar"},
+        {"solver": "admm-sensor"},
+        {"solver": "wiener"},
+        {"prior": "none"},
+        {"precision": "float64"},
+        {"keeper": True},
+        {"warm": True},
+        {"memory_gib": 1.0},
+    ],
+)
+def test_nothing_switches_the_choice_off_for_a_picture(asked):
+    scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0)
+    limit = {} if asked.get("solver") == "wiener" else {"iterations": 3}
+    keeper = Kept() if asked.pop("keeper", False) else None
+    warm = None
+    if asked.pop("warm", False):
+        warm = recon.reconstruct(scene.measurement, scene.calibration, iterations=40, judged=False)
+    result = recon.reconstruct(
+        scene.measurement, scene.calibration, **limit, **asked, keeper=keeper, warm=warm, judged=False
+    )
+    assert result.choice is not None
+    assert result.choice.binning > 1
+    assert result.image.shape == scene.truth.shape
+    assert result.choice.precision == asked.get("precision", "float32")
+    if keeper is not None:
+        assert keeper.parts
+    if warm is not None:
+        cold = recon.reconstruct(scene.measurement, scene.calibration, **limit, judged=False)
+        apart, further = (float(np.linalg.norm(r.image - warm.image)) for r in (result, cold))
+        assert apart < 0.3 * further
+
+
+@pytest.mark.parametrize(
+    "asked", [{"precision": "float64"}, {"keeper": True}, {"warm": True}, {"scratch": "."}]
+)
+def test_nothing_switches_the_choice_off_for_a_volume(beads, chosen_beads, asked):
+    keeper = Kept() if asked.pop("keeper", False) else None
+    warm = chosen_beads if asked.pop("warm", False) else None
+    result = recon.reconstruct(
+        beads.measurement, beads.calibration, prior="l1", iterations=3, **asked, keeper=keeper, warm=warm,
+        judged=False,
+    )  # fmt: skip
+    assert result.choice is not None
+    assert 1 < len(result.choice.planes) < 6
+    assert result.choice.model == chosen_beads.choice.model
+    if keeper is not None:
+        assert "channel-0" in keeper.parts
+
+
+def test_a_solver_that_has_no_way_for_varying_psfs_has_one_convolution_and_says_so():
+    scene = make_scene("sparse-picture", size=64, grid=3, seed=7)
+    assert choose(scene.measurement, scene.calibration).model != "convolution"
+    held = choose(scene.measurement, scene.calibration, solver="admm-sensor")
+    assert held.model == "convolution"
+    assert "one PSF" in decision(held, "model").why
+    assert not decision(held, "model").overruled

@@ -13,13 +13,19 @@ from recon.camera import registration_cache as remembered
 from recon.camera.camera_model import sort_by_depth
 from recon.camera.field_registration import NOT_ON_AXIS
 from recon.camera.local_convolution import FieldOfPsfs
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
-from recon.reconstruction.channel import ChannelProblem
-from recon.reconstruction.decide import choose
 from recon.reconstruction.overrides import Wishes
-from recon.reconstruction.selection_picture import choose_picture
-from recon.reconstruction.volume import prepare_volume
+from recon.reconstruction.part import Part
+
+
+def choose(measurement, calibration, **asked):
+    """Return what is chosen for a measurement."""
+    background = asked.pop("background", None)
+    problem = recon.Problem.of(
+        recon.Measurement(measurement, background=background), calibration, recon.Options(**asked)
+    )
+    return recon.choose(problem).choice
 
 
 def decision(choice, name):
@@ -30,15 +36,13 @@ def test_the_quicker_of_two_true_cameras_is_taken():
     few = make_scene("sparse-picture", size=64, grid=3, seed=7)
     many = make_scene("sparse-picture", size=64, grid=5, aberration=4.0, seed=7)
     for scene, model in ((few, "lowrank"), (many, "local")):
-        choice = choose_picture(scene.measurement, scene.calibration, z_um=float(scene.z_um[0]))
+        choice = choose(scene.measurement, scene.calibration, z_um=float(scene.z_um[0]))
         assert choice.model == model
-        depths = prepare_volume(scene.measurement, scene.calibration, None, None, None)
-        pixels = {
-            m: ChannelProblem(
-                depths, 0, m, smooth=False, prior="nonnegative", weights=np.ones((1, 3))
-            ).camera.fft_pixels
+        problems = {
+            m: recon.Problem.of(scene.measurement, scene.calibration, recon.Options(model=m))
             for m in ("lowrank", "local")
         }
+        pixels = {m: Part(p, slice(0, 1)).camera.fft_pixels for m, p in problems.items()}
         assert model == min(pixels, key=pixels.__getitem__)
         assert "transforms" in decision(choice, "model").why
 
@@ -66,11 +70,11 @@ def test_a_true_camera_has_the_lighter_prior():
     scene = make_scene("beads", size=40, depths=6, grid=3, density=2.0, photons=4000.0, seed=5)
     settings = {"prior": "l1", "estimate_background": False, "iterations": 60, "tolerance": 0.0}
     one, true = (
-        recon.reconstruct_volume(scene.measurement, scene.calibration, model=model, **settings)
+        recon.reconstruct(scene.measurement, scene.calibration, model=model, **settings)
         for model in ("convolution", "lowrank")
     )
     assert true.tau < 0.7 * one.tau
-    as_heavy = recon.reconstruct_volume(
+    as_heavy = recon.reconstruct(
         scene.measurement, scene.calibration, model="lowrank", tau=one.tau, **settings
     )
     light, heavy = (score(r.volume, scene.truth).psnr_db for r in (true, as_heavy))
@@ -141,12 +145,12 @@ def test_one_psf_put_together_on_the_axis_is_told():
     scene = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=2)
     settings = {"z_um": float(scene.z_um[0]), "iterations": 3}
     result = recon.reconstruct(
-        scene.measurement, scene.calibration, wishes=Wishes(model="convolution"), **settings
+        scene.measurement, scene.calibration, choose=Wishes(model="convolution"), **settings
     )
     assert NOT_ON_AXIS in result.warnings
     odd = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=3)
     result = recon.reconstruct(
-        odd.measurement, odd.calibration, wishes=Wishes(model="convolution"), **settings
+        odd.measurement, odd.calibration, choose=Wishes(model="convolution"), **settings
     )
     assert NOT_ON_AXIS not in result.warnings
 
@@ -159,6 +163,6 @@ def test_a_picture_is_judged_as_pictures_are_whatever_solves_it():
         assert result.verdict is not None
         assert result.verdict.method == "admm tv"
     volume = make_scene("beads", size=40, depths=3, grid=3, seed=7)
-    result = recon.reconstruct_volume(volume.measurement, volume.calibration, iterations=5)
+    result = recon.reconstruct(volume.measurement, volume.calibration, iterations=5)
     assert result.verdict is not None
     assert result.verdict.method == "volume tv"

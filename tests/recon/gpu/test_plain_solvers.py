@@ -11,16 +11,12 @@ from recon.base import threads
 from recon.base.metrics import psnr
 from recon.base.namespace import array_namespace, require_memory
 from recon.camera.background import BackgroundRemoval
-from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.errors import InputError, StructureError
-from recon.priors import L1, Box, NonNegativity, TotalVariation
-from recon.solvers import SensorAdmm, StoppingRules
+from recon.errors import InputError
+from recon.solvers import StoppingRules
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.gpu_camera import DepthCamera
 from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-from recon.solvers.gpu_picture import picture_solver
 from recon.solvers.gpu_total_variation import PlainTotalVariation
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 
@@ -131,27 +127,6 @@ def test_a_start_is_where_it_begins():
     assert errors[1] < 0.5 * errors[0]
 
 
-@pytest.mark.parametrize("prior", [TotalVariation(1.0) + NonNegativity(), L1(3.0) + NonNegativity()])
-def test_a_picture_in_colour_reaches_the_minimum(prior):
-    rng = np.random.default_rng(4)
-    psf = rng.random((1, 9, 8)) ** 6
-    convolution = PadCropConvolution(psf, SENSOR, n_channels=2, dtype=np.float64)
-    valid = rng.random((2, *SENSOR)) > 0.1
-    operator = Erasures(valid, (2, *SENSOR), np.float64) @ convolution
-    x = np.zeros(convolution.domain_shape)
-    x[0, 6:10, 7:12], x[1, 9:13, 5:9] = 3, 2
-    data = operator.forward(x) + 0.05 * rng.standard_normal((2, *SENSOR)) * valid
-
-    def objective(x):
-        return 0.5 * np.sum((operator.forward(x) - data) ** 2) + prior.value(x)
-
-    plain = picture_solver(np, operator, data, prior).run(StoppingRules(iterations=1500, tolerance=0))
-    exact = SensorAdmm(operator, data, prior).run(StoppingRules(iterations=1500, tolerance=0))
-    assert objective(plain.solution) == pytest.approx(objective(exact.solution), rel=1e-3)
-    with pytest.raises(StructureError, match="bounds 0 to 5"):
-        picture_solver(np, operator, data, TotalVariation(1.0) + Box(0, 5))
-
-
 def test_what_is_missing_is_said(monkeypatch):
     assert array_namespace("cpu") is np
     with pytest.raises(InputError, match="device 'tpu' is not known"):
@@ -184,16 +159,24 @@ def test_on_a_gpu_as_on_the_host():
         np.testing.assert_allclose(results[1].solution, results[0].solution, atol=1e-3 * largest)
 
 
-def test_the_gpus_method_makes_the_picture_or_says_what_to_install(monkeypatch, shoot):
+def test_a_picture_on_the_device_is_that_of_the_host_or_says_what_to_install(monkeypatch, shoot):
     shot = shoot()
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
-            recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
-    monkeypatch.setattr("recon.base.namespace.array_namespace", lambda _device: np)
-    plain = recon.reconstruct(shot.measurement, shot.psf, method="admm-gpu")
+            recon.reconstruct(shot.measurement, shot.psf, device="gpu")
+    monkeypatch.setattr("recon.solvers.gpu_total_variation.require_memory", lambda *_: None)
+    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: np)
+    plain = recon.reconstruct(shot.measurement, shot.psf, device="gpu")
     assert plain.image.dtype == np.float32
     assert psnr(plain.image, shot.truth) > 26
+    colour = np.stack([shot.measurement, 0.5 * shot.measurement], axis=-1)
+    found, host = (
+        recon.reconstruct(colour, shot.psf, device=device, iterations=300, tolerance=0)
+        for device in ("gpu", "cpu")
+    )
+    assert found.image.shape == host.image.shape
+    assert np.linalg.norm(found.image - host.image) < 0.02 * np.linalg.norm(host.image)
 
 
 @pytest.mark.parametrize("prior", ["tv", "l1"])
@@ -209,17 +192,17 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
-            recon.reconstruct_volume(measurement, calibration, prior=prior, device="gpu")
+            recon.reconstruct(measurement, calibration, prior=prior, device="gpu")
     options = {"prior": prior, "iterations": 40, "tolerance": 0, "model": "convolution"}
-    host = recon.reconstruct_volume(measurement, calibration, drop_empty=False, **options)
+    host = recon.reconstruct(measurement, calibration, drop_empty=False, **options)
     # Another module than numpy, with its functions: what a GPU's is to the code.
     twin = types.ModuleType("twin")
     twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
     monkeypatch.setattr("recon.solvers.gpu_total_variation.require_memory", lambda *_: None)
     monkeypatch.setattr("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.reconstruction.channel.array_namespace", lambda _device: twin)
-    device = recon.reconstruct_volume(measurement, calibration, device="gpu", **options)
+    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: twin)
+    device = recon.reconstruct(measurement, calibration, device="gpu", **options)
     assert host.volume.max() > 0
     np.testing.assert_allclose(device.volume, host.volume, atol=2e-3 * host.volume.max())
     with pytest.raises(InputError, match=r"local model|several places"):
-        recon.reconstruct_volume(measurement, calibration, device="gpu", model="local")
+        recon.reconstruct(measurement, calibration, device="gpu", model="local")

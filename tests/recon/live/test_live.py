@@ -70,7 +70,7 @@ def test_a_still_scene_converges_to_the_reconstruction() -> None:
     assert first.scene is SceneState.NEW
     assert (first.binning, first.method, first.frames) == (1, "admm", 1)
     reference = reconstruct(
-        frame, spots_psf(), method="admm-sensor", background=20.0, noise=NOISE, iterations=200, tolerance=0
+        frame, spots_psf(), solver="admm-sensor", background=20.0, noise=NOISE, iterations=200, tolerance=0
     ).image
     picture = first
     for _ in range(200):
@@ -86,7 +86,7 @@ def test_averaging_frames_of_a_still_scene_lessens_noise() -> None:
     clean = reconstruct(
         np.mean([photograph(0, seed) for seed in range(100, 140)], axis=0) - 20.0,
         spots_psf(),
-        method="admm-sensor",
+        solver="admm-sensor",
         noise=NOISE,
         iterations=300,
     ).image
@@ -136,7 +136,7 @@ def test_refining_goes_on_from_the_wiener_picture_of_the_newest_frame() -> None:
     for _ in range(100):
         better = reconstructor.refine() or better
     reference = reconstruct(
-        photograph(0, 2)[:, ::-1], spots_psf(), method="admm-sensor", background=20.0, noise=NOISE,
+        photograph(0, 2)[:, ::-1], spots_psf(), solver="admm-sensor", background=20.0, noise=NOISE,
         iterations=200, tolerance=0,
     ).image  # fmt: skip
     assert psnr(better.image, reference) > psnr(rough.image, reference) + 6

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 
 import numpy as np
 import pytest
 
-from recon import InputError, reconstruct, reconstruct_volume
+import recon
+from recon import InputError, reconstruct
 from recon.camera.camera_model import Depths
 from recon.camera.light import plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
-from recon.reconstruction.channel import Scaled
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import _dimming, _similarity, measure
@@ -96,8 +97,8 @@ def test_a_run_of_one_iteration_is_named_unfinished(iterations: int) -> None:
 @pytest.mark.parametrize("method", ["admm", "fista"])
 def test_a_start_from_a_settled_result_is_not_called_unfinished(method: str) -> None:
     scene = make_scene(SceneSpec("sparse-picture", size=40))
-    settled = reconstruct(scene.measurement, scene.calibration, method=method, iterations=300)
-    warm = reconstruct(scene.measurement, scene.calibration, method=method, iterations=2, initial=settled)
+    settled = reconstruct(scene.measurement, scene.calibration, solver=method, iterations=300)
+    warm = reconstruct(scene.measurement, scene.calibration, solver=method, iterations=2, warm=settled)
     assert settled.verdict is not None
     assert warm.verdict is not None
     assert settled.verdict.region is Region.INSIDE
@@ -109,7 +110,7 @@ def test_a_start_from_what_had_not_settled_does_not_pass_for_settled() -> None:
     """ADMM's first iteration does not move, whatever it starts from."""
     scene = make_scene(SceneSpec("sparse-picture", size=40))
     early = reconstruct(scene.measurement, scene.calibration, iterations=2)
-    warm = reconstruct(scene.measurement, scene.calibration, iterations=1, initial=early)
+    warm = reconstruct(scene.measurement, scene.calibration, iterations=1, warm=early)
     assert warm.history[0].change < 1e-3
     assert warm.verdict is not None
     assert warm.verdict.evidence["unsettled"] > 1
@@ -119,14 +120,14 @@ def test_a_start_from_what_had_not_settled_does_not_pass_for_settled() -> None:
 
 def test_a_volume_that_was_started_is_judged_by_what_it_still_changed() -> None:
     scene = make_scene(SceneSpec("beads", size=32, depths=3))
-    settled = reconstruct_volume(scene.measurement, scene.calibration, model="convolution", prior="l1")
-    warm = reconstruct_volume(
+    settled = reconstruct(scene.measurement, scene.calibration, model="convolution", prior="l1")
+    warm = reconstruct(
         scene.measurement,
         scene.calibration,
         model="convolution",
         prior="l1",
         iterations=2,
-        initial=settled,
+        warm=settled,
     )
     assert warm.verdict is not None
     last = warm.histories[0][-1].change
@@ -141,7 +142,7 @@ def test_every_reconstruction_carries_its_evidence() -> None:
             scene.measurement,
             scene.calibration,
             erasures=scene.erasures,
-            method=method,
+            solver=method,
             prior=prior,
             iterations=30 if method == "admm" else None,
         )
@@ -151,7 +152,7 @@ def test_every_reconstruction_carries_its_evidence() -> None:
     unasked = reconstruct(scene.measurement, scene.calibration, iterations=5, judged=False)
     assert unasked.verdict is None
     volume = make_scene(SceneSpec("beads", size=32, depths=3))
-    judged = reconstruct_volume(volume.measurement, volume.calibration, prior="l1", iterations=20)
+    judged = reconstruct(volume.measurement, volume.calibration, prior="l1", iterations=20)
     assert judged.verdict is not None
     assert judged.verdict.evidence["planes"] == 3
     assert 0.5 < judged.verdict.evidence["similarity"] <= 1
@@ -165,24 +166,16 @@ def test_colour_and_misfits_are_judged_by_the_worst_channel() -> None:
     assert result.verdict is not None
     assert np.isfinite(list(result.verdict.evidence.values())).all()
     with pytest.raises(InputError):
-        reconstruct(scene.measurement, scene.calibration, method="nothing")
+        reconstruct(scene.measurement, scene.calibration, solver="nothing")
 
 
 def test_judging_takes_planes_and_never_the_stack_anew() -> None:
     """A stack may be as large as the memory; float64 copies of it would be twice that, for one number."""
     psfs = RNG.random((64, 1, 64, 64)).astype(np.float32)
-    scaled = Scaled(
-        data=np.zeros((1, 64, 64), np.float32),
-        valid=np.ones((1, 64, 64), bool),
-        noise=np.ones(1, np.float32),
-        energy=1.0,
-        depths=Depths(np.arange(64.0), psfs, []),
-        warnings=(),
-        flat=True,
-    )
+    depths = Depths(np.arange(64.0), psfs, [])
     tracemalloc.start()
     try:
-        similar, dim, gains = _similarity(psfs[:, 0]), _dimming(psfs[:, 0]), plane_gains(scaled.depths)
+        similar, dim, gains = _similarity(psfs[:, 0]), _dimming(psfs[:, 0]), plane_gains(depths)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -198,12 +191,11 @@ def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr("recon.reconstruction.volume.evidence_of", fail)
-    monkeypatch.setattr("recon.reconstruction.picture.evidence_of", fail)
+    monkeypatch.setattr(sys.modules[recon.solve.__module__], "evidence_of", fail)
     volume = make_scene(SceneSpec("beads", size=32, depths=2))
     picture = make_scene(SceneSpec("sparse-picture", size=32))
     for result in (
-        reconstruct_volume(volume.measurement, volume.calibration, model="convolution", iterations=3),
+        reconstruct(volume.measurement, volume.calibration, model="convolution", iterations=3),
         reconstruct(picture.measurement, picture.calibration, iterations=3),
     ):
         assert result.verdict is None

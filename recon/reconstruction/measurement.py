@@ -1,0 +1,201 @@
+"""What was photographed, and what is known of the photograph: background, erased pixels, noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.checks import as_channels, require_finite, saturated_share
+from recon.base.noise import NoiseModel, estimate_deviation
+from recon.base.options import require_options
+from recon.errors import InputError
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+Noise = NoiseModel | float | None
+
+LEAST_NOISE = 1e-5
+"""Noise assumed at least, relative to the measurement's root mean square: float32 holds no more."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A photograph with the facts about it.
+
+    Attributes
+    ----------
+    image : array, (height, width) or (height, width, n_channels)
+        Any real dtype, any exposure. With ``patterns`` the grey frames, (n_patterns, height, width).
+    noise : NoiseModel or float, optional
+        The camera's noise, or its standard deviation in counts; default: estimated from the image.
+    background : array or number, optional
+        Subtracted from the image first.
+    erasures : array of bool, as ``image`` or (height, width), optional
+        True where a pixel tells nothing: dead, saturated, not read (Kuo 2020, Eq. 3.10, has the complement).
+    patterns : array, (n_patterns, height, width), optional
+        Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
+        sheet lit by it (see :mod:`recon.camera.patterned`). One pattern of ones is the ordinary photograph.
+    """
+
+    image: npt.ArrayLike
+    noise: Noise = None
+    background: npt.ArrayLike | None = None
+    erasures: npt.ArrayLike | None = None
+    patterns: npt.ArrayLike | None = None
+
+    @property
+    def flat(self) -> bool:
+        """Whether the image has no axis of channels."""
+        return np.ndim(self.image) == 2 or self.patterns is not None
+
+    def channels(self) -> Floats:
+        """Return the image as it came, channels (or frames under patterns) first."""
+        if self.patterns is None:
+            return as_channels(self.image, "measurement")
+        return _frames(self.image, self.light())
+
+    def light(self) -> Floats:
+        """Return the patterns, checked.
+
+        Raises
+        ------
+        InputError
+            When they are no patterns.
+        """
+        light = np.asarray(self.patterns, np.float32)
+        if light.ndim != 3 or not np.isfinite(light).all():
+            raise InputError(f"Patterns are finite numbers, (n, height, width); got {light.shape}.")
+        if light.min() < 0 or not light.any():
+            raise InputError("Patterns must not be negative, nor all dark.")
+        return light
+
+    def counts(self) -> Counts:
+        """Return the image less its background, channels first.
+
+        Raises
+        ------
+        InputError
+            When the image or what is known of it is unusable.
+        """
+        require_options(noise=self.noise)
+        counts = self.channels()
+        background = self.background
+        data = counts if background is None else counts - like_data(background, counts, "background")
+        valid = np.ones(data.shape, bool) if self.erasures is None else ~_mask(self.erasures, data)
+        if not valid.any(axis=(1, 2)).all():
+            raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
+        # As it came: once a background is off, saturated pixels no longer share a value.
+        warnings = tuple(
+            said
+            for channel, (values, kept) in enumerate(zip(counts, valid, strict=True))
+            if (said := _doubt(channel, values[kept]))
+        )
+        return Counts(data, valid, warnings)
+
+    def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
+        """Return every channel's noise deviation, counts; of frames under patterns their root mean square."""
+        each = np.array(
+            [channel_noise(d, v, self.noise) for d, v in zip(counts.data, counts.valid, strict=True)]
+        )
+        return each if self.patterns is None else np.full(len(each), float(np.sqrt(np.mean(each**2))))
+
+
+class Counts(NamedTuple):
+    """An image less its background, (n_channels, height, width), which of its pixels count, and warnings."""
+
+    data: Floats
+    valid: npt.NDArray[np.bool_]
+    warnings: tuple[str, ...]
+
+
+def channel_noise(data: Floats, valid: npt.NDArray[np.bool_], noise: Noise) -> float:
+    """Return one channel's noise deviation in counts, at least what float32 can tell."""
+    if isinstance(noise, NoiseModel):
+        deviation = noise.deviation(data[valid])
+    elif noise is not None:
+        deviation = float(noise)
+    else:
+        deviation = estimate_deviation(data, valid)
+    size = float(np.sqrt(np.mean(data[valid].astype(np.float64) ** 2)))
+    return max(deviation, LEAST_NOISE * size) or 1.0
+
+
+def require_same_pixels(psfs: Array, data: Array) -> None:
+    """Raise InputError when PSFs and data (n_channels, height, width) differ in size."""
+    if psfs.shape[1:] != data.shape[1:]:
+        raise InputError(
+            f"The PSF has {_size(psfs)} pixels and the measurement {_size(data)}. Both must come from the "
+            "same sensor area at the same binning: crop or bin one to match the other."
+        )
+
+
+def require_same_channels(psfs: Array, data: Array) -> None:
+    """Raise InputError when PSFs (n, n_channels, height, width) do not serve the data's channels."""
+    if psfs.shape[1] not in (1, len(data)):
+        has = "PSF has" if len(psfs) == 1 else "PSFs have"
+        raise InputError(
+            f"The {has} {psfs.shape[1]} channels and the measurement {len(data)}: give one PSF for all "
+            "channels or one for each."
+        )
+
+
+def like_data(image: npt.ArrayLike, data: Floats, name: str) -> Floats:
+    """Broadcast a number or an image to the data, channels first."""
+    if np.ndim(image) == 0:
+        return np.full_like(data, float(np.asarray(image)))
+    channels = as_channels(image, name)
+    if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
+        raise InputError(
+            f"The {name} has {_size(channels)} pixels and {len(channels)} channels; the measurement has "
+            f"{_size(data)} and {len(data)}."
+        )
+    return np.broadcast_to(channels, data.shape)
+
+
+def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
+    """Return frames that fit their patterns."""
+    data = np.asarray(frames, np.float32)
+    if data.shape != light.shape:
+        raise InputError(
+            f"One pattern a frame is expected, both (n, height, width); got frames {data.shape} and patterns "
+            f"{light.shape}."
+        )
+    require_finite(data, "measurement")
+    return data
+
+
+def _doubt(channel: int, values: Array) -> str:
+    """Say what is doubtful about a channel's pixels."""
+    lowest, highest = float(values.min()), float(values.max())
+    if lowest == highest and values.size > 1:
+        return (
+            f"The measurement's channel {channel} is constant ({highest:g} everywhere): there is nothing "
+            "in it to reconstruct. Was the scene lit, and the exposure long enough?"
+        )
+    if share := saturated_share(values):
+        return (
+            f"The measurement's channel {channel} looks saturated: {share:.2%} of its pixels are at "
+            f"exactly its maximum {highest:g}. "
+            "Leave them out with erasures, or expose shorter."
+        )
+    return ""
+
+
+def _mask(erasures: npt.ArrayLike, data: Floats) -> npt.NDArray[np.bool_]:
+    """Return erasures as a mask of the data's shape."""
+    given = np.asarray(erasures)
+    expected = "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
+    if given.ndim == 0:
+        raise InputError(f"erasures is {erasures!r}: {expected}.")
+    mask = like_data(given, data, "erasures")
+    if not np.isin(mask, (0, 1)).all():
+        raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
+    erased: npt.NDArray[np.bool_] = mask != 0
+    return erased
+
+
+def _size(channels: Array) -> str:
+    return f"{channels.shape[1]} x {channels.shape[2]}"

@@ -1,0 +1,314 @@
+"""What one solver takes of a problem: the channels that it solves together, their operator and weight."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from recon.base import fft
+from recon.base.namespace import array_namespace
+from recon.camera.background import BackgroundRemoval
+from recon.camera.base import Array, LinearOperator
+from recon.camera.camera_model import LOW_RANK_ERROR
+from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution3d import Convolution3D
+from recon.camera.erasures import Erasures
+from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
+from recon.camera.low_rank import low_rank
+from recon.camera.patterned import PatternedCamera
+from recon.camera.spatially_varying import SpatiallyVarying
+from recon.errors import InputError
+from recon.priors import Prior
+from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
+from recon.solvers import memory
+
+BACKGROUND_FREQUENCIES = (5, 5)
+"""Lowest DCT frequencies that belong to the background (Kuo 2020, sec. 6.2)."""
+
+
+class OfOnePlane(LinearOperator):
+    """An operator whose object is (n_channels, height, width) as one of (n_channels, 1, height, width)."""
+
+    def __init__(self, picture: LinearOperator) -> None:
+        channels, *shape = picture.domain_shape
+        super().__init__((channels, 1, *shape), picture.range_shape, picture.dtype)
+        self.picture = picture
+
+    def forward(self, x: Array, out: Array | None = None) -> Array:
+        """Return what the sensor sees of ``x``."""
+        return self.picture.forward(x[:, 0], out)
+
+    def adjoint(self, y: Array, out: Array | None = None) -> Array:
+        """Return the adjoint's picture as a volume of one plane."""
+        return self.picture.adjoint(y, None if out is None else out[:, 0])[:, None]
+
+    @property
+    def norm_bound(self) -> float:
+        """That of the picture's operator."""
+        return self.picture.norm_bound
+
+
+class AsPicture(LinearOperator):
+    """An operator whose object is (n_channels, 1, height, width) as one of (n_channels, height, width)."""
+
+    def __init__(self, volume: LinearOperator) -> None:
+        channels, _, *shape = volume.domain_shape
+        super().__init__((channels, *shape), volume.range_shape, volume.dtype)
+        self.volume = volume
+
+    def forward(self, x: Array, out: Array | None = None) -> Array:
+        """Return what the sensor sees of ``x``."""
+        return self.volume.forward(x[:, None], out)
+
+    def adjoint(self, y: Array, out: Array | None = None) -> Array:
+        """Return the adjoint's only plane."""
+        return self.volume.adjoint(y, None if out is None else out[:, None])[:, 0]
+
+    @property
+    def norm_bound(self) -> float:
+        """That of the volume's operator."""
+        return self.volume.norm_bound
+
+
+class Part:
+    """Operator, data and prior of the channels that are solved together.
+
+    Parameters
+    ----------
+    problem : Problem
+    channels : slice
+        All, or one.
+
+    Attributes
+    ----------
+    camera : LinearOperator
+        Domain (n_channels, n_z, grid height, grid width), range (n_channels, height, width).
+    data : ndarray, (n_channels, height, width)
+        In units of the noise, and in the precision of the arithmetic.
+    valid : ndarray of bool, as ``data``
+    removal : BackgroundRemoval or None
+        What takes a smooth background out of the data, where one is estimated.
+    tau, weight : float or None
+        Of the prior: relative to ``max |A^H b|``, and absolute; set by :meth:`weigh`.
+    """
+
+    def __init__(self, problem: Problem, channels: slice) -> None:
+        self.problem, self.channels = problem, channels
+        # Before any work: what is missing for the device is said at once.
+        self.namespace = array_namespace(problem.options.device)
+        self.dtype = np.dtype(problem.precision)
+        self.valid = problem.valid[self._rows]
+        self.storage = memory.Storage()
+        self.plan: memory.MemoryPlan | None = None
+        self.tau: float | None = None
+        self.weight = 0.0
+        self._removed: BackgroundRemoval | None = None
+        self.removal = (
+            BackgroundRemoval(self.valid.shape, BACKGROUND_FREQUENCIES, self.valid, dtype=self.dtype)
+            if problem.smooth
+            else None
+        )
+        given = problem.options.memory_gib
+        self._limit = None if given is None else int(given * memory.GIB)
+        self.set_data(problem)
+        self.camera = self._make_camera()
+        if problem.patterned:
+            shape, psf = problem.sensor_shape, problem.depths.central.shape
+            window, _ = window_of("sensor", shape, (psf[2], psf[3]))
+            self.camera = PatternedCamera(self.camera, problem.measurement.light(), window)
+
+    def set_data(self, problem: Problem) -> None:
+        """Take another photograph's data."""
+        self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
+
+    @property
+    def _rows(self) -> slice:
+        """The data of these channels: all frames under patterns."""
+        return slice(None) if self.problem.patterned else self.channels
+
+    def _make_camera(self) -> LinearOperator:
+        problem = self.problem
+        psfs = problem.levelled[0].central
+        own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
+        energy = problem.energy[self.channels if len(problem.energy) > 1 else slice(0, 1)]
+        if problem.together:
+            plane = PadCropConvolution(
+                psfs[0, own] / energy[:, None, None],
+                problem.sensor_shape,
+                n_channels=self.channels.stop - self.channels.start,
+                dtype=self.dtype,
+            )
+            self._require_memory(plane)
+            return OfOnePlane(plane)
+        scale = np.float32(1 / float(energy[0]))
+        if not problem.varies:
+            return self._convolution(psfs[:, own] * scale)
+        fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in problem.levelled[0].fields]
+        return self._varying(fields)
+
+    def _require_memory(self, plane: PadCropConvolution) -> None:
+        """Refuse a picture that a given limit has no room for."""
+        if self._limit is None:
+            return
+        size = self.dtype.itemsize * int(np.prod(plane.domain_shape))
+        self.plan = memory.MemoryPlan(0, 12 * size, self._limit)
+        if not self.plan.fits:
+            raise InputError(f"This picture needs {self.plan}. Bin the images, or allow more.")
+
+    def _convolution(self, psfs: Array) -> Convolution3D:
+        height, width = self.problem.sensor_shape
+        camera = Convolution3D(
+            psfs,
+            (height, width),
+            dtype=self.dtype,
+            allocate=lambda shape, dtype: self.storage.zeros(shape, dtype),
+        )
+        self.plan = memory.plan(
+            kind_of(self.problem.prior_name),
+            camera.domain_shape,
+            psfs.size,
+            len(psfs) * height * width,
+            itemsize=self.dtype.itemsize,
+            available=self._limit,
+        )
+        if not self.plan.fits:
+            scratch = memory.scratch_for(self.plan, self.problem.options.scratch)
+            self.storage = memory.Storage(scratch, self.plan.room)
+        return camera
+
+    def _varying(self, fields: list[FieldOfPsfs]) -> SpatiallyVarying:
+        problem, shape = self.problem, self.problem.sensor_shape
+        field_shape, (row, column) = field_of(shape, fields[0].psfs.shape[2:])
+        support = None
+        reach = problem.extent.acceptance_px
+        if reach is not None:
+            off_axis = np.hypot(np.arange(field_shape[0])[:, None] - row, np.arange(field_shape[1]) - column)
+            support = np.broadcast_to(off_axis <= reach, (len(fields), *field_shape))
+        grid = fft.fast_length(field_shape[0]), fft.fast_length(field_shape[1])
+        camera = (
+            local_convolution(fields, shape, support=support, grid_shape=grid, dtype=self.dtype)
+            if problem.model == "local"
+            else low_rank(
+                fields, shape, error=LOW_RANK_ERROR, support=support, grid_shape=grid, dtype=self.dtype
+            )
+        )
+        volumes = 12 if kind_of(problem.prior_name) == "tv" else 6
+        size = self.dtype.itemsize * int(np.prod(camera.domain_shape))
+        available = memory.available_bytes() if self._limit is None else self._limit
+        self.plan = memory.MemoryPlan(0, volumes * size + camera.nbytes, available)
+        if not self.plan.fits:
+            raise InputError(
+                f"The {problem.model} model needs {self.plan}. Bin the images or take fewer depths."
+            )
+        return camera
+
+    @cached_property
+    def central(self) -> Convolution3D:
+        """The camera with each depth's central PSF everywhere: varying ones are preconditioned by it."""
+        problem = self.problem
+        psfs = problem.levelled[0].central
+        own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
+        scale = np.float32(1 / float(problem.energy[0]))
+        return Convolution3D(psfs[:, own] * scale, problem.sensor_shape, dtype=self.dtype)
+
+    def memory_used(self) -> str | None:
+        """Say what was planned, and what had to go to disk; None where nothing was."""
+        if self.plan is None:
+            return None
+        on_disk = min(self.storage.on_disk, self.plan.state)  # turns of a run put theirs there anew
+        if not on_disk:
+            return str(self.plan)
+        share = on_disk / max(self.plan.state, 1)
+        return (
+            f"{self.plan}; {on_disk / memory.GIB:.2f} GiB of the state in files, of which an iteration reads "
+            f"and writes about {share * self.plan.traffic / memory.GIB:.2f} GiB"
+        )
+
+    def close(self) -> None:
+        """Remove what the solver kept on disk."""
+        self.storage.close()
+
+    # For solvers -------------------------------------------------------------------------------------
+    @property
+    def operator(self) -> LinearOperator:
+        """The camera with everything that happens to its data."""
+        return self._with_data(self.camera)
+
+    @property
+    def picture_operator(self) -> LinearOperator:
+        """The same of one plane for solvers of pictures, whose objects are (n_channels, height, width)."""
+        camera = self.camera
+        return self._with_data(camera.picture if isinstance(camera, OfOnePlane) else AsPicture(camera))
+
+    def _with_data(self, operator: LinearOperator) -> LinearOperator:
+        if not self.valid.all():
+            operator = Erasures(self.valid, self.data.shape, dtype=self.dtype) @ operator
+        return operator if self.removal is None else self.removal @ operator
+
+    @property
+    def solved_data(self) -> Array:
+        """The data that belong to :attr:`operator`."""
+        return self.data if self.removal is None else self.removal.forward(self.data)
+
+    @property
+    def prior(self) -> Prior:
+        """The prior with its weight."""
+        return penalty_of(self.problem.prior, self.weight)
+
+    def weigh(self, tau: float | None) -> None:
+        """Set the prior's weight: relative to ``max |A^H b|``, or from the noise."""
+        name = self.problem.prior_name
+        if isinstance(self.problem.prior, Prior) or not is_weighted(name):
+            return
+        peak = self.peak()
+        self.tau = default_tau(name, self.problem.camera_class, peak) if tau is None else float(tau)
+        self.weight = self.tau * peak
+
+    def peak(self) -> float:
+        """``max |A^H b|``; of a convolution plane by plane: no volume for one number."""
+        data = self.solved_data
+        if isinstance(self.camera, Convolution3D):
+            return max(float(np.abs(plane).max()) for plane in self.camera.adjoint_planes(data))
+        return float(np.max(np.abs(self.camera.adjoint(data))))
+
+    # From a solution ---------------------------------------------------------------------------------
+    def lifted(self, solution: Array) -> Array:
+        """Return a solver's solution on the camera's domain."""
+        return solution.reshape(self.camera.domain_shape)
+
+    def background(self, solution: Array) -> Array:
+        """Return the smooth background that goes with a solution, in units of the noise, as ``data``."""
+        if self.removal is None:
+            raise ValueError("No background was asked for.")
+        return self.removal.background(self.data - self.camera.forward(solution))
+
+    def residual(self, solution: Array, background: Array | None) -> Array:
+        """Return what a solution and its background leave of the data, as ``data``; 0 where erased."""
+        rest: Array = self._measured - self.camera.forward(solution)
+        return np.where(self.valid, rest if background is None else rest - background, 0)
+
+    def positive_background(self, solution: Array) -> Array:
+        """Return the smooth background >= 0 nearest to what a solution leaves of the data."""
+        removal = self.removal or self._removed
+        if removal is None:
+            raise ValueError("No background was asked for.")
+        return removal.non_negative(self._measured - self.camera.forward(solution))
+
+    def without(self, background: Array) -> None:
+        """Take a background for given: what is left of the data is solved for, with the same weight."""
+        self._removed, self.removal = self.removal or self._removed, None
+        self.data = np.where(self.valid, self._measured - background, 0).astype(self.dtype)
+
+    @property
+    def noise_norm(self) -> float:
+        """Expected norm of the noise in the data."""
+        return float(np.sqrt(np.count_nonzero(self.valid)))
+
+
+def parts_of(problem: Problem) -> list[slice]:
+    """Return the channels that are solved together, one slice a run."""
+    if problem.together:
+        return [slice(0, problem.n_channels)]
+    return [slice(c, c + 1) for c in range(problem.n_channels)]

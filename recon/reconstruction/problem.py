@@ -1,0 +1,468 @@
+"""A measurement and a calibration brought together: data in units of their noise, a camera, a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.checks import as_channels, check_psf, select_psf
+from recon.base.options import require_options
+from recon.camera.camera_model import (
+    Depths,
+    Extent,
+    ModelName,
+    choose_model,
+    members_of_depths,
+    one_depth,
+    sort_by_depth,
+)
+from recon.camera.field_registration import one_psf
+from recon.camera.light import energies, levelled
+from recon.camera.local_convolution import field_of
+from recon.errors import InputError
+from recon.priors import Prior
+from recon.reconstruction.measurement import (
+    Floats,
+    Measurement,
+    like_data,
+    require_same_channels,
+    require_same_pixels,
+)
+from recon.reconstruction.options import Field, ReconstructionOptions
+from recon.reconstruction.overrides import Precision
+from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.solvers import SOLVERS, OfferedSolver, solver_for
+from recon.reconstruction.weights import CameraClass, kind_of, name_of, require_prior
+from recon.types import Calibration
+
+if TYPE_CHECKING:
+    from recon.reconstruction.choice import Choice
+    from recon.reconstruction.reduction import Reduction
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """``min_x 1/2 ||A x - b||^2 + prior(x)`` for a measurement, a calibration and options; see :meth:`of`.
+
+    A picture is a volume of one plane: the camera's domain is (n_channels, n_z, height, width). Each
+    channel's data is divided by its noise' standard deviation, the PSFs by their energy, so that nothing
+    depends on exposure.
+
+    Attributes
+    ----------
+    measurement : Measurement
+        As it came.
+    calibration : Calibration
+        The depths that take part.
+    options : ReconstructionOptions
+    data : ndarray, float32, (n_channels, height, width)
+        In units of the noise, background subtracted; 0 where erased.
+    valid : ndarray of bool, (n_channels, height, width)
+    noise : ndarray, float32, (n_channels,)
+        Standard deviation of the noise, counts.
+    depths : Depths
+        The calibration sorted by depth, its PSFs registered.
+    model : str
+        Of the camera; ``"auto"`` until :func:`~recon.reconstruction.selection.choose` has chosen it.
+    reason : str
+        Why that model.
+    smooth : bool
+        Whether a smooth background is estimated as well.
+    precision : "float32" or "float64"
+        Of the arithmetic.
+    extent : Extent
+        How much of PSFs and field is modelled.
+    warnings : tuple of str
+    tolerance : float or None
+        Change an iteration at which to stop, where it was chosen; else the solver's own.
+    choice : Choice or None
+        What was chosen and why; ``reduction`` then has the way back.
+    """
+
+    measurement: Measurement
+    calibration: Calibration
+    options: ReconstructionOptions
+    data: Floats
+    valid: npt.NDArray[np.bool_]
+    noise: Floats
+    depths: Depths
+    model: ModelName
+    reason: str
+    smooth: bool
+    precision: Precision = "float32"
+    extent: Extent = field(default_factory=Extent)
+    warnings: tuple[str, ...] = ()
+    tolerance: float | None = None
+    choice: Choice | None = None
+    reduction: Reduction | None = None
+
+    @classmethod
+    def of(
+        cls,
+        measurement: Measurement | npt.ArrayLike,
+        calibration: Calibration | npt.ArrayLike,
+        options: ReconstructionOptions | None = None,
+        *,
+        extent: Extent | None = None,
+    ) -> Problem:
+        """Check, subtract the background, sort PSFs by depth, scale.
+
+        Parameters
+        ----------
+        measurement : Measurement or array
+        calibration : Calibration or array
+            PSFs, or one PSF image (height, width[, n_channels]) without background, which is taken as it is:
+            one convolution of everything. One channel serves all.
+        options : ReconstructionOptions, optional
+            With ``z_um`` the picture of one depth: PSFs of the nearest calibrated one. Else all depths.
+        extent : Extent, optional
+            How much of the PSFs and of the field to model; default all.
+
+        Raises
+        ------
+        InputError
+            When the input is unusable; the text says what was found, what was expected and what to do.
+        """
+        options = options or ReconstructionOptions()
+        extent = extent or Extent()
+        _require(options)
+        measurement = measurement if isinstance(measurement, Measurement) else Measurement(measurement)
+        counts = measurement.counts()
+        if not isinstance(calibration, Calibration):
+            if options.model not in ("auto", "convolution"):
+                raise InputError(
+                    f"The {options.model} model needs a calibration with PSFs from several places of the "
+                    "field."
+                )
+            psfs = as_channels(calibration, "PSF")
+            calibration = Calibration(psfs[None], np.full((1, 3), np.nan))
+            options = replace(options, model="convolution")
+        if measurement.patterns is not None and options.model == "auto":
+            options = replace(options, model="convolution")
+        calibration, depths, doubts = _depths_of(calibration, options)
+        lone = measurement.patterns is not None
+        require_same_channels(calibration.psfs, counts.data[:1] if lone else counts.data)
+        require_same_pixels(calibration.psfs[0], counts.data)
+        if extent.psf_window is not None:
+            depths = depths.within(extent.psf_window)
+        one = len(depths.central) == 1
+        for z, psf in enumerate(depths.central):
+            doubts += [text if one else f"Depth {z}: {text}" for text in check_psf(psf)]
+        model, reason = options.model, ""
+        if model != "auto":
+            model, reason = choose_model(depths, model)
+        asked = True if options.positive_background else options.estimate_background
+        deviation = measurement.deviations(counts).astype(np.float32)
+        return cls(
+            measurement,
+            calibration,
+            options,
+            np.where(counts.valid, counts.data / deviation[:, None, None], 0).astype(np.float32),
+            counts.valid,
+            deviation,
+            depths,
+            model,
+            reason,
+            (not one and measurement.background is None) if asked is None else asked,
+            "float32" if options.precision == "auto" else options.precision,
+            extent,
+            tuple(dict.fromkeys((*doubts, *depths.warnings, *counts.warnings))),
+        )
+
+    def with_data(self, image: npt.ArrayLike) -> Problem:
+        """Return the same problem with another photograph of the same camera: noise and scales stay.
+
+        Parameters
+        ----------
+        image : array, shaped as the measurement's
+            Less its background where the measurement was given without one.
+        """
+        measurement = replace(self.measurement, image=image)
+        counts = measurement.channels()
+        if counts.shape != self.data.shape or measurement.flat != self.flat:
+            raise InputError(
+                f"The frame is {np.shape(image)}, those before {np.shape(self.measurement.image)}."
+            )
+        if measurement.background is not None:
+            counts = counts - like_data(measurement.background, counts, "background")
+        data = counts / self.noise[:, None, None]
+        if not self.valid.all():
+            data = np.where(self.valid, data, 0)
+        return replace(self, measurement=measurement, data=data)
+
+    # What it is --------------------------------------------------------------------------------------
+    @property
+    def flat(self) -> bool:
+        """Whether the measurement has no axis of channels."""
+        return self.measurement.flat
+
+    @property
+    def patterned(self) -> bool:
+        """Whether the data are frames of one scene under patterns of light."""
+        return self.measurement.patterns is not None
+
+    @property
+    def n_channels(self) -> int:
+        """Colour channels of the object."""
+        return 1 if self.patterned else len(self.data)
+
+    @property
+    def n_planes(self) -> int:
+        """Depths that are reconstructed."""
+        return len(self.depths.central)
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        """Height and width of the measurement."""
+        return self.data.shape[1], self.data.shape[2]
+
+    @property
+    def solver(self) -> OfferedSolver:
+        """The solver that was asked for, or the first that is for such problems."""
+        return solver_for(self)
+
+    @property
+    def prior(self) -> str | Prior:
+        """The prior that was asked for, or the solver's own."""
+        if self.options.prior is not None:
+            return self.options.prior
+        if self.options.solver != "auto":
+            return SOLVERS.named(self.options.solver).prior
+        return "tv-haar" if self.patterned else "tv"  # total variation's own prox is slow
+
+    @property
+    def prior_name(self) -> str:
+        """How the prior is recorded."""
+        return name_of(self.prior)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the camera model has PSFs that vary over the field."""
+        return self.model != "convolution"
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a picture through one PSF, without a background to be estimated."""
+        return self.n_planes == 1 and not self.varies and not self.smooth
+
+    @property
+    def together(self) -> bool:
+        """Whether all channels are solved together; else one after the other, as memory asks for."""
+        return self.is_plain and self.options.device == "cpu"
+
+    @property
+    def camera_class(self) -> CameraClass:
+        """What default weights go by."""
+        if self.varies:
+            return "varying, with a background" if self.smooth else "varying"
+        return "picture" if self.is_plain else "planes"
+
+    @property
+    def stop_tolerance(self) -> float:
+        """Change an iteration at which to stop: as asked, as chosen, or the solver's own."""
+        if self.options.tolerance is not None:
+            return self.options.tolerance
+        return self.solver.tolerance_for(self) if self.tolerance is None else self.tolerance
+
+    # Scales ------------------------------------------------------------------------------------------
+    @cached_property
+    def energy(self) -> Array:
+        """What the PSFs are divided by, (n_channels or 1,): each its own where channels have one PSF each.
+
+        Of many PSFs it is their root mean square, which keeps how bright they are beside one another.
+        """
+        psfs = self.depths.central
+        if self.is_plain:
+            own = np.sqrt(np.sum(psfs[0].astype(np.float64) ** 2, axis=(1, 2)))
+            return np.asarray(own, np.float32)
+        return np.asarray([float(np.sqrt(np.mean(energies(psfs))))])
+
+    @property
+    def image_scale(self) -> Floats:
+        """From the scaled problem's object to measurement units, (n_channels, 1, 1, 1)."""
+        return np.asarray(self.noise[: self.n_channels] / self.energy, np.float32)[:, None, None, None]
+
+    @cached_property
+    def levelled(self) -> tuple[Depths, Floats]:
+        """PSFs as the prior counts light, and the gains, on the whole field, that bring a solution back.
+
+        l1 counts light on the sensor: no voxel may be the cheaper explanation.
+        """
+        if kind_of(self.prior_name) == "tv" or self.prior_name != "l1" or self.is_plain:
+            return self.depths, np.ones((1, 1, 1), np.float32)
+        return levelled(self.depths, self.sensor_shape, varying=self.varies)
+
+    @property
+    def gains(self) -> Floats:
+        """Gains of the voxels that are returned."""
+        gains = self.levelled[1]
+        rows, columns = self.window
+        return gains if gains.shape[1:] == (1, 1) else gains[:, rows, columns]
+
+    # Where it is -------------------------------------------------------------------------------------
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Part of the operator's grid that is returned."""
+        return window_of(self.options.field, self.sensor_shape, self._psf_shape)[0]
+
+    @property
+    def _psf_shape(self) -> tuple[int, int]:
+        return self.depths.central.shape[2], self.depths.central.shape[3]
+
+    @property
+    def grid(self) -> Grid:
+        """Where the voxels of the result lie."""
+        window, centre = window_of(self.options.field, self.sensor_shape, self._psf_shape)
+        z_um = self.depths.z_um
+        if self.n_planes == 1 and self.options.z_um is not None:
+            z_um = np.array([float(self.options.z_um)])
+        return grid_of(self.calibration, z_um, window, centre)
+
+    @property
+    def axis_weights(self) -> Array:
+        """Weights of the z, y and x differences of total variation, (3,) or (n_z, 3)."""
+        given = self.options.axis_weights
+        return self.grid.axis_weights() if given is None else np.asarray(given, float)
+
+    def measured(self, solution: Array, channels: slice) -> Floats:
+        """Return what a solution (some channels, n_z, ...) is in the window, in measurement units.
+
+        (n_z, height, width) of one channel, with the channels last where there are several.
+        """
+        rows, columns = self.window
+        volumes = np.asarray(
+            solution[:, :, rows, columns] * (self.image_scale[channels] / self.gains), np.float32
+        )
+        return np.ascontiguousarray(volumes[0] if len(volumes) == 1 else np.moveaxis(volumes, 0, -1))
+
+    def start(self, before: Reconstruction, channels: slice, grid_shape: tuple[int, int]) -> Array:
+        """Place a reconstruction's object on the operator's grid of some channels, scaled.
+
+        Raises
+        ------
+        InputError
+            When it does not fit.
+        """
+        shape = (self.n_channels, self.n_planes, *grid_shape)
+        scale = self.image_scale[channels]
+        if before.state is not None and before.state.shape == shape:
+            return np.asarray(before.state[channels] / scale)
+        rows, columns = self.window
+        needed = (self.n_planes, rows.stop - rows.start, columns.stop - columns.start)
+        volume = before.volume if before.volume.ndim == 4 else before.volume[..., None]
+        if volume.shape != (*needed, self.n_channels):
+            raise InputError(
+                f"The reconstruction to start from is {before.volume.shape}; this measurement needs {needed}"
+                + ("." if self.flat else f" of {self.n_channels} channels.")
+            )
+        whole = np.zeros(shape, self.precision)[channels]
+        whole[:, :, rows, columns] = np.moveaxis(volume, -1, 0)[channels] * self.gains / scale
+        return whole
+
+    def provenance(self) -> Mapping[str, Any]:
+        """Return what is known of it, JSON-compatible."""
+        from recon.base.declare import record
+
+        z_um = float(self.depths.z_um[0])
+        return {
+            "noise_deviation": [float(v) for v in self.noise],
+            "psf_z_um": z_um if self.n_planes == 1 and np.isfinite(z_um) else None,
+            "precision": self.precision,
+            "valid_share": float(np.count_nonzero(self.valid) / self.valid.size),
+            "model": self.model,
+            "model_reason": self.reason,
+            **({"patterns": len(self.data)} if self.patterned else {}),
+            "options": record(self.options),
+        }
+
+
+def window_of(
+    field: Field, sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Return the part of the operator's grid that a field takes, and where the axis is in it."""
+    (full_height, full_width), (row, column) = field_of(sensor_shape, psf_shape)
+    if field == "full":
+        return (slice(0, full_height), slice(0, full_width)), (row, column)
+    height, width = sensor_shape
+    top, left = max(row - height // 2, 0), max(column - width // 2, 0)
+    window = slice(top, min(top + height, full_height)), slice(left, min(left + width, full_width))
+    return window, (row - top, column - left)
+
+
+def grid_of(
+    calibration: Calibration,
+    z_um: npt.NDArray[np.float64],
+    window: tuple[slice, slice],
+    centre: tuple[int, int],
+) -> Grid:
+    """Return where the voxels of depths ``z_um`` lie, micrometres."""
+    pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
+    pitches = np.full(len(z_um), np.nan)
+    if pitch is not None and distance:
+        pitches = pitch * z_um / (1000 * distance)
+    shape = (len(z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return Grid(shape, centre, z_um, pitches, pitch)
+
+
+def central(calibration: Calibration) -> Calibration:
+    """Return one PSF for the whole field of one depth: the one on the axis."""
+    positions = calibration.source_positions_um
+    nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
+    own = slice(nearest, nearest + 1)
+    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])
+
+
+def _require(options: ReconstructionOptions) -> None:
+    """Check what can be checked before there is a measurement."""
+    if options.prior is not None:
+        require_prior(options.prior)
+    require_options(
+        iterations=options.iterations,
+        time_s=options.time_s,
+        tolerance=options.tolerance,
+        tau=options.tau,
+        z_um=options.z_um,
+    )
+    if options.positive_background and options.estimate_background is False:
+        raise InputError("A positive background cannot be had without estimating one: leave one of them out.")
+
+
+def _depths_of(
+    calibration: Calibration, options: ReconstructionOptions
+) -> tuple[Calibration, Depths, list[str]]:
+    """Return the depths that take part, sorted and registered, and warnings."""
+    if len(calibration.psfs) == 0:
+        raise InputError("The calibration holds no PSF: at least one is needed.")
+    if options.z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
+        return calibration, sort_by_depth(calibration), []
+    if options.model == "convolution":
+        psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
+        same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
+        own = slice(same, same + 1)
+        calibration = replace(
+            calibration,
+            psfs=calibration.psfs[own],
+            source_positions_um=calibration.source_positions_um[own],
+        )
+        return calibration, sort_by_depth(calibration), []
+    depth = one_depth(calibration, options.z_um)
+    try:
+        return depth, sort_by_depth(depth), []
+    except InputError as error:
+        if options.model != "auto":
+            raise
+        depth = central(depth)
+        return depth, sort_by_depth(depth), [f"One PSF for the whole field: {error}"]
+
+
+def _asked(calibration: Calibration, z_um: float | None) -> float | None:
+    """Return the depth to look for: of PSFs of one depth, theirs."""
+    z = calibration.source_positions_um[:, 2]
+    return float(z[0]) if z_um is None and np.isfinite(z[0]) else z_um

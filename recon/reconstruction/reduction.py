@@ -1,0 +1,228 @@
+"""The smaller problem that a choice asks for, and the way back to the pixels and depths of the given one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.blocks import block_mean, enlarged
+from recon.base.declare import record
+from recon.base.noise import averaged_noise
+from recon.camera.camera_model import Extent, members_of_depths
+from recon.camera.field_registration import NOT_ON_AXIS
+from recon.reconstruction.between import with_planes_between
+from recon.reconstruction.choice import Choice
+from recon.reconstruction.colours import Colours, merged_input
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.planes import put_back
+from recon.reconstruction.problem import Problem, central
+from recon.reconstruction.result import Reconstruction
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+
+MORE_ROUNDS = 2
+"""Rounds with planes put back, at most: the last of them has all."""
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """How the smaller problem came of the given one, and the way back.
+
+    Attributes
+    ----------
+    given : Problem
+    choice : Choice
+    tint : Colours or None
+        How channels are proportional that were merged.
+    """
+
+    given: Problem
+    choice: Choice
+    tint: Colours | None
+
+    def picture(self, image: Array) -> Floats:
+        """Bring a plane (height, width[, n_channels]) back."""
+        if self.choice.binning > 1:
+            channels_first = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
+            larger = enlarged(channels_first, self.choice.binning, self.given.sensor_shape)
+            image = larger if image.ndim == 2 else np.moveaxis(larger, 0, -1)
+        whole = image if self.tint is None else self.tint.spread(image)
+        return np.ascontiguousarray(whole)
+
+    def volume(self, planes: Array) -> Floats:
+        """Bring a volume (n_z, height, width[, n_channels]) back; depths that were left out are empty."""
+        places = places_of(self.choice)
+        if self.choice.n_planes == 1:
+            return self.picture(planes[0])[None]
+        whole = np.zeros((self.choice.n_planes, *self.picture(planes[0]).shape), np.float32)
+        for at, plane in zip(places, planes, strict=True):
+            picture, below = self.picture(plane), int(at)
+            if at == below:
+                whole[below] += picture
+            else:  # an object half way between two depths belongs to both
+                whole[below : below + 2] += picture / 2
+        return whole
+
+    def background(self, image: Array) -> Floats:
+        """Bring a background (height, width[, n_channels]) back: counts a pixel, not light to be shared."""
+        factor = self.choice.binning
+        if factor > 1:
+            channels_first = image if image.ndim == 2 else np.moveaxis(image, -1, 0)
+            larger = enlarged(channels_first, factor, self.given.sensor_shape) * factor**2
+            image = larger if image.ndim == 2 else np.moveaxis(larger, 0, -1)
+        if self.tint is not None:
+            image = image[..., None] * self.tint.scene.astype(np.float32)
+        return image
+
+
+def reduced(choice: Choice, problem: Problem) -> Problem:
+    """Return the smaller problem that a choice asks for."""
+    measurement, calibration = problem.measurement, problem.calibration
+    flat, noise = measurement.flat, measurement.noise
+    counts = measurement.counts()
+    data, valid = counts.data, counts.valid
+    tint = None
+    if choice.merged:
+        deviation = measurement.deviations(counts)
+        # Noise of the sum of channels: their weights, and each its own.
+        data, valid, calibration, tint = merged_input(data, valid, deviation, calibration)
+        noise = None if noise is None else float(np.sqrt(np.sum((tint.weights * deviation) ** 2)))
+        flat = True
+    if choice.between:
+        depths_um = calibration.source_positions_um[:, 2]
+        calibration = with_planes_between(calibration, depths_um, choice.between)
+    factor = choice.binning
+    every = sorted([*range(choice.n_planes), *(k + 0.5 for k in choice.between)])
+    places = places_of(choice)
+    planes = None if len(places) == len(every) else tuple(every.index(at) for at in places)
+    rest = tuple(z for z, at in enumerate(every) if at not in places)
+    left_out = reduced_calibration(calibration, factor, rest) if rest else None
+    calibration = reduced_calibration(calibration, factor, planes)
+    window = tuple(max(n // factor, 1) for n in choice.psf_window)
+    small = tuple(min(w, n) for w, n in zip(window, calibration.psfs.shape[2:], strict=True))
+    erased = None
+    if not valid.all():
+        erased = block_mean(valid.astype(np.float32), factor, about_axis=True) < 1 - 1e-6
+    kept = block_mean(np.where(valid, data, 0), factor, about_axis=True)
+    warnings = problem.warnings
+    single = choice.n_planes == 1 and choice.model == "convolution"
+    if single:
+        calibration = central(calibration)
+        # That some PSFs were hard to register is of no concern to one.
+        idle = {w for w in problem.depths.warnings if w != NOT_ON_AXIS}
+        warnings = tuple(w for w in warnings if w not in idle)
+    made = Problem.of(
+        Measurement(
+            kept[0] if flat else np.moveaxis(kept, 0, -1),
+            averaged_noise(noise, factor**2),
+            erasures=None if erased is None else (erased[0] if flat else np.moveaxis(erased, 0, -1)),
+        ),
+        calibration,
+        replace(
+            problem.options,
+            model=choice.model,
+            estimate_background=choice.background,
+            precision=choice.precision,
+            tolerance=None,
+            choose=None,
+        ),
+        extent=None
+        if single and not choice.background
+        else Extent(
+            (small[0], small[1]),
+            None if choice.acceptance_px is None else choice.acceptance_px / factor,
+            left_out,
+        ),
+    )
+    return replace(
+        made,
+        reason=next(d.why for d in choice.decisions if d.name == "model"),
+        tolerance=choice.tolerance,
+        warnings=tuple(dict.fromkeys((*warnings, *made.warnings))),
+        choice=choice,
+        reduction=Reduction(problem, choice, tint),
+    )
+
+
+def put_planes_back(problem: Problem, result: Reconstruction, rounds: int) -> Problem | None:
+    """Return the problem with planes that what is left of the data shows light in; None where none does."""
+    reduction = problem.reduction
+    assert reduction is not None
+    wishes = reduction.given.options.choose
+    if rounds >= MORE_ROUNDS or (wishes is not None and wishes.planes is not None):
+        return None
+    signs = result.provenance.get("light_in_planes_left_out", [])
+    more = put_back(reduction.choice, signs, everything=rounds == MORE_ROUNDS - 1)
+    return None if more is None else reduced(more, reduction.given)
+
+
+def bring_back(small: Reconstruction, problem: Problem) -> Reconstruction:
+    """Return a smaller problem's result as one of the given pixels and depths."""
+    reduction = problem.reduction
+    assert reduction is not None
+    choice, given = reduction.choice, reduction.given
+    places = places_of(choice)
+    background = small.background
+    return replace(
+        small,
+        volume=reduction.volume(small.volume),
+        grid=given.grid,
+        background=None if background is None else reduction.background(background),
+        choice=choice,
+        empty_planes=tuple(
+            replace(e, planes=_empty(choice, [places[z] for z in e.planes])) for e in small.empty_planes
+        ),
+        # Only a state on the measurement's own pixels and channels can start another run.
+        state=None if choice.binning > 1 or choice.merged else small.state,
+        provenance={**small.provenance, "auto": choice.to_json(), "options": record(given.options)},
+        basis=(problem, small),
+    )
+
+
+def reduced_start(problem: Problem, before: Reconstruction) -> Reconstruction:
+    """Return a reconstruction to start from on a smaller problem's pixels, depths and channels."""
+    reduction = problem.reduction
+    assert reduction is not None
+    choice = reduction.choice
+    volume = before.volume
+    if reduction.tint is not None:
+        volume = np.mean(volume / reduction.tint.spread(np.ones(())), axis=-1)
+    if choice.binning > 1:
+        first = volume if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
+        first = block_mean(first, choice.binning, about_axis=True) * choice.binning**2
+        volume = first if volume.ndim == 3 else np.moveaxis(first, 0, -1)
+    # Light of planes between is on the calibrated ones: there it begins.
+    planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
+    own = choice.binning == 1 and not choice.merged
+    return replace(before, volume=np.stack(planes).astype(np.float32), state=before.state if own else None)
+
+
+def reduced_calibration(calibration: Calibration, factor: int, planes: tuple[int, ...] | None) -> Calibration:
+    """Return a calibration of some of the depths, on binned pixels."""
+    psfs, positions = calibration.psfs, calibration.source_positions_um
+    if planes is not None:
+        groups = members_of_depths(positions)
+        kept = np.sort(np.concatenate([groups[z] for z in planes]))
+        psfs, positions = psfs[kept], positions[kept]
+    geometry = calibration.geometry
+    if factor > 1:
+        psfs = block_mean(psfs, factor, about_axis=True)
+        pitch = geometry.pixel_pitch_um
+        geometry = replace(geometry, pixel_pitch_um=None if pitch is None else pitch * factor)
+    return replace(calibration, psfs=psfs, source_positions_um=positions, background=None, geometry=geometry)
+
+
+def places_of(choice: Choice) -> list[float]:
+    """Return the planes that are reconstructed, in the calibration's order: ``k + 0.5`` after depth ``k``."""
+    return sorted([*choice.planes, *(k + 0.5 for k in choice.between)])
+
+
+def _empty(choice: Choice, places: list[float]) -> tuple[int, ...]:
+    """Return the depths that are empty where these places are: none that got light of a plane between."""
+    given = {k + by for k in choice.between if k + 0.5 not in places for by in (0, 1)}
+    return tuple(int(at) for at in places if at == int(at) and at not in given)

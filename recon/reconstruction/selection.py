@@ -1,0 +1,281 @@
+"""The smallest model that explains the data (docs/decisions/0010-smallest-model.md)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.blocks import block_mean
+from recon.camera.camera_model import ModelName
+from recon.errors import InputError
+from recon.reconstruction.between import between_of
+from recon.reconstruction.choice import Choice, Decision
+from recon.reconstruction.colours import channels_of, merged
+from recon.reconstruction.extent import binning_of, field_of
+from recon.reconstruction.measurement import Measurement, require_same_channels
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.planes import planes_of
+from recon.reconstruction.precision import precision_of
+from recon.reconstruction.probe import (
+    COARSE_PX,
+    VARYING_ITERATIONS,
+    CoarsePass,
+    camera_cost,
+    coarse_passes,
+)
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reduction import reduced, reduced_calibration
+from recon.reconstruction.selected_camera import candidates, model_decision, model_of
+from recon.reconstruction.solvers import SOLVERS, require_solver
+from recon.reconstruction.solving import (
+    USUAL_ITERATIONS,
+    SmoothLight,
+    background_of,
+    is_stray,
+    iterations_of,
+    steps_of_tolerance,
+)
+from recon.reconstruction.weights import kind_of
+from recon.types import Calibration
+
+Array = npt.NDArray[Any]
+
+
+def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Problem:
+    """Return the smallest problem that explains the data as well: model ``"auto"``.
+
+    What is chosen: the camera model, the depths that take part and planes between them, the field, binning,
+    whether colours are one picture, a smooth background, when to stop, and the precision; each by itself
+    unless the options say it. Solver, device, memory, checkpoints and a start do not hinder it: where a
+    solver has no way for a model or a background, that one is not chosen, and its reason is said.
+
+    Parameters
+    ----------
+    problem : Problem
+    options : ReconstructionOptions, optional
+        Default the problem's own.
+
+    Returns
+    -------
+    Problem
+        With ``choice`` (the reasons, and what one step up and down would cost) and ``reduction`` (the way
+        back). The same problem where the options ask for a model.
+
+    Raises
+    ------
+    InputError
+        When the input is unusable, or a choice was asked for that cannot be had.
+    """
+    if options is not None:
+        problem = replace(problem, options=options)
+    if problem.model != "auto":
+        if problem.options.choose not in (None, Wishes()):
+            raise InputError(
+                f"Choices are about what model='auto' chooses; they do not go with model={problem.model!r}. "
+                "Leave one of the two out."
+            )
+        return problem
+    return reduced(choice_for(problem), problem)
+
+
+def choice_for(problem: Problem) -> Choice:
+    """Choose what to reconstruct a problem with; errors as :func:`choose`."""
+    began = time.perf_counter()
+    wishes, held = _held(problem, _settled(problem))
+    measurement, calibration = problem.measurement, problem.calibration
+    counts = measurement.counts()
+    data, valid = counts.data, counts.valid
+    require_same_channels(calibration.psfs, data)
+    deviation = measurement.deviations(counts)
+    merge, tint = channels_of(data, deviation, valid, calibration.psfs, wishes)
+    if tint is not None and merge.value == "merged":
+        data, valid, calibration = merged(data, valid, calibration, tint)
+    whole = bool(valid.all())
+    depths = problem.depths
+    if tint is not None and merge.value == "merged" and problem.calibration.psfs.shape[1] > 1:
+        depths = Problem.of(
+            Measurement(data[0]), calibration, ReconstructionOptions(z_um=problem.options.z_um)
+        ).depths
+    coarse = _coarse(data, valid, calibration, problem.options.z_um)
+    kind = kind_of(problem.prior_name)
+    picture = problem.n_planes == 1
+    costs = {m: camera_cost(coarse[0], m) for m in candidates(depths)}
+    contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
+    model, why, variation = model_of(depths, wishes, contrast, lambda m: costs[m].fft_pixels)
+    # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
+    sparse = coarse_passes(coarse, "l1", background=True)
+    light = _smooth_light(coarse, sparse, kind, model)
+    given = measurement.background is not None
+    smooth = background_of(light, kind, wishes, given=given)
+    estimated = smooth.value == "estimated"
+    planes, dropped = planes_of(sparse, depths, wishes)
+    between, added = between_of(calibration, depths, planes, wishes)
+    binning = binning_of(depths, wishes, whole=whole)
+    # A background of a few numbers takes what light from beyond the field has of them, not all of it.
+    haze = is_stray(light.share) and not given and not (estimated and kind == "l1")
+    window, reach, field = field_of(depths, wishes, model, haze=haze)
+    usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
+    side = max(data.shape[1:]) // int(binning.numbers["binning"])
+    precise = precision_of(wishes, usual, side)
+    tolerance, end = iterations_of(model, wishes, picture=picture, merged=merge.value == "merged")
+    decisions = (
+        model_decision(model, why, variation, depths, {m: c.seconds for m, c in costs.items()}, wishes),
+        dropped,
+        *([added] if len(depths.z_um) > 1 else []),
+        field,
+        binning,
+        merge,
+        smooth,
+        end,
+        precise,
+    )
+    choice = Choice(
+        model=model,
+        planes=planes,
+        n_planes=len(depths.z_um),
+        between=between,
+        binning=int(binning.numbers["binning"]),
+        merged=merge.value == "merged",
+        background=estimated,
+        precision="float64" if precise.value == "float64" else "float32",
+        psf_window=window,
+        acceptance_px=reach,
+        tolerance=tolerance,
+        decisions=tuple(
+            replace(d, why=held[d.name], overruled=False) if d.name in held else d for d in decisions
+        ),
+        seconds=0.0,
+    )
+    if picture and model == "convolution" and not estimated:
+        choice = _plain(choice, problem, wishes)
+    return replace(choice, seconds=time.perf_counter() - began)
+
+
+def _settled(problem: Problem) -> Wishes:
+    """Return the choices that the caller makes: those asked for, and what the other options say."""
+    options = problem.options
+    wishes = options.choose or Wishes()
+    if options.precision != "auto":
+        if wishes.precision not in (None, options.precision):
+            raise InputError(
+                f"precision={options.precision} and the choice precision={wishes.precision} contradict each "
+                "other: leave one of them out."
+            )
+        wishes = replace(wishes, precision=options.precision)
+    if wishes.background is None:
+        asked = True if options.positive_background else options.estimate_background
+        wishes = replace(wishes, background=asked)
+    if wishes.tolerance is None:
+        wishes = replace(wishes, tolerance=options.tolerance)
+    if options.field == "full":  # what can reach the sensor is asked for, on its pixels
+        wishes = replace(wishes, field="all", binning=1)
+    if options.axis_weights is not None and np.ndim(options.axis_weights) == 2:  # one row a depth
+        wishes = replace(wishes, planes="all", between=False)
+    return wishes
+
+
+def _held(problem: Problem, wishes: Wishes) -> tuple[Wishes, dict[str, str]]:
+    """Settle what the solver and its device leave no choice in; return why, by the decisions' names."""
+    options = problem.options
+    require_solver(options.solver)
+    offered = [SOLVERS.named(options.solver)] if options.solver != "auto" else list(SOLVERS.values())
+
+    def refused(model: ModelName, smooth: bool) -> str | None:
+        """Return why no solver takes such a problem; None where one does."""
+        reasons = [o.accepts(replace(problem, model=model, smooth=smooth)) for o in offered]
+        return None if None in reasons else str(reasons[0])
+
+    held = {}
+    smooth = bool(wishes.background)
+    if wishes.model is None and candidates(problem.depths) != ("convolution",):
+        reason = refused("local", smooth) or refused("lowrank", smooth)
+        if reason is not None:
+            wishes = replace(wishes, model="convolution")
+            held["model"] = f"one PSF a depth, as of the solver: {reason}"
+    if wishes.background is None:
+        reason = refused(wishes.model or "convolution", True)
+        if reason is not None:
+            wishes = replace(wishes, background=False)
+            held["background"] = f"none, as of the solver: {reason}"
+    return wishes, held
+
+
+def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | None) -> list[Problem]:
+    """Return small copies of every channel."""
+    # Erased pixels cannot be averaged with others: the coarse pass then has all pixels.
+    whole = bool(valid.all())
+    factor = max(1, max(data.shape[1:]) // COARSE_PX) if whole else 1
+    return [
+        Problem.of(
+            Measurement(
+                block_mean(data[c], factor, about_axis=True),
+                erasures=None if whole else ~np.asarray(valid[c], bool),
+            ),
+            reduced_calibration(_one_channel(calibration, c), factor, None),
+            ReconstructionOptions(z_um=z_um, estimate_background=False),
+        )
+        for c in range(len(data))
+    ]
+
+
+def _one_channel(calibration: Calibration, channel: int) -> Calibration:
+    own = channel if calibration.psfs.shape[1] > 1 else 0
+    return replace(calibration, psfs=calibration.psfs[:, own : own + 1], background=None)
+
+
+def _contrast(data: Array, valid: Array, deviation: Array) -> float:
+    """Return the largest channel's standard deviation in units of its noise."""
+    spread = [float(d[v].std(dtype=np.float64)) for d, v in zip(data, valid, strict=True)]
+    return max(s / max(float(n), 1e-30) for s, n in zip(spread, deviation, strict=True))
+
+
+def _smooth_light(
+    coarse: list[Problem], sparse: CoarsePass, kind: Literal["tv", "l1"], model: ModelName
+) -> SmoothLight:
+    """Look for light that a smooth background would explain."""
+    share = sparse.smooth_share
+    # A picture that l1 explains has no smooth light; that of a volume total variation does not tell.
+    if not (kind == "tv" and coarse[0].n_planes == 1 and is_stray(share) and model != "convolution"):
+        return SmoothLight(share)
+    dark, lit = (
+        coarse_passes(coarse, "tv", background=b, model=model, iterations=VARYING_ITERATIONS)
+        for b in (False, True)
+    )
+    return SmoothLight(share, dark, lit)
+
+
+def _plain(choice: Choice, problem: Problem, wishes: Wishes) -> Choice:
+    """Return the choice with what the solver of a plain picture does: the whole field, and its own end."""
+    height, width = problem.depths.central.shape[2:]
+    solved = replace(problem, model="convolution", smooth=False)
+    tolerance = solved.solver.tolerance_for(solved) if wishes.tolerance is None else wishes.tolerance
+    replaced = {
+        "field": Decision(
+            "field",
+            f"{2 * height - 1} x {2 * width - 1} pixels",
+            "one convolution of a picture is quick on everything that can reach the sensor",
+            overruled=wishes.field is not None,
+            numbers={"share_of_largest": 1.0},
+        ),
+        "iterations": Decision(
+            "iterations",
+            f"until they change by less than {tolerance:g}",
+            "as asked" if wishes.tolerance is not None else "where this solver stops by default",
+            0.0,
+            *steps_of_tolerance(tolerance),
+            overruled=wishes.tolerance is not None,
+            numbers={"tolerance": tolerance},
+        ),
+    }
+    return replace(
+        choice,
+        psf_window=(height, width),
+        acceptance_px=None,
+        tolerance=tolerance,
+        decisions=tuple(replaced.get(d.name, d) for d in choice.decisions),
+    )

@@ -1,0 +1,379 @@
+"""From a problem to its reconstruction, and to what it is worth."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.errors import InputError
+from recon.priors import PRIORS
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part, parts_of
+from recon.reconstruction.positive_background import in_turns, is_negative, may_go_on
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reduction import bring_back, put_planes_back, reduced_start
+from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.selection import choose
+from recon.reconstruction.solvers import SOLVERS, OfferedSolver
+from recon.reconstruction.unmodelled_planes import limit_of, signs_in_words, signs_of_light
+from recon.reconstruction.weights import is_weighted
+from recon.solvers import Outcome, StoppingRules, StopReason
+from recon.solvers.base import Callback, Keeper
+from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.empty_planes import EmptyPlanes
+from recon.solvers.stopping import IterationRecord
+from recon.verdict.collect import evidence_of, not_judged, unsettled_by
+from recon.verdict.judge import method_name, verdict_on
+from recon.verdict.verdict import Verdict
+
+Array = npt.NDArray[Any]
+Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
+"""``on_progress(record, volume)`` after each iteration; ``volume()`` makes the present one, (n_z, height,
+width[, n_channels]), of one channel where channels are solved one after the other. It may be called until
+``on_progress`` returns."""
+
+ITERATIONS = 200
+"""At most so many, where neither iterations nor a time are asked for."""
+
+
+def solve(
+    problem: Problem,
+    options: ReconstructionOptions | None = None,
+    *,
+    warm: Reconstruction | None = None,
+    on_progress: Progress | None = None,
+    cancel: threading.Event | None = None,
+    keeper: Keeper | None = None,
+) -> Reconstruction:
+    """Solve a problem (Kuo 2020, Eqs. 3.11 and 4.2; with a background Eq. 6.2).
+
+    Where the problem was chosen (:func:`~recon.reconstruction.selection.choose`), the result is on the
+    measurement's pixels and all calibrated depths whatever was chosen. Depths that were left out are put back
+    where what is left of the data shows light there, and the problem is solved again: once with them and
+    their neighbours, then with all, as far as the time allows.
+
+    Parameters
+    ----------
+    problem : Problem
+    options : ReconstructionOptions, optional
+        Other ones of when to stop, solver and device; default the problem's own.
+    warm : Reconstruction, optional
+        Start from this one: same calibration, same ``field``.
+    on_progress : Progress, optional
+    cancel : threading.Event, optional
+        Set it to stop after the iteration in progress.
+    keeper : Keeper, optional
+        Keeps the solvers' state, and has them go on from what was kept of the same problem. Turns for a
+        positive background are not kept: they begin anew.
+
+    Raises
+    ------
+    InputError
+        When the solver has no way for the problem, or it does not fit into memory.
+    """
+    if options is not None:
+        problem = replace(problem, options=options)
+    if problem.model == "auto":
+        problem = choose(problem)
+    if problem.reduction is None:
+        return _solve(problem, warm, on_progress, cancel, keeper, "")
+    limit, spent, rounds = problem.options.time_s, 0.0, 0
+    best: tuple[Reconstruction, Problem] | None = None
+    while True:
+        left = None if limit is None else limit - spent
+        result = _solve(
+            replace(problem, options=replace(problem.options, time_s=left)),
+            None if warm is None else reduced_start(problem, warm),
+            None if on_progress is None else _shown(problem, on_progress),
+            cancel,
+            keeper,
+            f"round-{rounds}-" if rounds else "",
+        )
+        spent += result.seconds
+        if best is None or not _cut_short(result) or _objective(result) < _objective(best[0]):
+            best = result, problem
+        more = put_planes_back(problem, result, rounds)
+        out_of_time = limit is not None and spent >= limit
+        if more is None or out_of_time or StopReason.CANCELLED in result.stop_reasons:
+            break
+        problem, rounds = more, rounds + 1
+    whole = bring_back(*best)
+    return replace(whole, seconds=spent, stop_reasons=result.stop_reasons)
+
+
+def _shown(problem: Problem, on_progress: Progress) -> Progress:
+    """Return a callback of the smaller problem's iterations."""
+    reduction = problem.reduction
+    assert reduction is not None
+    return lambda record, now: on_progress(record, lambda: reduction.volume(now()))
+
+
+def _cut_short(result: Reconstruction) -> bool:
+    return not {StopReason.TIME, StopReason.CANCELLED}.isdisjoint(result.stop_reasons)
+
+
+def _objective(result: Reconstruction) -> float:
+    """Return misfit and prior together, which a run with more planes can only make smaller in the end."""
+    return sum(history[-1].objective for history in result.histories if history)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What the run of one part gave."""
+
+    volume: npt.NDArray[np.float32]
+    state: Array | None
+    background: Array | None
+    outcome: Outcome
+    tau: float | None
+    empty: EmptyPlanes
+    signs: npt.NDArray[np.float64] | None
+    memory: str | None
+    noise_norm: float
+
+
+def _solve(
+    problem: Problem,
+    warm: Reconstruction | None,
+    on_progress: Progress | None,
+    cancel: threading.Event | None,
+    keeper: Keeper | None,
+    prefix: str,
+) -> Reconstruction:
+    offered = problem.solver
+    _require_tau(problem, offered)
+    channels = parts_of(problem)
+    rules = rules_of(problem, offered, len(channels))
+    found = []
+    for one in channels:
+        part = Part(problem, one)
+        try:
+            name = f"{prefix}channel-{one.start}" if len(channels) > 1 or not problem.together else prefix
+            found.append(_run(part, offered, rules, warm, on_progress, cancel, (keeper, name)))
+        finally:
+            part.close()
+    return _together(problem, offered, found)
+
+
+def rules_of(problem: Problem, offered: OfferedSolver, runs: int = 1) -> StoppingRules:
+    """Return when to stop one of so many runs: time is shared evenly by them.
+
+    Raises
+    ------
+    InputError
+        When a limit is asked for that a solver in one step does not have.
+    """
+    options = problem.options
+    if offered.one_step:
+        given = (options.iterations, options.time_s, options.tolerance, options.stop_at_noise or None)
+        if given != (None, None, None, None):
+            raise InputError(
+                f"{offered.name} is one shot: iterations, time_s, tolerance and stop_at_noise do not apply "
+                "to it."
+            )
+    try:
+        return StoppingRules(
+            iterations=ITERATIONS
+            if options.iterations is None and options.time_s is None
+            else options.iterations,
+            time_s=None if options.time_s is None else options.time_s / runs,
+            tolerance=problem.stop_tolerance,
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def _require_tau(problem: Problem, offered: OfferedSolver) -> None:
+    if problem.options.tau is None or offered.one_step or is_weighted(problem.prior_name):
+        return
+    raise InputError(f"The prior {problem.prior_name} has no weight: leave tau out.")
+
+
+def _run(
+    part: Part,
+    offered: OfferedSolver,
+    rules: StoppingRules,
+    warm: Reconstruction | None,
+    on_progress: Progress | None,
+    cancel: threading.Event | None,
+    kept: tuple[Keeper | None, str],
+) -> _Solved:
+    """Solve for some channels."""
+    problem, options = part.problem, part.problem.options
+    part.weigh(options.tau)
+    shape = part.camera.domain_shape
+    start = None if warm is None else problem.start(warm, part.channels, (shape[2], shape[3]))
+    solver = offered.make(part, start)
+    if options.stop_at_noise:
+        rules = replace(rules, noise_norm=part.noise_norm)
+    tell: Callback | None = None
+    if on_progress is not None:
+
+        def tell(solver: Any, record: IterationRecord) -> None:
+            on_progress(record, lambda: problem.measured(part.lifted(solver.solution), part.channels))
+
+    keeper, name = kept
+    outcome = solver.run(rules, callback=tell, cancel=cancel, keeper=keeper, part=name)
+    smooth = part.background(part.lifted(outcome.solution)) if problem.smooth else None
+    if options.positive_background and smooth is not None and is_negative(smooth):
+        smooth = part.positive_background(part.lifted(outcome.solution))
+        if may_go_on(outcome):
+            first = replace(outcome, solution=np.empty(0))
+            del solver, outcome
+
+            def again(background: Array) -> Any:
+                part.without(background)
+                return offered.make(part, None)
+
+            outcome, smooth, solver = in_turns(
+                smooth, first, again, part.positive_background, rules, tell, cancel
+            )
+    solution = part.lifted(outcome.solution)
+    signs = None
+    if problem.extent.left_out is not None:
+        rest = part.residual(solution, smooth)[0]
+        channel, window = part.channels.start, problem.extent.psf_window
+        signs = signs_of_light(rest, problem.extent.left_out, channel, window) / limit_of(part)
+    return _Solved(
+        volume=problem.measured(solution, part.channels),
+        state=_state(part, solution),
+        background=None if smooth is None else smooth * problem.noise[part.channels, None, None],
+        outcome=replace(outcome, solution=np.empty(0)),
+        tau=part.tau if outcome.tau is None else outcome.tau,
+        empty=solver.empty if isinstance(solver, DouglasRachford) else EmptyPlanes(),
+        signs=signs,
+        memory=part.memory_used(),
+        noise_norm=part.noise_norm,
+    )
+
+
+def _state(part: Part, solution: Array) -> Array | None:
+    """Return a picture's whole object in measurement units; of volumes nothing, for memory's sake."""
+    problem = part.problem
+    if problem.n_planes > 1 or problem.levelled[1].shape[1:] != (1, 1):
+        return None
+    state: Array = solution * (problem.image_scale[part.channels] / problem.levelled[1])
+    return state
+
+
+def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) -> Reconstruction:
+    """Return what all parts gave as one result."""
+    volume = found[0].volume if len(found) == 1 else np.stack([f.volume for f in found], axis=-1)
+    if not problem.flat and problem.n_channels == 1:
+        volume = volume[..., None]
+    signs = [f.signs for f in found if f.signs is not None]
+    left_out = np.max(signs, axis=0).tolist() if signs else []
+    taus = [f.tau for f in found if f.tau is not None]
+    states = [f.state for f in found if f.state is not None]
+    empty = () if problem.together else tuple(f.empty for f in found)
+    memory = found[-1].memory
+    return Reconstruction(
+        volume=np.ascontiguousarray(volume),
+        grid=problem.grid,
+        model=problem.model,
+        reason=problem.reason,
+        solver=offered.name,
+        prior=problem.prior_name,
+        tau=max(taus, default=None),
+        noise_norm=found[0].noise_norm,
+        histories=tuple(f.outcome.history for f in found),
+        stop_reasons=tuple(f.outcome.stop_reason for f in found),
+        seconds=sum(f.outcome.seconds for f in found),
+        background=_stacked([f.background for f in found if f.background is not None], problem.flat),
+        empty_planes=empty,
+        warnings=(*problem.warnings, *_uncertified(empty), *signs_in_words(left_out)),
+        state=np.concatenate(states) if states else None,
+        provenance={
+            **problem.provenance(),
+            **({} if memory is None else {"memory": memory}),
+            **({"light_in_planes_left_out": left_out} if signs else {}),
+        },
+    )
+
+
+def _uncertified(empty: tuple[EmptyPlanes, ...]) -> list[str]:
+    return [
+        f"Stopped before it was certain that {len(e.planes)} depth planes are empty: on one of them the "
+        f"residual's correlation is {e.worst:.2f} tau. Let it run longer (or, in Python, drop_empty=False)."
+        for e in empty
+        if not e.certified
+    ]
+
+
+def _stacked(images: list[Array], flat: bool) -> npt.NDArray[np.float32] | None:
+    """Return channels (some, height, width) in the measurement's shape."""
+    if not images:
+        return None
+    channels = np.concatenate(images).astype(np.float32)
+    return channels[0] if flat else np.ascontiguousarray(np.moveaxis(channels, 0, -1))
+
+
+def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
+    """Return the result with a verdict on whether to trust it, at the cost of about two iterations.
+
+    Parameters
+    ----------
+    result : Reconstruction
+    problem : Problem
+        That was solved.
+    started : bool
+        Whether it was started from another result.
+    """
+    if result.basis is not None:
+        problem, small = result.basis
+        verdict, said = _verdict(small, problem, started=started)
+    else:
+        verdict, said = _verdict(result, problem, started=started)
+    return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
+
+
+def _verdict(
+    result: Reconstruction, problem: Problem, *, started: bool
+) -> tuple[Verdict | None, tuple[str, ...]]:
+    foreign = [
+        f"the {what} {name}"
+        for what, name, own in (
+            ("solver", result.solver, SOLVERS.is_own(result.solver)),
+            ("prior", result.prior, PRIORS.is_own(result.prior)),
+        )
+        if not own
+    ]
+    if problem.patterned:
+        foreign.append("patterned light")
+    if foreign:
+        return None, (f"Not judged: there are no known cases of {' and '.join(foreign)}.",)
+    try:
+        picture = problem.n_planes == 1
+        # One plane is a picture: it fails as pictures do, by a wrong depth for one.
+        evidence = evidence_of(
+            problem.measurement.image,
+            problem.data,
+            problem.valid,
+            problem.noise,
+            result.volume,
+            problem.depths.central,
+            _residuals(result, problem),
+            max(
+                unsettled_by(h, r, problem.stop_tolerance, started=started)
+                for h, r in zip(result.histories, result.stop_reasons, strict=True)
+            ),
+            points=not picture,
+        )
+        return verdict_on(evidence, method_name(result.solver if picture else "volume", result.prior)), ()
+    except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
+        return None, (not_judged(error),)
+
+
+def _residuals(result: Reconstruction, problem: Problem) -> list[float]:
+    if result.history:
+        return [history[-1].data_residual for history in result.histories]
+    # A solution in one step fits whatever there is, with negative light where the model is wrong.
+    assert result.state is not None
+    part = Part(problem, parts_of(problem)[0])
+    possible = np.maximum(result.state / problem.image_scale, 0).astype(part.dtype)
+    return [float(np.linalg.norm(part.operator.forward(possible) - part.data))]

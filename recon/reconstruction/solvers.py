@@ -1,0 +1,364 @@
+"""The solvers on offer: what each takes, where it stops by itself, and how it is made for a problem's part.
+
+Each answers for itself; terminal, window, chart, maps and model selection ask :data:`SOLVERS`. One of a
+user's own is registered with ``SOLVERS.register``, or as an entry point of the group
+``diffuserbench.solvers``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from recon.base.registry import Registry
+from recon.camera.base import Array
+from recon.errors import InputError
+from recon.priors import Prior
+from recon.solvers.base import Callback, Keeper, Outcome
+from recon.solvers.stopping import StoppingRules
+
+if TYPE_CHECKING:
+    from recon.camera.convolution3d import Convolution3D
+    from recon.camera.spatially_varying import SpatiallyVarying
+    from recon.reconstruction.part import Part
+    from recon.reconstruction.problem import Problem
+
+
+class Runs(Protocol):
+    """What a solver that was made does: as :class:`recon.solvers.base.Solver`."""
+
+    @property
+    def solution(self) -> Array:
+        """The present iterate."""
+        ...
+
+    def run(
+        self,
+        rules: StoppingRules | None = None,
+        *,
+        callback: Callback | None = None,
+        cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
+        part: str = "",
+    ) -> Outcome:
+        """Iterate until a rule fires."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfferedSolver:
+    """A solver as it is registered.
+
+    Attributes
+    ----------
+    name, help : str
+    make : callable
+        ``make(part, start)`` returns what solves a :class:`~recon.reconstruction.part.Part` from a start on
+        its camera's domain, or from zero where that is None. Its solution has as many values as that domain.
+    refuses : callable, optional
+        ``refuses(problem)`` returns why it has no way for a problem, in a sentence; None where it has.
+    tolerance : float or callable
+        Change an iteration at which pictures were seen to have settled; a callable is given the problem.
+    prior : str
+        The prior that it takes where none is asked for.
+    one_step : bool
+        Whether it has no iterations: limits do not apply to it.
+    """
+
+    name: str
+    help: str
+    make: Callable[[Part, Array | None], Runs]
+    refuses: Callable[[Problem], str | None] = lambda _: None
+    tolerance: float | Callable[[Problem], float] = 2e-3
+    prior: str = "tv"
+    one_step: bool = False
+
+    def accepts(self, problem: Problem) -> str | None:
+        """Say why it cannot solve a problem; None where it can."""
+        return self.refuses(problem)
+
+    def tolerance_for(self, problem: Problem) -> float:
+        """Return the change an iteration at which it stops by itself."""
+        return self.tolerance(problem) if callable(self.tolerance) else self.tolerance
+
+
+VOLUME_PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
+"""Priors by name of volumes, of PSFs that vary over the field, with a background, and on a GPU."""
+SPLITTING_PRIORS = (*VOLUME_PRIORS, "none")
+"""Priors by name that the splittings of pictures have a way for."""
+
+
+_ONE_LIGHT = "it is for photographs in one light (fista takes patterns)"
+
+
+def _plain_only(problem: Problem) -> str | None:
+    if problem.patterned:
+        return _ONE_LIGHT
+    if problem.n_planes > 1:
+        return "it is for one depth"
+    if problem.varies:
+        return f"it is for one PSF; the {problem.model} model has a solver of its own (admm)"
+    if problem.smooth:
+        return "it estimates no background"
+    return "it runs on the cpu only" if problem.options.device != "cpu" else None
+
+
+def _by_name(problem: Problem, priors: Iterable[str], where: str = "") -> str | None:
+    prior = problem.prior
+    if isinstance(prior, Prior):
+        return None if problem.together else f"{where} priors are given by name: {', '.join(priors)}".strip()
+    if prior in priors:
+        return None
+    return f"{where} it takes the priors {', '.join(priors)}, not {prior!r}".strip()
+
+
+def _admm_refuses(problem: Problem) -> str | None:
+    if problem.patterned:
+        return _ONE_LIGHT
+    if problem.options.device != "cpu" and problem.varies:
+        return (
+            f"The {problem.model} model runs on the cpu only. Choose the model convolution for the "
+            f"{problem.options.device}"
+        )
+    if problem.together:
+        return _by_name(problem, SPLITTING_PRIORS)
+    return _by_name(problem, VOLUME_PRIORS, "for volumes, varying PSFs, backgrounds and a GPU")
+
+
+def _admm(part: Part, start: Array | None) -> Runs:
+    from recon.camera.convolution3d import Convolution3D
+    from recon.camera.spatially_varying import SpatiallyVarying
+    from recon.solvers.admm import Admm
+
+    problem, camera = part.problem, part.camera
+    if problem.together:
+        return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
+    if isinstance(camera, SpatiallyVarying):
+        return _varying_admm(part, camera, start)
+    assert isinstance(camera, Convolution3D)
+    return _on_device(part, camera, start) if problem.options.device != "cpu" else _exact(part, camera, start)
+
+
+def _of_picture(start: Array | None) -> Array | None:
+    return None if start is None else start[:, 0]
+
+
+def _is_tv(part: Part) -> bool:
+    return part.problem.prior_name.startswith("tv")
+
+
+def _exact(part: Part, camera: Convolution3D, start: Array | None) -> Runs:
+    """Return the solver of a convolution a depth whose data term is exact."""
+    from recon.solvers.douglas_rachford import DouglasRachford
+    from recon.solvers.tv_admm_volume import LeanTotalVariation
+
+    if not _is_tv(part):
+        return DouglasRachford(
+            camera,
+            part.data,
+            part.weight,
+            valid=part.valid[0],
+            background=part.removal,
+            initial=start,
+            drop_empty=part.problem.options.drop_empty,
+            keep_state=False,
+            storage=part.storage,
+        )
+    return LeanTotalVariation(
+        camera,
+        part.data,
+        part.weight,
+        axis_weights=part.problem.axis_weights,
+        isotropic=part.problem.prior_name == "tv-isotropic",
+        valid=part.valid[0],
+        background=part.removal,
+        initial=start,
+        keep_state=False,
+        storage=part.storage,
+    )
+
+
+def _on_device(part: Part, camera: Convolution3D, start: Array | None) -> Runs:
+    """Return the solver that runs on the device's arrays."""
+    from recon.solvers.gpu_camera import DepthCamera
+    from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
+    from recon.solvers.gpu_total_variation import PlainTotalVariation
+
+    plain = DepthCamera(
+        part.namespace,
+        camera.channel_spectrum(0),
+        camera.grid_shape,
+        camera.sensor_window,
+        part.valid[0],
+        part.removal,
+    )
+    start = None if start is None else start[0]
+    if not _is_tv(part):
+        return PlainDouglasRachford(plain, part.data[0], part.weight, initial=start)
+    return PlainTotalVariation(
+        plain,
+        part.data[0],
+        part.weight,
+        axis_weights=part.problem.axis_weights,
+        isotropic=part.problem.prior_name == "tv-isotropic",
+        initial=start,
+    )
+
+
+def _varying_admm(part: Part, camera: SpatiallyVarying, start: Array | None) -> Runs:
+    from recon.solvers.operator_admm import OperatorAdmm
+
+    z, y, x = (
+        float(w) for w in np.broadcast_to(part.problem.axis_weights, (part.problem.n_planes, 3)).mean(axis=0)
+    )
+    return OperatorAdmm(
+        camera,
+        part.central,
+        part.data,
+        part.weight,
+        axis_weights=(z, y, x) if _is_tv(part) else None,
+        isotropic=part.problem.prior_name == "tv-isotropic",
+        valid=part.valid[0],
+        background=part.removal,
+        initial=start,
+    )
+
+
+def _sensor_admm(part: Part, start: Array | None) -> Runs:
+    from recon.solvers.sensor_admm import SensorAdmm
+
+    return SensorAdmm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
+
+
+def _fista(part: Part, start: Array | None) -> Runs:
+    from recon.solvers.fista import Fista
+
+    return Fista(part.picture_operator, part.solved_data, part.prior, initial=_of_picture(start))
+
+
+def _fista_refuses(problem: Problem) -> str | None:
+    if problem.options.device != "cpu":
+        return "it runs on the cpu only"
+    return "it is for one depth" if problem.n_planes > 1 else None
+
+
+class OneStep:
+    """A solver without iterations."""
+
+    def __init__(self, solve: Callable[[], Outcome]) -> None:
+        self._solve = solve
+        self.solution = np.zeros(0)
+
+    def run(
+        self,
+        rules: StoppingRules | None = None,
+        *,
+        callback: Callback | None = None,
+        cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
+        part: str = "",
+    ) -> Outcome:
+        """Solve; nothing is told, kept or cancelled on the way."""
+        outcome = self._solve()
+        self.solution = outcome.solution
+        return outcome
+
+
+def _wiener(part: Part, _: Array | None) -> Runs:
+    """Wiener's penalty takes the place of a prior; bounds are kept by clipping."""
+    from recon.priors.simple import Separable
+    from recon.solvers.wiener import wiener
+
+    def solve() -> Outcome:
+        outcome = wiener(part.picture_operator, part.data, part.problem.options.tau)
+        for term in part.prior.terms():
+            if isinstance(term, Separable):
+                outcome = replace(outcome, solution=term.prox(outcome.solution, 0.0))
+        return outcome
+
+    return OneStep(solve)
+
+
+def _wiener_refuses(problem: Problem) -> str | None:
+    return _plain_only(problem) or (
+        None
+        if problem.prior in ("none", "nonnegative")
+        else "it evaluates no prior: it takes none, or nonnegative for its bounds"
+    )
+
+
+def _offered() -> tuple[OfferedSolver, ...]:
+    return (
+        OfferedSolver(
+            name="admm",
+            help="Splitting; for pictures and volumes, any camera model, background and device.",
+            make=_admm,
+            refuses=_admm_refuses,
+            tolerance=lambda problem: 2e-3 if problem.is_plain else 1e-3,
+        ),
+        OfferedSolver(
+            name="admm-sensor",
+            help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
+            make=_sensor_admm,
+            refuses=lambda problem: _plain_only(problem) or _by_name(problem, SPLITTING_PRIORS),
+        ),
+        OfferedSolver(
+            name="fista",
+            help="Accelerated proximal gradient, for pictures with any prior.",
+            make=_fista,
+            refuses=_fista_refuses,
+            tolerance=lambda problem: 2e-4 if problem.patterned else 5e-4,
+        ),
+        OfferedSolver(
+            name="wiener",
+            help="Deconvolution in one step, without a prior, for previews.",
+            make=_wiener,
+            refuses=_wiener_refuses,
+            prior="none",
+            one_step=True,
+        ),
+    )
+
+
+SOLVERS: Registry[OfferedSolver] = Registry("solver", "diffuserbench.solvers", _offered)
+"""The solvers, the usual one first."""
+
+REPLACED = {
+    "admm-gpu": "The solver admm-gpu is now the device: leave the solver out, or take admm, and device='gpu' "
+    "(--device gpu), for pictures and volumes alike."
+}
+"""Solvers that are no more, and what replaces them."""
+
+
+def require_solver(name: str) -> None:
+    """Raise InputError for what is not the name of a solver."""
+    if name in REPLACED:
+        raise InputError(REPLACED[name])
+    if name != "auto":
+        SOLVERS.named(name)
+
+
+def solver_for(problem: Problem) -> OfferedSolver:
+    """Return the solver that was asked for, or the first that takes a problem.
+
+    Raises
+    ------
+    InputError
+        When it has no way for the problem, with the reason.
+    """
+    asked = problem.options.solver
+    require_solver(asked)
+    if asked == "auto":
+        reasons = {name: offered.accepts(problem) for name, offered in SOLVERS.items()}
+        able = next((name for name, reason in reasons.items() if reason is None), None)
+        if able is None:
+            raise InputError("; ".join(f"{name}: {reason}" for name, reason in reasons.items()) + ".")
+        return SOLVERS[able]
+    offered = SOLVERS.named(asked)
+    if (reason := offered.accepts(problem)) is not None:
+        raise InputError(f"The solver {asked} does not take this: {reason}.")
+    return offered
