@@ -74,7 +74,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
 
     def cut(problem, setting, limit_s):
         curve = whole(problem, setting, limit_s)
-        shorter = setting.method != "wiener"
+        shorter = setting.solver != "wiener"
         return recon_chart.Curve(curve.points[:1], False) if shorter else curve
 
     out = tmp_path / "chart"
