@@ -174,15 +174,18 @@ def binnings_of(problem: ChartProblem) -> list[int]:
 
 def own_methods(*, volume: bool) -> tuple[str, ...]:
     """Return the methods, for pictures or volumes, that others' packages or this program have registered."""
-    usual = VOLUME if volume else next(iter(SOLVERS))
-    found = [f"{usual} {name}" for name in PRIORS if not PRIORS.is_own(name)]
-    found += [f"{name} {solver.prior}" for name, solver in SOLVERS.items() if not SOLVERS.is_own(name)]
-    if not found:
+    priors = [name for name in PRIORS if not PRIORS.is_own(name)]
+    solvers = [name for name in SOLVERS if not SOLVERS.is_own(name)]
+    if not priors and not solvers:
         return ()
     scene = make_scene("beads", size=16, depths=2) if volume else make_scene("sparse-picture", size=16)
     problem = Problem.of(
         scene.measurement, scene.calibration, ReconstructionOptions(model="convolution", judged=False)
     )
+    found = [f"{name} {SOLVERS[name].prior}" for name in solvers]
+    for prior in priors:
+        ways = (f"{name} {prior}" for name in SOLVERS)
+        found += [way for way in ways if Setting.named(way).refusal(problem) is None][:1]
     return tuple(method for method in found if Setting.named(method).refusal(problem) is None)
 
 
