@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration_routines.errors import RunEndedError
-from calibration_routines.optics.angular import RESPONSE_FILE, finish_angular, is_angular
-from calibration_routines.optics.dpc import RESULT_FILE, finish_diffuser, is_dpc
-from calibration_routines.optics.optics_procedures import response_outcome, surface_outcome
+from calibration_routines.optics.angular import RESPONSE_FILE, finish_angular, is_angular, response_outcome
+from calibration_routines.optics.dpc import RESULT_FILE, finish_diffuser, is_dpc, surface_outcome
 from calibration_routines.procedure import Listener, Outcome, Outlook, outlook_of, under_control
 from calibration_routines.psf.sweep import FOLDER, finish_sweep, watch_resumed
 from calibration_routines.psf.sweep_procedure import analysing, sweep_outcome

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.spot_camera import SpotCamera, SpotLook
+from calibration_routines.options import Size, problems_of
 from instrument.files.errors import BenchError, SettingsError
-from recon.base.declare import option
-from recon.base.option_text import size
+from recon.base.declare import RARE, option
 from recon.holography import Display
 from recon.holography.spots import PoseProbe
 
 Progress = Callable[[str, int], object]
+ALIGNMENT_FILE = "alignment.json"
+"""Where the command line writes it."""
 
 
 class AlignmentFailedError(BenchError):
@@ -22,74 +25,64 @@ class AlignmentFailedError(BenchError):
     exit_code = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class AlignmentSettings:
-    """How far and how carefully to search.
+    """How far and how carefully to search."""
 
-    Attributes
-    ----------
-    reach : float
-        Largest shift to look for, mask pixels.
-    depth_um : float
-        Largest distance to look for.
-    roll_mrad, scale : float
-        Largest rotation and scale error to look for.
-    tilt_mrad : float
-        Typical tilt of a mask put in by hand: spots hardly feel it, so that it is also taken for likely.
-    spots : int
-        In a search picture.
-    max_frames : int
-        Give up rather than take more.
-    moves : int
-        Stage moves at most; 0 keeps the stage where it is.
-    division : (int, int)
-        Rows and columns of the sections whose displacement is measured one by one.
-    section_pictures : int
-        Pictures of section spots in their last measurement.
-    refinements : int
-        Pictures of probe spots in the last measurement of depth, tilts and brightness.
-    """
-
-    reach: float = option(72.0, help="Largest shift to look for, mask pixels.", above=0)
-    depth_um: float = option(1000.0, help="Largest distance to look for.", unit="um", above=0)
-    roll_mrad: float = 7.0
-    scale: float = 0.003
-    tilt_mrad: float = 5.0
-    spots: int = 128
-    max_frames: int = option(100, help="Give up rather than take more.", least=1)
-    moves: int = option(4, help="Stage moves at most; 0: nothing moves.", least=0)
-    division: tuple[int, int] = option(
-        (3, 5),
-        help="Of the SLM, measured one by one.",
-        default_words="3x5",
+    reach: float = option(72.0, unit="mask px", above=0, help="Largest shift to look for, mask pixels.")
+    depth_um: float = option(1000.0, unit="um", above=0, help="Largest distance to look for.")
+    moves: int = option(4, least=0, label="Stage moves", help="Stage moves at most; 0: nothing moves.")
+    max_frames: int = option(
+        100, least=1, label="Frames", help="Frames at most: gives up rather than take more."
+    )
+    division: Size = option(
+        Size(3, 5),
         flags=("--sections",),
         metavar="ROWSxCOLUMNS",
-        parse=size,
+        parse=Size.of,
+        label="Sections",
+        help="Sections of the SLM, whose displacement is measured one by one.",
     )
-    section_pictures: int = 8
-    refinements: int = 4
+    slm_calibration: Path | None = option(
+        None,
+        metavar="FILE",
+        label="SLM calibration",
+        help="Look-up table and flatness, from calibrate slm.",
+        default_words="none: an ideal SLM",
+    )
+    roll_mrad: float = option(
+        7.0, unit="mrad", above=0, label="Rotation", help="Largest rotation to look for.", group=RARE
+    )
+    scale: float = option(
+        0.003, above=0, label="Scale error", help="Largest scale error to look for.", group=RARE
+    )
+    tilt_mrad: float = option(
+        5.0,
+        unit="mrad",
+        above=0,
+        label="Tilt",
+        help="Typical tilt of a mask put in by hand: spots hardly feel it, so it is taken for likely.",
+        group=RARE,
+    )
+    spots: int = option(128, least=1, help="Spots in a search picture.", group=RARE)
+    section_pictures: int = option(
+        8, least=1, help="Pictures of section spots in their last measurement.", group=RARE
+    )
+    refinements: int = option(
+        4, least=1, help="Pictures in the last measurement of depth, tilts and brightness.", group=RARE
+    )
+    out: Path | None = option(
+        None,
+        flags=("--out", "-o"),
+        metavar="FILE",
+        label="File",
+        help="Where the alignment goes (.json); a picture goes beside it.",
+        default_words=f"{ALIGNMENT_FILE}; in the window dated, beside the runs",
+    )
+    overwrite: bool = option(False, flags=("--force",), help="Overwrite files that exist.")
 
     def __post_init__(self) -> None:
-        problems = [
-            (name, f"{name} must be a finite number above 0, not {getattr(self, name):g}")
-            for name in ("reach", "depth_um", "roll_mrad", "scale", "tilt_mrad")
-            if not 0 < getattr(self, name) < float("inf")
-        ]
-        problems += [
-            (name, f"{name} must be at least {least}, not {getattr(self, name)}")
-            for name, least in (
-                ("spots", 1),
-                ("max_frames", 1),
-                ("moves", 0),
-                ("section_pictures", 1),
-                ("refinements", 1),
-            )
-            if getattr(self, name) < least
-        ]
-        if min(self.division) < 1:
-            words = f"the SLM has at least one row and one column of sections, not {self.division}"
-            problems.append(("division", words))
-        if problems:
+        if problems := problems_of(self):
             raise SettingsError(problems)
 
     @property

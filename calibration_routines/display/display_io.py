@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError
+from instrument.files.atomic import check_writable
+from instrument.files.errors import BenchError, FileError
 from instrument.files.slm_correction import SlmCorrection
 from instrument.files.slm_image import phase_levels
 from instrument.reconstruction.preparation import darkest_block
+from instrument.runs.folder import dated_name, free_name
 
 Array = npt.NDArray[Any]
 
@@ -122,3 +126,33 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
     if not bench.stage.is_homed:
         bench.stage.home()
     approach_from_below(bench.stage, place)
+
+
+# Files ------------------------------------------------------------------------------------------------
+def require_slm(bench: Bench) -> Slm:
+    """Return the bench's SLM; BenchError where it has none."""
+    if bench.slm is None:
+        raise BenchError(f"{bench.label} has no [slm].")
+    return bench.slm
+
+
+def refuse_existing(file: Path | None, *, overwrite: bool) -> None:
+    """Refuse to write over a file that nobody allowed to be replaced.
+
+    Raises
+    ------
+    FileError
+        When it exists.
+    """
+    if file is not None and file.exists() and not overwrite:
+        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
+
+
+def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) -> Path:
+    """Return the file to write in the end, by default one with a date, sure now that it can be written."""
+    if out is None:
+        where = folder or bench.config.data_folder
+        where.mkdir(parents=True, exist_ok=True)
+        out = free_name(where, dated_name(label), ".json")
+    check_writable(out)
+    return out

@@ -75,7 +75,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
         When spots of too few sections are seen.
     """
     settings, k = session.settings, session.display.factor
-    sections = Sections(session.display.slm_shape, settings.division)
+    sections = Sections(session.display.slm_shape, settings.division.shape)
     falling = spot_response(session.spots.maker)
     about = np.zeros((len(sections), 1, 2))
     amplitudes, tried, noises = [], [], []

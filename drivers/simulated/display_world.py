@@ -12,8 +12,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions
-from drivers.simulated.clock import Clock
-from drivers.simulated.surroundings import Surroundings
+from drivers.simulated.surroundings import Clock, Surroundings
 from recon.base.blocks import block_sum
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
 from recon.optics.sensor import SensorSpec

@@ -9,7 +9,6 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBo
 
 from gui.jobs import Job
 from gui.panel import Panel
-from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.widgets.chart_view import ChartView
 from gui.widgets.dialogues import choose_path
@@ -17,6 +16,7 @@ from gui.widgets.stability_view import StabilityView
 from instrument.evaluation.chart_data import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
+from recon.base.declare import expression
 from recon.verdict.shipped import shipped_file
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."

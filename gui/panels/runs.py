@@ -32,10 +32,9 @@ from calibration_routines.procedure import Outcome
 from calibration_routines.psf.sweep import FOLDER
 from calibration_routines.psf.sweep_record import is_sweep
 from gui.background_reading import NewestOnly
-from gui.forms.as_python import script
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun
+from gui.procedure_run import Ended, ProcedureRun, script
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.image_view import ImageView

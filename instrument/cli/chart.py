@@ -14,7 +14,7 @@ from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_
 from instrument.cli.options import Given, Only
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError
-from instrument.reconstruction.inputs import InputOptions, SourceOptions
+from instrument.reconstruction.options import InputOptions, SourceOptions
 from recon.base.declare import option
 from recon.base.option_text import size as size_of
 

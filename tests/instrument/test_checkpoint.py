@@ -151,7 +151,7 @@ def test_a_digest_tells_arrays_apart():
 
 
 def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monkeypatch):
-    import instrument.cli.picture as module
+    import instrument.cli.solving as module
 
     def full(*_args, **_kwargs):
         raise FileError(files / "a.tif", "cannot be written: the disk is full.", "Make room.")
@@ -159,7 +159,7 @@ def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monke
     kept = files / "kept"
     what = ("--psf", files / "psf.tif", "--tolerance", "0.5", "--checkpoint", kept, "-o", files / "a.tif")
     with monkeypatch.context() as broken:
-        broken.setattr(module, "_write", full)
+        broken.setattr(module, "write_reconstruction", full)
         code, said = run(*what)
     assert code == 2
     assert "disk is full" in said

@@ -23,7 +23,7 @@ preset = "tiny"
 PROGRAM = """
 import time
 from pathlib import Path
-from instrument.bench import closing_at_exit
+from instrument.bench import safety
 from instrument.bench.bench import open_bench
 
 bench = open_bench(Path("bench.toml"))
@@ -34,7 +34,7 @@ def off():
     real()
     print("dark", flush=True)
 bench.led_array.off = off
-closing_at_exit.EXIT_WAIT_S = {wait_s}
+safety.EXIT_WAIT_S = {wait_s}
 """
 
 
