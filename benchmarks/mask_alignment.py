@@ -24,7 +24,7 @@ import numpy as np
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
-from drivers.simulated.display_world import DisplayWorld
+from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, parse_config
 from instrument.bench.display_setup import bench_display

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of
+from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunStatus
 from recon.base.registry import Registry
 
 if TYPE_CHECKING:
-    from calibration_routines.display.spot_camera import SpotLook
+    from calibration_routines.display.display_io import SpotLook
     from calibration_routines.psf.exposure import SweepExposures
     from calibration_routines.psf.sweep_watch import SweepEvent
 
@@ -178,6 +179,10 @@ class Routine:
         Command lines.
     start : callable, optional
         Gives values for a form to begin with, by name, that follow from the bench.
+    lacks_result : callable, optional
+        Of routines whose runs become results later, too: whether a folder is such a run, without its result.
+    finish : callable, optional
+        Makes the result of such a run.
     file : str
         Where the command line writes the result when nothing else is said, of options with an ``out``.
     command : str
@@ -193,6 +198,8 @@ class Routine:
     needs: tuple[str, ...] = ()
     examples: tuple[str, ...] = ()
     start: Callable[[Bench], Mapping[str, Any]] | None = None
+    lacks_result: Callable[[Path], bool] = lambda _: False
+    finish: Callable[[Run], Outcome] | None = None
     file: str = ""
     command: str = "calibrate"
 
@@ -259,8 +266,9 @@ def under_control(bench: Bench, control: RunControl | None) -> Iterator[RunContr
         yield control
 
 
-def home_if_needed(bench: Bench, listener: Listener) -> None:
-    """Home a stage that has no reference yet."""
-    if bench.stage is not None and not bench.stage.is_homed:
+def home_if_needed(bench: Bench, listener: Listener, plan: Plan | None = None) -> None:
+    """Home a stage that has no reference yet; for a plan that places nothing, not."""
+    needed = plan is None or any(part.positions is not None for part in plan.parts)
+    if needed and bench.stage is not None and not bench.stage.is_homed:
         listener.step("homing the stage")
         bench.stage.home()

@@ -36,7 +36,7 @@ from instrument.files.alignment_file import load_alignment
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import load_slm_correction
 from instrument.reconstruction.result_list import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option

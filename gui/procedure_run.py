@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PySide6.QtCore import QObject, QTimer, Signal
 
-from calibration_routines.display.spot_camera import SpotLook
+from calibration_routines.display.display_io import SpotLook
 from calibration_routines.errors import RunEndedError
 from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
 from calibration_routines.psf.exposure import SweepExposures

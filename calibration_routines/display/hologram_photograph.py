@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment
@@ -21,7 +21,7 @@ from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.base.declare import option
 from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
-from recon.holography.camera_map import CameraMap, register_camera
+from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
 from recon.holography.lowpass import make_band
 from recon.holography.options import Envelope
@@ -192,49 +192,6 @@ def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.flo
     half[rows, : band.kept[1]] = spectrum
     image = np.fft.irfft2(half, (height, width)) * (height * width)
     return np.fft.fftshift(low_pass(image, display.slm_shape)), peak
-
-
-def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
-    """Blank the SLM, register the camera by the mask's speckle, and learn how bright the mean intensity is.
-
-    Returns
-    -------
-    CameraMap
-    float
-        Counts a millisecond of the mean intensity.
-
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
-    """
-    camera = io.bench.camera
-    pitch_um = camera.pixel_pitch_um * camera.binning
-    across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
-    io.show(np.ones(display.slm_shape, complex))
-    frame = io.photograph(camera.exposure_ms)
-    found = register_camera(frame, display, across)
-    return found, _inner_mean(frame, found)
-
-
-def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
-    """Return counts a millisecond of the mean intensity of random phases.
-
-    A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
-    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
-    """
-    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
-    io.show(np.exp(1j * phases))
-    full = (1 << io.bench.camera.significant_bits) - 1
-    return _inner_mean(io.photograph(full / (12 * mean_per_ms)), camera)
-
-
-def _inner_mean(frame: Array, camera: CameraMap) -> float:
-    """Return the mean over the inner field of view, the mask pixels' envelope divided out."""
-    rows, columns = camera.pixels(np.array([-0.3, 0.3]), np.array([-0.3, 0.3]))
-    inner = frame[round(rows[0]) : round(rows[1]), round(columns[0]) : round(columns[1])]
-    envelope = (np.sinc(np.linspace(-0.3, 0.3, 101)) ** 2).mean() ** 2
-    return float(inner.mean() / envelope)
 
 
 @dataclass(frozen=True, slots=True)

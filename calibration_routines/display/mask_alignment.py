@@ -25,28 +25,31 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.alignment_session import (
-    ALIGNMENT_FILE,
-    AlignmentFailedError,
-    AlignmentSession,
-    AlignmentSettings,
-    Progress,
-)
 from calibration_routines.display.display_io import (
     DisplayBench,
+    SpotLook,
     approach_from_below,
     refuse_existing,
     require_slm,
     writable,
 )
-from calibration_routines.display.mask_search import Measured, measure_sections, refine_pose, search_pose
+from calibration_routines.display.mask_search import (
+    ALIGNMENT_FILE,
+    AlignmentFailedError,
+    AlignmentSession,
+    AlignmentSettings,
+    Measured,
+    Progress,
+    measure_sections,
+    refine_pose,
+    search_pose,
+)
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
-from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, home_if_needed, under_control
 from instrument.bench.bench import Bench
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment, save_alignment
-from instrument.files.slm_correction import load_slm_correction
+from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
 from recon.holography import Display

@@ -12,19 +12,19 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import (
     DisplayBench,
+    SpotCamera,
     bring_mask,
     refuse_existing,
     require_slm,
     writable,
 )
-from calibration_routines.display.spot_camera import SpotCamera
 from calibration_routines.options import problems_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
 from instrument.bench.bench import Bench
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError, SettingsError
-from instrument.files.slm_correction import SlmCorrection
+from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
 from recon.holography import Display

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, RunEndedError
+from calibration_routines.errors import CalibrationError, completed
 from calibration_routines.optics.angular_response import (
     EMISSIONS,
     AngularResponse,
@@ -48,7 +48,6 @@ from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
 from instrument.plan import Plan
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
@@ -271,8 +270,7 @@ def finish_angular(run: Run) -> tuple[AngularResponse, Path]:
         When the run is none of the angular response's, is not complete, or too little can be seen.
     """
     sweep, geometry, bench, simulated = _read_record(run.path)
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
+    completed(run)
     points = sweep.points()
     dark = dark_model(run)
     drift = drift_of(run, points, dark)
@@ -399,6 +397,8 @@ ROUTINES = (
         options=AngularSweep,
         procedure=AngularProcedure,
         needs=("stage",),
+        lacks_result=lambda run: is_angular(run) and not (run / RESPONSE_FILE).exists(),
+        finish=lambda run: response_outcome(*finish_angular(run)),
         examples=(
             "diffuserbench calibrate angular --dry-run",
             "diffuserbench calibrate angular",

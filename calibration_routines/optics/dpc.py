@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, RunEndedError
+from calibration_routines.errors import CalibrationError, completed
 from calibration_routines.options import problems_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
-from calibration_routines.psf.analysis import DarkModel, replace_hot
+from calibration_routines.psf.analysis import dark_model, full_scale, light_of
 from calibration_routines.psf.exposure import AutoExposure, auto_expose, hot_pixels
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
@@ -29,7 +29,6 @@ from instrument.files.figures import save_figure
 from instrument.plan import OFF, Light, Part, Plan, check
 from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
@@ -217,9 +216,7 @@ def finish_diffuser(run: Run) -> tuple[DiffuserSurface, Path]:
             f"{path} cannot be read ({error}): the run is none of calibrate dpc, or the file was changed. "
             "The frames beside it are not touched."
         ) from error
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
-    phase = phase_from_halves(_halves(run), optics)
+    phase = phase_from_halves(_halves(completed(run)), optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (setup.index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)
     surface = DiffuserSurface(
@@ -299,15 +296,12 @@ def _expose(bench: Bench, array: LedArray, setup: DpcSetup) -> AutoExposure:
 
 
 def _halves(run: Run) -> dict[str, Image]:
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    dark = DarkModel((1.0,), (run.images("dark"),), full_scale)
+    dark = dark_model(run)
     halves = {}
     for side in SIDES:
-        frames = run.images(side)
-        if np.any((frames >= full_scale).any(axis=0) & ~dark.hot):
+        if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        light = replace_hot(frames.mean(axis=0, dtype=np.float32) - dark.at(1.0), dark.hot)
-        halves[side] = np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark)
     return halves
 
 
@@ -445,6 +439,8 @@ ROUTINES = (
         options=DpcSetup,
         procedure=DpcProcedure,
         needs=("led_array",),
+        lacks_result=lambda run: is_dpc(run) and not (run / RESULT_FILE).exists(),
+        finish=lambda run: surface_outcome(*finish_diffuser(run)),
         examples=(
             "diffuserbench new microscope.toml --led-microscope",
             "diffuserbench calibrate dpc --bench microscope.toml --na 0.1 --magnification 4",

@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, RunEndedError
+from calibration_routines.errors import CalibrationError, completed
 from calibration_routines.options import problems_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
-from calibration_routines.psf.analysis import DarkModel, channels_first, replace_hot
+from calibration_routines.psf.analysis import channels_first, dark_model, full_scale, replace_hot
 from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
 from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
@@ -124,15 +123,12 @@ def photograph(
     if exposure_ms is None:
         exposure_ms = expose_scene(bench).exposure_ms
     plan = photograph_plan(exposure_ms, average, dark_frames)
-    run = acquire(bench, plan, folder, on_progress=on_progress, control=control)
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
+    run = completed(acquire(bench, plan, folder, on_progress=on_progress, control=control))
     frames = run.images("scene")
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    dark = DarkModel((exposure_ms,), (run.images("dark"),), full_scale)
-    light = frames.mean(axis=0, dtype=np.float32) - dark.at(exposure_ms)
+    dark = dark_model(run)
+    light = frames.mean(axis=0, dtype=np.float32) - dark.at(run.metadata(0).exposure_ms)
     binned = block_mean(channels_first(replace_hot(light, dark.hot)), binning)
-    saturated = (frames >= full_scale).any(axis=0) & ~dark.hot
+    saturated = (frames >= full_scale(run)).any(axis=0) & ~dark.hot
     return Photograph(
         measurement=np.ascontiguousarray(np.moveaxis(binned, 0, -1)) if frames.ndim == 4 else binned[0],
         raw=frames[0],

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.errors import RunEndedError
+from calibration_routines.errors import completed
 from calibration_routines.psf.analysis import (
     DarkModel,
     PlaneFrames,
@@ -63,7 +63,6 @@ from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.plan import Step
 from instrument.runs.acquire import acquire, prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.runner import Progress, Runner
@@ -341,9 +340,7 @@ def _stored(run: Run, index: int) -> Snapshot:
 
 
 def _complete(run: Run) -> Run:
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The sweep", run, f"Go on with: diffuserbench resume {run.path}")
-    return run
+    return completed(run, "The sweep", f"Go on with: diffuserbench resume {run.path}")
 
 
 # Frames to PSFs ----------------------------------------------------------------------------------------

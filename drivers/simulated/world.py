@@ -13,8 +13,7 @@ import numpy.typing as npt
 from matplotlib import cbook
 
 from drivers.device import DriverOptions
-from drivers.simulated.options import WorldOptions
-from drivers.simulated.presets import PRESETS, Preset
+from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
 from drivers.simulated.surroundings import Clock, Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser

@@ -19,8 +19,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from calibration_routines.display.display_io import SpotLook
 from calibration_routines.display.mask_alignment import AlignmentReport
-from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.procedure import Outcome
 from gui.forms.routines import forms
 from gui.procedure_panel import ProcedurePanel

@@ -40,8 +40,7 @@ from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.run_bar import RunBar
 from instrument.runs.catalogue import RunSummary, run_paths, summary
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _LEVELS = (0.1, 99.9)

@@ -18,9 +18,8 @@ from instrument.files.formatting import duration, size
 from instrument.plan import Plan, check
 from instrument.plan.file import load_plan
 from instrument.runs.acquire import abilities_of, free_bytes, prepare
-from instrument.runs.layout import BENCH_TOML, FinishReason, RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run
+from instrument.runs.run import BENCH_TOML, FinishReason, Run, RunCondition
 from instrument.runs.runner import Runner, RunState, RunStatus
 from instrument.runs.writer import RunWriter
 

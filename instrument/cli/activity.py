@@ -17,7 +17,7 @@ from instrument.reconstruction.activity import ActivitySettings, find_activity, 
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.request import Settings
 from instrument.reconstruction.video_output import VideoPictures
-from instrument.runs.layout import STATE
+from instrument.runs.run import STATE
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions
 

@@ -11,6 +11,7 @@ import typer
 from instrument.cli.app import App, examples
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError
+from instrument.reconstruction.asked import request_of, settings_of
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
 from instrument.reconstruction.request import PictureRequest, Settings, VolumeRequest
 from instrument.reconstruction.result_file import Outputs
@@ -43,24 +44,12 @@ class _Asked:
     @property
     def settings(self) -> Settings:
         """What pictures, volumes and videos are all asked for."""
-        inputs, options = self.inputs, self.options
-        return Settings(
-            model=options.model,
-            dark=inputs.dark,
-            crop=inputs.crop,
-            binning=inputs.binning,
-            erasures=inputs.erasures,
-            noise=inputs.noise,
-            prior=None if options.prior is None else str(options.prior),
-            tau=options.tau,
-            iterations=options.iterations,
-            time_s=options.time_s,
-            tolerance=options.tolerance,
-            stop_at_noise=options.stop_at_noise,
-            mosaic=inputs.mosaic,
-            wishes=options.choose,
-            precision=None if options.precision == "auto" else options.precision,
-        )
+        return settings_of(self.inputs, self.options)
+
+    @property
+    def request(self) -> PictureRequest | VolumeRequest:
+        """What a photograph is to be made into."""
+        return request_of(self.source, self.inputs, self.options)
 
 
 @app.command(
@@ -99,12 +88,12 @@ def reconstruct(
     elif source.image is None:
         raise BenchError("Give a photograph with --image FILE, or a recording: RUN --video.")
     elif source.volume is not None:
-        _volume(asked, source.image, source.volume)
+        _volume(asked)
     else:
-        _picture(asked, source.image)
+        _picture(asked)
 
 
-def _picture(asked: _Asked, image: Path) -> None:
+def _picture(asked: _Asked) -> None:
     from instrument.cli.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
@@ -115,36 +104,16 @@ def _picture(asked: _Asked, image: Path) -> None:
             "were measured. Leave it out."
         )
     _require_auto(asked)
-    request = PictureRequest(
-        image=image,
-        psf=source.psf,
-        calibration=source.calibration,
-        z_um=asked.options.z_um,
-        method=asked.options.solver,
-        allow_saturated=asked.inputs.allow_saturated,
-        allow_mixed_depth=asked.inputs.allow_mixed_depth,
-        settings=asked.settings,
-    )
-    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, output.figure), output)
+    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, output.figure), output)
 
 
-def _volume(asked: _Asked, image: Path, psfs: Path) -> None:
+def _volume(asked: _Asked) -> None:
     from instrument.cli.solving import reconstruct_photograph
 
-    options, output = asked.options, asked.output
+    output = asked.output
     asked.given.refuse("--volume", "volume")
     _require_auto(asked)
-    request = VolumeRequest(
-        image=image,
-        psfs=psfs,
-        estimate_background=options.estimate_background,
-        positive_background=options.positive_background,
-        scratch=options.scratch,
-        memory_gib=options.memory_gib,
-        device=options.device,
-        settings=asked.settings,
-    )
-    reconstruct_photograph(request, Outputs.named(output.out or _PICTURE, volume=True), output)
+    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, volume=True), output)
 
 
 def _video(asked: _Asked, run: Path | None) -> None:

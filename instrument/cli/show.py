@@ -135,8 +135,7 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
 
     from calibration_routines.display.display_io import DisplayBench, bring_mask
     from instrument.files.alignment_file import load_alignment
-    from instrument.files.slm_correction import load_slm_correction
-    from instrument.files.slm_image import levels_phase, read_slm_image
+    from instrument.files.slm_image import levels_phase, load_slm_correction, read_slm_image
 
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
@@ -230,8 +229,8 @@ def _capture(
 
 def _show_run(run: Path, picture: Path | None) -> None:
     """Say how a run ended, what it holds, with which bench and software; draw a sheet of its frames."""
+    from instrument.runs.catalogue import contact_sheet
     from instrument.runs.run import Run
-    from instrument.runs.run_picture import contact_sheet
 
     found = Run.open(run)
     for name, value in _facts(found):

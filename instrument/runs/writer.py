@@ -26,7 +26,7 @@ from instrument.runs.durable import AppendOnlyLog, write_json
 from instrument.runs.folder import dated_name, disk_remedy, free_name, lock_run, plan_with_copies
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.frame_record import FrameRecord, Gap
-from instrument.runs.layout import (
+from instrument.runs.run import (
     BENCH,
     BENCH_TOML,
     FRAMES,
@@ -34,10 +34,12 @@ from instrument.runs.layout import (
     LOG,
     PLAN,
     PROVENANCE,
+    RUN_STATE,
     STATE,
     FinishReason,
+    Run,
+    RunError,
 )
-from instrument.runs.run import RUN_STATE, Run, RunError
 
 _PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-contrib-python-headless", "pydantic")
 

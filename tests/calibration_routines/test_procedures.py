@@ -22,8 +22,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import SettingsError
 from instrument.plan import Part, Plan, PlanError
-from instrument.runs.layout import FinishReason, RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
 

@@ -15,8 +15,7 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 60_000

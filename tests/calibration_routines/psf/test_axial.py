@@ -24,7 +24,7 @@ from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
 from instrument.plan import PlanError
-from instrument.runs.layout import RunCondition
+from instrument.runs.run import RunCondition
 from instrument.runs.runner import RunStatus
 from recon.types import Geometry
 

@@ -22,9 +22,8 @@ from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import acquire
-from instrument.runs.layout import LOG
 from instrument.runs.recorder import record
-from instrument.runs.run import Run
+from instrument.runs.run import LOG, Run
 from instrument.runs.snapshot import LightState, read_snapshot, write_snapshot
 
 BENCH = """

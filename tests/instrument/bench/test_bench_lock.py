@@ -18,7 +18,7 @@ from tests.mocks.devices import MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 HOLDER = """
 import sys
 from drivers.registry.claim import Claim

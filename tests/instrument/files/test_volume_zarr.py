@@ -54,7 +54,7 @@ def test_a_volume_there_before_survives_a_failure(tmp_path, volume, monkeypatch)
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("instrument.files.volume_zarr._sync", full)
+    monkeypatch.setattr("instrument.files.atomic.sync_folder", full)
     with pytest.raises(OSError, match="No space"):
         write_volume_zarr(path, 2 * volume, GRID, {})
     np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], volume)

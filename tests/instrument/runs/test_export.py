@@ -18,8 +18,7 @@ from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.runs.export import export
 from instrument.runs.frame_record import Gap
-from instrument.runs.layout import FinishReason
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import FinishReason, Run, RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 METADATA = FrameMetadata(

@@ -16,9 +16,8 @@ from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import Run, RunCondition, RunError
 from instrument.runs.verification import verify
 from tests.mocks.devices import MockDevice, MockWorld
 

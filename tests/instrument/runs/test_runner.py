@@ -16,8 +16,7 @@ from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError
 from instrument.plan import SOURCE, Part, Plan, PlanError, SourcePoints
 from instrument.runs.acquire import acquire, prepare
-from instrument.runs.layout import FinishReason, RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.runner import Runner, RunState, RunStatus
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockDevice, MockWorld

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SETUP = """
 import sys, time
 from importlib.metadata import EntryPoint

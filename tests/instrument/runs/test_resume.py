@@ -13,9 +13,8 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import FinishReason, RunCondition
 from instrument.runs.resume import inspect, prepare_resume
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import FinishReason, Run, RunCondition, RunError
 from instrument.runs.runner import RunStatus
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockWorld

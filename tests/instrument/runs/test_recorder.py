@@ -16,9 +16,8 @@ from drivers.errors import DeviceError, DeviceLostError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import BenchError
-from instrument.runs.layout import FinishReason, RunCondition
 from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording, record
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import FinishReason, Run, RunCondition, RunError
 from instrument.runs.writer import FrameToStore, RunWriter
 from tests.mocks.devices import MockDevice, MockWorld
 from tests.mocks.free_running import FreeRunningCamera

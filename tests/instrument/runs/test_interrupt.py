@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from instrument.files.interrupt import CtrlC, interrupts_held
+from instrument.runs.finish import CtrlC, interrupts_held
 
 
 def in_context(work: Callable[[CtrlC], None]) -> None:

@@ -15,8 +15,7 @@ from ome_zarr_models.v05 import Image
 from drivers.frame import FrameMetadata
 from instrument.plan import Part, Plan
 from instrument.runs.durable import AppendOnlyLog, read_lines, write_json
-from instrument.runs.layout import FinishReason, RunCondition
-from instrument.runs.run import Run, RunError
+from instrument.runs.run import FinishReason, Run, RunCondition, RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord(

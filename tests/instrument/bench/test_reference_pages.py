@@ -12,7 +12,7 @@ from instrument.bench.config_reference import reference
 from instrument.cli import COMMANDS
 from instrument.cli.reference import page as options_page
 
-DOCS = Path(__file__).parents[2] / "docs" / "reference"
+DOCS = Path(__file__).parents[3] / "docs" / "reference"
 
 
 def test_the_configuration_reference_is_what_the_models_say() -> None:
