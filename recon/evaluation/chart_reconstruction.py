@@ -29,7 +29,7 @@ __all__ = ["ChartProblem", "Setting", "left_out", "run_setting", "settings_for"]
 
 Array = npt.NDArray[Any]
 
-SCORES = 3
+SCORES = 2
 """Version of how points are scored: those of another one do not compare."""
 COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
 """Iterations at which a run is scored."""
