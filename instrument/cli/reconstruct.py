@@ -232,7 +232,6 @@ def reconstruct(
             "--volume": volume is not None,
             "--figure": figure is not None,
             "--method": method is not Method.ADMM,
-            "--background/--no-background": background is not None,
             "--explain": explain,
             "--choose": bool(choices),
             "--positive-background": positive_background,
@@ -250,6 +249,7 @@ def reconstruct(
         from instrument.cli.video import reconstruct_to_video
         from instrument.reconstruction.video import VideoRequest
         from recon.streams.joint import OVER_TIME
+        from recon.streams.video import WARM_ITERATIONS
 
         chosen = next((name for name in OVER_TIME if name == over_time), None)
         if over_time is not None and chosen is None:
@@ -271,7 +271,8 @@ def reconstruct(
                 film=film,
                 block=block,
                 over_time=chosen,
-                **({} if warm is None else {"warm_iterations": warm}),
+                estimate_background=background,
+                warm_iterations=WARM_ITERATIONS if warm is None else warm,
             ),
             workers=workers,
             scheduler=scheduler,
