@@ -36,8 +36,8 @@ from auto_scenes import FAMILY_PRIOR, JUDGED, TUNING
 import recon
 from recon.base.threads import set_threads
 from recon.camera import registration_cache as remembered
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
-from recon.evaluation.scene_score import score
 from recon.reconstruction.choice import Choice
 
 FIXED = tuple(f"{m}{b}" for m in ("convolution", "lowrank", "local") for b in ("", " + background"))

@@ -9,7 +9,7 @@ every frame whose ``write`` has returned) must be there; no frame may be taken t
 log; every run must open and verify. Exit status 1 when any of it fails.
 
 ``kill -9`` ends the process, not the kernel: that everything is also synced in the right order, so that a
-power cut costs no more, is held by tests/instrument/test_store_order.py.
+power cut costs no more, is held by tests/instrument/runs/test_store_order.py.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import prepare
 from instrument.runs.durable import read_lines
-from instrument.runs.layout import RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.verification import verify
 from instrument.runs.writer import FrameToStore, RunWriter
 

@@ -21,8 +21,13 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from recon.analysis.field import field_of_view
 from recon.analysis.point_tests import PLANES, PointTests, point_tests
-from recon.analysis.resolution import axial_resolution, lateral_resolution
-from recon.analysis.sampling import axial_spacing_per_um, gaussian_response, lateral_spacing_um
+from recon.analysis.resolution import (
+    axial_resolution,
+    axial_spacing_per_um,
+    gaussian_response,
+    lateral_resolution,
+    lateral_spacing_um,
+)
 from recon.base.threads import set_threads
 from recon.types import Calibration, Geometry
 

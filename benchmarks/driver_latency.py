@@ -31,7 +31,7 @@ from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.grbl.stage import GrblOptions, GrblStage
 from drivers.illuminate.led_array import IlluminateLedArray, IlluminateOptions
 from drivers.led_array import LedArray
-from drivers.second_display.options import SecondDisplayOptions
+from drivers.second_display.outputs import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
 from drivers.slm import Slm
 from drivers.stage import Stage

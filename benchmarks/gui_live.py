@@ -30,7 +30,7 @@ from gui.panels.live import LivePanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from instrument.bench.config_file import parse_config
-from instrument.runs.snapshot import Light
+from instrument.runs.snapshot import LightState
 
 SIZES = {"0.3 MP": (480, 640), "1.0 MP": (1024, 1024), "1.3 MP": (1024, 1280), "5.5 MP": (2160, 2560)}
 BENCH = """
@@ -104,7 +104,7 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
         panel = window.panel("live")
         assert isinstance(panel, LivePanel)
         until(lambda: panel._shown is not None)
-        panel.switch_light(Light.SOURCE)
+        panel.switch_light(LightState.SOURCE)
         until(lambda: session.bench.source_lit)
         frame = panel._shown
         assert frame is not None

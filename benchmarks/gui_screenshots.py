@@ -277,8 +277,8 @@ def _first_run(window: MainWindow) -> None:
 
 def _reconstructions(window: MainWindow, out: Path) -> None:
     """Reconstruct a picture and a volume with the form, and look at them."""
+    from gui.forms.reconstruct import CALIBRATION, VOLUME
     from gui.panels.reconstructions import ReconstructionsPanel
-    from gui.widgets.reconstruct_form import CALIBRATION, VOLUME
 
     panel = window.panel("reconstructions")
     assert isinstance(panel, ReconstructionsPanel)
@@ -286,17 +286,21 @@ def _reconstructions(window: MainWindow, out: Path) -> None:
     calibration = sorted(panel.session.runs_folder.glob("*/calibration"))[0]
     form = panel.form
     for kind, scene, prior, tau, shot in (
-        (CALIBRATION, "bars", "tv", "", "reconstruct"),
-        (VOLUME, "beads", "l1", "0.05", "volume"),
+        (CALIBRATION, "bars", "tv", None, "reconstruct"),
+        (VOLUME, "beads", "l1", 0.05, "volume"),
     ):
         panel.tabs.setCurrentWidget(form)
-        form.kind.setCurrentText(kind)
-        form.image.setText(str(folder / f"{scene}.tif"))
-        form.psfs.setText(str(calibration))
-        form.z_mm.setText(PICTURE_Z_MM)
-        form.prior.setCurrentText(prior)
-        form.tau.setText(tau)
-        form.iterations.setText("150")
+        form.options.set_values({"kind": kind})
+        form.options.set_values(
+            {
+                "image": folder / f"{scene}.tif",
+                form.source: calibration,
+                "z_um": 1e3 * float(PICTURE_Z_MM),
+                "prior": prior,
+                "tau": tau,
+                "iterations": 150,
+            }
+        )
         panel._suggest_out()
         job = panel.reconstruct()
         if job is None:
@@ -325,13 +329,16 @@ def _hologram(window: MainWindow) -> None:
 
     panel = window.show_panel("holograms")
     assert isinstance(panel, HologramsPanel)
-    panel.picture.setText(str(panel.session.runs_folder.parent / "portrait.png"))
-    panel.picture.check()
     alignments = sorted(panel.session.runs_folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
-    panel.alignment.setText(str(alignments[-1]))
-    panel.weights_mode.setCurrentText("a fovea, dragged")
+    panel.form.set_values(
+        {
+            "picture": panel.session.runs_folder.parent / "portrait.png",
+            "alignment": alignments[-1],
+            "counts": "a fovea, dragged",
+            "iterations": 60,
+        }
+    )
     panel.target.set_fovea((0.42, 0.5), 0.24)
-    panel.iterations.setText("60")
     for start in (panel.compute, panel.photograph):
         job = start()
         if job is None:

@@ -24,9 +24,8 @@ from scipy.stats import spearmanr
 
 from recon.base.threads import set_threads
 from recon.evaluation.chart_reconstruction import ChartProblem, run_setting, settings_for
-from recon.evaluation.even import SETTLED_ITERATIONS, even_with_best
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scored import Point
+from recon.evaluation.scored import SETTLED_ITERATIONS, Point, even_with_best
 
 SCENES = ("sparse-picture", "dense-picture", "beads")
 COUNTS = (3, 10, 30, 90)

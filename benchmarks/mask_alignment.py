@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.hologram_photograph import capture_hologram
+from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
-from drivers.simulated.display_world import DisplayWorld
+from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, parse_config
 from instrument.bench.display_setup import bench_display
@@ -159,13 +159,12 @@ def one_start(seed: int, kind: str, plain: np.ndarray | None) -> tuple[dict[str,
             "tilt_left_mrad": round(float(np.hypot(left.pitch_mrad, left.yaw_mrad)), 2),
         }
         aligned = replace(known, displacement=field)
-        shots = {"mean_per_ms": report.brightness_per_ms}
-        after = capture_hologram(
-            io, [hologram(aligned, target)], aligned, target, report.camera, **shots, average=2
-        )
+        mean_per_ms = report.brightness_per_ms
+        seen = HologramCamera(io, aligned, report.camera, mean_per_ms)
+        after = seen.capture([hologram(aligned, target)], target, average=2)
         line["psnr_after_db"] = round(after.scores.psnr_db, 2)
         bench.stage.move_to({axis.name: 0.0 for axis in bench.stage.axes})
-        before = capture_hologram(io, [plain], known, target, report.camera, **shots, average=2)
+        before = replace(seen, display=known).capture([plain], target, average=2)
         line["psnr_before_db"] = round(before.scores.psnr_db, 2)
     still = dict.fromkeys(("z_um", "roll_mrad", "pitch_mrad", "yaw_mrad"), "0.0") | {"shift_um": "[0.0, 0.0]"}
     config = parse_config(configuration({**options, **still}), None)
@@ -178,7 +177,8 @@ def one_start(seed: int, kind: str, plain: np.ndarray | None) -> tuple[dict[str,
         io.show(np.ones(known.slm_shape, complex))
         across = known.wavelength_nm * known.focal_mm / known.mask_pitch_um / bench.camera.pixel_pitch_um
         camera = register_camera(io.photograph(10.0), known, across)
-        perfect = capture_hologram(io, [hologram(exact, target)], exact, target, camera, **shots, average=2)
+        seen = HologramCamera(io, exact, camera, mean_per_ms)
+        perfect = seen.capture([hologram(exact, target)], target, average=2)
         line["psnr_perfect_db"] = round(perfect.scores.psnr_db, 2)
     return line, plain
 

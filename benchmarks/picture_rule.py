@@ -26,8 +26,8 @@ from benchmarks.lenslet_scene import Camera, expose
 from recon import reconstruct
 from recon.base.threads import set_threads
 from recon.camera.base import Array
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 
 LOOK_AT = 16
 """Iterations of ``admm-sensor`` after which the edges are measured."""

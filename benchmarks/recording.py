@@ -26,7 +26,7 @@ from typing import Any
 
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
-from instrument.runs.recording import record
+from instrument.runs.recorder import record
 
 SIZES = {"0.3 MP": (480, 640), "1.3 MP": (1024, 1280), "5 MP": (2048, 2560)}
 BENCH = """

@@ -58,7 +58,7 @@ def measure(places_a_bin: int, seed: int) -> list[tuple[float, float, float, flo
         bench.stage.home()
         world = bench.shared["simulated"]
         assert isinstance(world, SimulatedWorld)
-        exposures = expose_sweep(bench, PointSweep(((0.0, 0.0, Z_UM),)))
+        exposures = expose_sweep(bench, PointSweep(points_um=((0.0, 0.0, Z_UM),)))
         bench.camera.set_exposure_ms(exposures.exposures_ms[0])
         pitch_um = 2 * bench.camera.pixel_pitch_um * bench.camera.binning
         bench.source_off()

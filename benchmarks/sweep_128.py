@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the run goes; default: a temporary folder")
     arguments = parser.parse_args()
     near, far = (60e3, 250e3) if arguments.preset == "tiny" else (100e3, 500e3)
-    sweep = AxialSweep(near, far, arguments.planes, average=arguments.average)
+    sweep = AxialSweep(z_min_um=near, z_max_um=far, planes=arguments.planes, average=arguments.average)
     text = BENCH.format(preset=arguments.preset, binning=arguments.binning)
     with (
         open_bench(parse_config(text, None)) as bench,

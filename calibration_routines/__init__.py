@@ -5,7 +5,6 @@ from calibration_routines.optics.angular import AngularSweep, measure_angular_re
 from calibration_routines.optics.angular_response import AngularResponse, load_response
 from calibration_routines.optics.dpc import DiffuserSurface, DpcSetup, measure_diffuser
 from calibration_routines.optics.photograph import Photograph, expose_scene, photograph
-from calibration_routines.psf.axial_plan import AxialSweep, planes_needed
 from calibration_routines.psf.exposure import (
     AutoExposure,
     ExposureOutcome,
@@ -15,9 +14,17 @@ from calibration_routines.psf.exposure import (
     expose_sweep,
 )
 from calibration_routines.psf.field_response import FieldResponse, measure_field_response
-from calibration_routines.psf.sampling import GridSweep, Sampling, axial_planes, grid_sweep, lateral_spacing
+from calibration_routines.psf.sampling import (
+    GridSweep,
+    Sampling,
+    axial_planes,
+    grid_sweep,
+    lateral_spacing,
+    planes_needed,
+)
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
-from calibration_routines.psf.sweep_plan import PointSweep, Sweep, check_sweep, sweep_plan
+from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, PointSweep, Sweep, VolumeSweep
+from calibration_routines.psf.sweep_plan import check_sweep, sweep_plan
 from calibration_routines.psf.sweep_record import is_sweep
 from calibration_routines.psf.sweep_watch import PointTaken, SourceVisit, SweepEvent
 
@@ -32,6 +39,7 @@ __all__ = [
     "ExposureOutcome",
     "FieldResponse",
     "GridSweep",
+    "LateralSweep",
     "Photograph",
     "PointSweep",
     "PointTaken",
@@ -41,6 +49,7 @@ __all__ = [
     "SweepCalibration",
     "SweepEvent",
     "SweepExposures",
+    "VolumeSweep",
     "auto_expose",
     "axial_planes",
     "calibrate_sweep",

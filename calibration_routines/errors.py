@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instrument.files.errors import BenchError
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 
 class CalibrationError(BenchError):
@@ -33,3 +33,16 @@ class RunEndedError(CalibrationError):
         self.words = f"{what} ended early ({run.condition}); what was taken is in {run.path}."
         """Without the remedy, which is not the same on the command line and in a window."""
         super().__init__(self.words + (f" {remedy}" if remedy else ""))
+
+
+def completed(run: Run, what: str = "The run", remedy: str = "") -> Run:
+    """Return a run that has all its frames.
+
+    Raises
+    ------
+    RunEndedError
+        When it was ended before its last one.
+    """
+    if run.condition is not RunCondition.COMPLETED:
+        raise RunEndedError(what, run, remedy)
+    return run

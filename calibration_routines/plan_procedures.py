@@ -5,20 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration_routines.errors import RunEndedError
-from calibration_routines.optics.angular import RESPONSE_FILE, finish_angular, is_angular
-from calibration_routines.optics.dpc import RESULT_FILE, finish_diffuser, is_dpc
-from calibration_routines.optics.optics_procedures import response_outcome, surface_outcome
-from calibration_routines.procedure import Listener, Outcome, Outlook, outlook_of, under_control
+from calibration_routines.errors import completed
+from calibration_routines.procedure import (
+    Listener,
+    Outcome,
+    Outlook,
+    Routine,
+    home_if_needed,
+    outlook_of,
+    routines,
+    under_control,
+)
 from calibration_routines.psf.sweep import FOLDER, finish_sweep, watch_resumed
 from calibration_routines.psf.sweep_procedure import analysing, sweep_outcome
 from calibration_routines.psf.sweep_record import is_sweep
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
 from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 
 
@@ -46,7 +51,7 @@ class PlanProcedure:
         heard = listener or Listener()
         self.outlook(bench, folder)
         with under_control(bench, control) as control:
-            _home_for(bench, self.plan, heard)
+            home_if_needed(bench, heard, self.plan)
             heard.step(self.plan.label)
             run = prepare(bench, self.plan, folder, on_progress=heard.frame, control=control).execute()
         return run_outcome(run)
@@ -86,7 +91,7 @@ class ResumeProcedure:
             found = Run.open(self.run)
             whole = found.condition is RunCondition.COMPLETED and not found.missing()
             if found.plan is not None and not whole:
-                _home_for(bench, found.plan, heard)
+                home_if_needed(bench, heard, found.plan)
                 heard.step("verifying the frames")
                 runner, findings = prepare_resume(
                     bench, self.run, on_verify=heard.share, on_progress=heard.frame
@@ -98,9 +103,8 @@ class ResumeProcedure:
                 control.follow(runner)
                 found = runner.execute()
             lacks = lacks_result(self.run)
-            if lacks and found.condition is not RunCondition.COMPLETED:
-                raise RunEndedError("The run", found, "It can be resumed.")
             if lacks:
+                completed(found, remedy="It can be resumed.")
                 heard.step("analysing")
             if (outcome := finish_simple(found)) is not None:
                 return outcome
@@ -118,26 +122,23 @@ class ResumeProcedure:
 
 def lacks_result(run: Path) -> bool:
     """Whether a run's frames are those of a calibration, and its result is not there yet."""
-    return (
-        (is_sweep(run) and not (run / FOLDER).exists())
-        or (is_angular(run) and not (run / RESPONSE_FILE).exists())
-        or (is_dpc(run) and not (run / RESULT_FILE).exists())
-    )
+    return (is_sweep(run) and not (run / FOLDER).exists()) or _unfinished(run) is not None
 
 
 def finish_simple(run: Run) -> Outcome | None:
-    """Make the result of a complete run of an angular response or a surface that has none yet.
+    """Make the result of a complete run of a routine other than a sweep that has none yet.
 
     Returns
     -------
     Outcome or None
         None for every other run.
     """
-    if is_angular(run.path) and not (run.path / RESPONSE_FILE).exists():
-        return response_outcome(*finish_angular(run))
-    if is_dpc(run.path) and not (run.path / RESULT_FILE).exists():
-        return surface_outcome(*finish_diffuser(run))
-    return None
+    routine = _unfinished(run.path)
+    return None if routine is None or routine.finish is None else routine.finish(run)
+
+
+def _unfinished(run: Path) -> Routine | None:
+    return next((routine for routine in routines.values() if routine.lacks_result(run)), None)
 
 
 def run_outcome(run: Run) -> Outcome:
@@ -153,10 +154,3 @@ def run_outcome(run: Run) -> Outcome:
     return Outcome(
         verdict=tuple(words), good=complete and not dropped and not saturated, runs=(run.path,), result=run
     )
-
-
-def _home_for(bench: Bench, plan: Plan, heard: Listener) -> None:
-    moves = any(part.positions is not None for part in plan.parts)
-    if moves and bench.stage is not None and not bench.stage.is_homed:
-        heard.step("homing the stage")
-        bench.stage.home()

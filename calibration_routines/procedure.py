@@ -6,20 +6,25 @@ A procedure is frozen data: what a person asked for. ``outlook`` says what it wi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from calibration_routines.display.spot_camera import SpotLook
-from calibration_routines.psf.exposure import SweepExposures
-from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, PlanEstimate, Step, estimate
 from instrument.runs.acquire import abilities_of
+from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunStatus
+from recon.base.registry import Registry
+
+if TYPE_CHECKING:
+    from calibration_routines.display.display_io import SpotLook
+    from calibration_routines.psf.exposure import SweepExposures
+    from calibration_routines.psf.sweep_watch import SweepEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +41,9 @@ class Outlook:
         Of the plan.
     free_bytes : int or None
         On the disk that the runs go to.
+    plan_lines : tuple of str
+        The plan in words where more is to be said than frames and seconds; exposures are only found at the
+        start (:meth:`Listener.planned`).
     path : tuple of mapping
         Where the source (``x_um``, ``y_um``, ``z_um``) or the stage goes, in the order of the visits.
     """
@@ -44,6 +52,7 @@ class Outlook:
     plan: Plan | None = None
     cost: PlanEstimate | None = None
     free_bytes: int | None = None
+    plan_lines: tuple[str, ...] = ()
     path: tuple[dict[str, float], ...] = ()
 
 
@@ -94,6 +103,9 @@ class Listener:
     def exposures(self, found: SweepExposures) -> None:
         """Hear which exposures a sweep will have."""
 
+    def planned(self, lines: Sequence[str]) -> None:
+        """Hear in words what will be taken, once the exposures are known."""
+
     def frame(self, status: RunStatus) -> None:
         """Hear that a frame of a run is on the disk, or that the run's state changed."""
 
@@ -142,6 +154,77 @@ class Procedure(Protocol):
         """
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Routine:
+    """A row of the registry: what ``calibrate`` and the window offer, from its options to its result.
+
+    Attributes
+    ----------
+    name : str
+        On the command line: ``diffuserbench calibrate NAME``.
+    title : str
+        In the window.
+    help : str
+        What it does, one sentence.
+    options : type
+        Frozen dataclass with declared fields (:mod:`recon.base.declare`); raises SettingsError for what makes
+        no sense together.
+    procedure : callable
+        Makes the procedure of such options: what plans (``outlook``) and runs (``carry_out``).
+    details : str
+        More about it, for the command's help.
+    needs : tuple of str
+        Devices that it needs besides the camera.
+    examples : tuple of str
+        Command lines.
+    start : callable, optional
+        Gives values for a form to begin with, by name, that follow from the bench.
+    lacks_result : callable, optional
+        Of routines whose runs become results later, too: whether a folder is such a run, without its result.
+    finish : callable, optional
+        Makes the result of such a run.
+    file : str
+        Where the command line writes the result when nothing else is said, of options with an ``out``.
+    command : str
+        The command that it is part of.
+    """
+
+    name: str
+    title: str
+    help: str
+    options: type[Any]
+    procedure: Callable[[Any], Procedure]
+    details: str = ""
+    needs: tuple[str, ...] = ()
+    examples: tuple[str, ...] = ()
+    start: Callable[[Bench], Mapping[str, Any]] | None = None
+    lacks_result: Callable[[Path], bool] = lambda _: False
+    finish: Callable[[Run], Outcome] | None = None
+    file: str = ""
+    command: str = "calibrate"
+
+
+_MODULES = (
+    "psf.sweep_procedure",
+    "optics.photograph",
+    "optics.angular",
+    "optics.dpc",
+    "optics.beads",
+    "display.slm_calibration",
+    "display.mask_alignment",
+)
+"""Each has its routines as ``ROUTINES``. They are imported when somebody asks what there is."""
+
+
+def _own() -> Iterator[Routine]:
+    for name in _MODULES:
+        yield from import_module(f"calibration_routines.{name}").ROUTINES
+
+
+routines: Registry[Routine] = Registry("routine", "diffuserbench.routines", _own)
+"""All routines by name: the project's, those of installed packages, those that this program registered."""
+
+
 def outlook_of(
     bench: Bench, plan: Plan, folder: Path | None, reasons: Sequence[str] = (), *, homes: bool = False
 ) -> Outlook:
@@ -155,7 +238,7 @@ def outlook_of(
     told = list(reasons)
     if path and bench.stage is not None and (homes or not bench.stage.is_homed):
         told.append("The stage is homed first, every axis to its reference: its way must be free.")
-    return Outlook(tuple(told), plan, estimate(plan, abilities), abilities.free_bytes, path)
+    return Outlook(tuple(told), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
 
 
 def path_of(plan: Plan) -> tuple[dict[str, float], ...]:
@@ -183,8 +266,9 @@ def under_control(bench: Bench, control: RunControl | None) -> Iterator[RunContr
         yield control
 
 
-def home_if_needed(bench: Bench, listener: Listener) -> None:
-    """Home a stage that has no reference yet."""
-    if bench.stage is not None and not bench.stage.is_homed:
+def home_if_needed(bench: Bench, listener: Listener, plan: Plan | None = None) -> None:
+    """Home a stage that has no reference yet; for a plan that places nothing, not."""
+    needed = plan is None or any(part.positions is not None for part in plan.parts)
+    if needed and bench.stage is not None and not bench.stage.is_homed:
         listener.step("homing the stage")
         bench.stage.home()

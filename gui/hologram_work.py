@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,12 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
-from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
+from calibration_routines.display.hologram_photograph import (
+    CaptureOptions,
+    Photographed,
+    photograph_hologram,
+    write_capture,
+)
 from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
-from gui.python_lines import expression
+from gui.widgets.entry import existing_path
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
@@ -28,10 +34,12 @@ from instrument.display.hologram_file import HologramFiles
 from instrument.display.hologram_job import HologramResult, compute_and_judge, prepare_target
 from instrument.files.alignment_file import load_alignment
 from instrument.files.atomic import check_writable
+from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.files.slm_correction import load_slm_correction
-from instrument.reconstruction.result_list import free_name
+from instrument.files.slm_image import load_slm_correction
+from instrument.reconstruction.result_list import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
+from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
 _INTERVAL_S = 0.25
@@ -39,28 +47,62 @@ _FRAME_S = 0.02
 """How long each of several frames is shown before the next is sent; the SLM's settling comes on top."""
 
 
-@dataclass(frozen=True, slots=True)
-class HologramOrder:
-    """A hologram of one picture, as the panel's fields have it.
+def plane_of(text: str) -> tuple[Path, float]:
+    """Return a picture in another plane and its depth in mm, from ``FILE @ DEPTH mm``.
 
-    Attributes
-    ----------
-    picture : Path
-    out : Path
-    z_mm : float
-        Depth behind the focal plane.
-    alignment : Path or None
-        From ``align mask``.
-    further : tuple of (Path, float)
-        Pictures in other planes, each with its depth in mm behind the focal plane.
-    options : HologramOptions
+    Raises
+    ------
+    BenchError
+        When it is not understood, or there is no such file.
     """
+    name, at, depth = text.rpartition("@")
+    bare = depth.strip().removesuffix("mm").strip()
+    if not at or not bare:
+        raise BenchError(f"{text!r}: write FILE @ DEPTH mm, e.g. far.png @ 40 mm.")
+    try:
+        z_mm = float(bare.replace(",", "."))
+    except ValueError:
+        raise BenchError(f"The depth {bare!r} is no number of mm.") from None
+    if not math.isfinite(z_mm):
+        raise BenchError(f"The depth must be a finite number of mm, not {bare}.")
+    return existing_path(name.strip()), z_mm
 
-    picture: Path
-    out: Path
-    z_mm: float = 0.0
-    alignment: Path | None = None
-    further: tuple[tuple[Path, float], ...] = ()
+
+def pattern_png(text: str) -> Path:
+    """Return the name of a pattern; ValueError where it is none."""
+    path = Path(text).expanduser()
+    if path.suffix.lower() != ".png":
+        raise ValueError("the pattern needs a name that ends in .png.")
+    return path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HologramOrder:
+    """A hologram of one picture: the files, the planes, and how it is computed."""
+
+    picture: Path = option(help="The picture to show.", group="Picture")
+    z_mm: float = option(0.0, help="Behind the focal plane.", unit="mm", label="Depth", group="Picture")
+    further: tuple[tuple[Path, float], ...] = option(
+        (),
+        help="Pictures in other planes, each with its depth; several are separated by semicolons.",
+        default_words="none (FILE @ 40 mm; …)",
+        metavar="FILE @ DEPTH mm",
+        parse=plane_of,
+        label="Further planes",
+        group="Picture",
+    )
+    alignment: Path | None = option(
+        None,
+        help="Of the mask, from align mask: alignment.json.",
+        default_words="not aligned",
+        group="Display",
+    )
+    out: Path = option(
+        help="8-bit phase, 256 levels a turn; .json and a preview go beside it.",
+        parse=pattern_png,
+        label="Pattern",
+        group="Result",
+    )
     options: HologramOptions = field(default_factory=HologramOptions)
 
     def display(self, config: BenchConfig, size: tuple[tuple[int, int], float]) -> Display:
@@ -169,7 +211,7 @@ def photograph(
     pattern = computed.order.out
     if make_folder:
         pattern.parent.mkdir(parents=True, exist_ok=True)
-    out = free_name(pattern.parent, f"{pattern.stem}-seen", ".png")
+    out = free_result(pattern.parent, f"{pattern.stem}-seen", ".png")
     check_writable(out)  # before the bench is touched
     control = RunControl()
 
@@ -191,7 +233,7 @@ def photograph(
                 list(computed.result.hologram.slm),
                 computed.display,
                 computed.target,
-                average=average,
+                CaptureOptions(average=average),
             )
             bench.safe_state()
     except EndedEarlyError as error:
@@ -224,34 +266,38 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
 
     ``weights`` is the expression that makes the weights; None where there are none.
     """
-    options = expression(replace(order.options, weights=None))
+    imports = Imports(
+        {
+            ("instrument.bench.config_file", "load_config"),
+            ("instrument.bench.display_setup", "bench_display"),
+            ("instrument.bench.display_setup", "slm_size"),
+            ("instrument.display.hologram_file", "HologramFiles"),
+            ("instrument.display.hologram_job", "compute_and_judge"),
+            ("instrument.display.hologram_job", "prepare_target"),
+            ("instrument.files.images", "read_image"),
+        }
+    )
+    options = expression(replace(order.options, weights=None), imports)
     if weights is not None:
+        imports.names |= {("dataclasses", "replace"), ("recon.holography", weights.partition("(")[0])}
         options = f"replace({options}, weights={weights})"
-    imports = [
-        "from instrument.bench.config_file import load_config",
-        "from instrument.bench.display_setup import bench_display, slm_size",
-        "from instrument.display.hologram_file import HologramFiles",
-        "from instrument.display.hologram_job import compute_and_judge, prepare_target",
-        "from instrument.files.images import read_image",
-        "from recon.holography import HologramOptions, foveal_weights, painted_weights",
-    ]
     lines = [
-        f"config = load_config({'None' if config.path is None else expression(config.path)})",
+        f"config = load_config({'None' if config.path is None else expression(config.path, imports)})",
         f"options = {options}",
         "display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))",
     ]
     if order.alignment is not None:
-        imports.append("from instrument.files.alignment_file import load_alignment")
-        lines.append(f"display = load_alignment({expression(order.alignment)}).of(display)")
+        imports.names.add(("instrument.files.alignment_file", "load_alignment"))
+        lines.append(f"display = load_alignment({expression(order.alignment, imports)}).of(display)")
     lines += [
-        f"planes = {expression([(order.picture, order.z_mm), *order.further])}",
+        f"planes = {expression([(order.picture, order.z_mm), *order.further], imports)}",
         "targets = [",
         "    prepare_target(read_image(picture).pixels, display, options, z_mm=z_mm)",
         "    for picture, z_mm in planes",
         "]",
         "result = compute_and_judge(display, targets, options)",
-        f"files = HologramFiles({expression(order.out)}, config.display.slm_binning, options, [display])",
+        f"out = {expression(order.out, imports)}",
+        "files = HologramFiles(out, config.display.slm_binning, options, [display])",
         "files.write(0, 0, result)",
     ]
-    head = ["from dataclasses import replace", "from pathlib import Path", "", *sorted(imports), ""]
-    return "\n".join([*head, *lines, ""])
+    return "\n".join([*imports.lines(), "", *lines, ""])

@@ -10,11 +10,9 @@ from typing import Any, ClassVar
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import (
     QComboBox,
-    QFrame,
     QLabel,
     QPlainTextEdit,
     QPushButton,
-    QScrollArea,
     QSplitter,
     QStackedWidget,
     QVBoxLayout,
@@ -22,12 +20,11 @@ from PySide6.QtWidgets import (
 )
 
 from calibration_routines.procedure import Outcome, Outlook, Procedure
-from gui.forms.as_python import script
-from gui.forms.field import Form
-from gui.forms.options_form import OptionsForm
+from gui.forms.options_form import OptionsForm, scrolled
+from gui.forms.routines import Form
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun, Situation
+from gui.procedure_run import Ended, ProcedureRun, Situation, script
 from gui.session import BenchSession
 from gui.widgets.run_bar import RunBar
 from instrument.bench.bench import Bench
@@ -73,12 +70,7 @@ class ProcedurePanel(Panel):
         for form in self.forms:
             self.choice.addItem(form.title)
             self.choice.setItemData(self.choice.count() - 1, form.tip, Qt.ItemDataRole.ToolTipRole)
-            scroll = QScrollArea()
-            scroll.setWidgetResizable(True)
-            scroll.setFrameShape(QFrame.Shape.NoFrame)
-            scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-            scroll.setWidget(self.views[form.name])
-            self.stack.addWidget(scroll)
+            self.stack.addWidget(scrolled(self.views[form.name]))
             self.views[form.name].changed.connect(self._typed)
         self.about = QLabel()
         self.about.setObjectName("dim")

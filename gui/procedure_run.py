@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PySide6.QtCore import QObject, QTimer, Signal
 
-from calibration_routines.display.spot_camera import SpotLook
+from calibration_routines.display.display_io import SpotLook
 from calibration_routines.errors import RunEndedError
 from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
 from calibration_routines.psf.exposure import SweepExposures
@@ -19,8 +19,11 @@ from calibration_routines.psf.sweep_watch import SweepEvent
 from gui.jobs import Job, JobContext
 from gui.session import BenchSession
 from instrument.bench.photograph import Snapshot
+from instrument.plan import Plan
+from instrument.plan.file import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
+from recon.base.declare import Imports, expression
 
 _LOOK_MS = 100
 
@@ -277,3 +280,34 @@ class ProcedureRun(QObject):
         self._timer.stop()
         self._job = None
         self.over.emit()
+
+
+def script(procedure: Procedure, bench: Path | None) -> str:
+    """Return lines that open the bench, say what the procedure will do, and carry it out.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        A dataclass.
+    bench : Path, optional
+        Its bench.toml; None: the built-in simulated bench.
+    """
+    imports = Imports({("instrument.bench.bench", "open_bench")})
+    made = expression(procedure, imports, special={Plan: _plan_lines})
+    opened = f"open_bench({str(bench)!r})" if bench is not None else "open_bench()"
+    lines = [
+        *imports.lines(),
+        "",
+        f"procedure = {made}",
+        f"with {opened} as bench:",
+        "    print(*procedure.outlook(bench).reasons, sep='\\n')",
+        "    done = procedure.carry_out(bench)",
+        "print(*done.verdict, sep='\\n')",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _plan_lines(plan: Plan, imports: Imports) -> str:
+    imports.names.add(("instrument.plan", "Plan"))
+    imports.modules.add("tomllib")
+    return f"Plan.checked(tomllib.loads({plan_toml(plan)!r}))"

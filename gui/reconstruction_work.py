@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gui.jobs import JobCancelledError, JobContext
-from gui.python_lines import expression
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from instrument.reconstruction.volume_file import write_volume
+from recon.base.declare import Imports, expression
 from recon.solvers.stopping import IterationRecord
 
 _INTERVAL_S = 0.5
@@ -119,33 +119,24 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
 
 def lines_of(work: ReconstructionWork) -> str:
     """Return the Python that does a reconstruction."""
-    request, settings = work.request, work.request.settings
-    volume = isinstance(request, VolumeRequest)
-    imports = {f"from instrument.reconstruction.request import {type(request).__name__}, Settings"}
-    if volume:
-        imports.add("from instrument.reconstruction.volume_file import write_volume")
-        imports.add("from instrument.reconstruction.result_file import Outputs")
-    else:
-        imports.add("from instrument.reconstruction.result_file import Outputs, write_reconstruction")
-    if settings.crop is not None:
-        imports.add("from instrument.reconstruction.preparation import Crop")
-    if type(settings.noise).__name__ == "NoiseModel":
-        imports.add("from recon.base.noise import NoiseModel")
-    if settings.wishes is not None:
-        imports.add("from recon.reconstruction.overrides import Wishes")
-    named = f"Outputs.named({expression(work.outputs.image)}{', volume=True' if volume else ''})"
-    lines = [f"request = {expression(request)}", "job = request.prepare()"]
+    volume = isinstance(work.request, VolumeRequest)
+    write = "write_volume" if volume else "write_reconstruction"
+    imports = Imports({("instrument.reconstruction.result_file", "Outputs")})
+    imports.names.add((f"instrument.reconstruction.{'volume_file' if volume else 'result_file'}", write))
+    lines = [f"request = {expression(work.request, imports)}", "job = request.prepare()"]
     settled: list[str] = []
     if work.kept_in is None:
         lines.append("result = request.solve(job)")
     else:
-        imports.add("from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint")
+        kept = "instrument.reconstruction.kept_request"
+        imports.names |= {(kept, "checkpoint_for"), (kept, "settle_checkpoint")}
         reasons = "result.stop_reasons" if volume else "[result.stop_reason]"
         lines += [
-            f"keeper = checkpoint_for({expression(work.kept_in)}, job, request)",
+            f"keeper = checkpoint_for({expression(work.kept_in, imports)}, job, request)",
             "result = request.solve(job, keeper=keeper)",
         ]
         settled.append(f"settle_checkpoint(keeper, {reasons})")
+    named = f"Outputs.named({expression(work.outputs.image, imports)}{', volume=True' if volume else ''})"
     turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
-    lines.append(f"{'write_volume' if volume else 'write_reconstruction'}({named}, result, job{turned})")
-    return "\n".join(["from pathlib import Path", "", *sorted(imports), "", *lines, *settled, ""])
+    lines.append(f"{write}({named}, result, job{turned})")
+    return "\n".join([*imports.lines(), "", *lines, *settled, ""])

@@ -24,7 +24,7 @@ from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.live.live_camera import LiveCamera
-from instrument.runs.snapshot import Light, switch_light
+from instrument.runs.snapshot import LightState, switch_light
 
 Level = Literal["debug", "info", "warning", "error"]
 
@@ -224,7 +224,7 @@ class BenchSession(QObject):
 
         return self.jobs.device(title, on_camera, {"camera"})
 
-    def switch_light(self, light: Light, *, quiet: bool = False) -> Job:
+    def switch_light(self, light: LightState, *, quiet: bool = False) -> Job:
         """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         return self.jobs.device(
             f"Light: {light}",

@@ -27,7 +27,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.files.interrupt import CtrlC
+from instrument.runs.finish import CtrlC
 from instrument.runs.runner import Progress
 from recon import Reconstruction, reconstruct
 

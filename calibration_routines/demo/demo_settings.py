@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.psf.axial_plan import AxialSweep
+from calibration_routines.psf.sweep_options import AxialSweep
+from recon.base.declare import option
 from recon.optics.scene import Scene
 from recon.optics.scenes import picture
 
@@ -17,44 +19,45 @@ PICTURE = Path(__file__).with_name("demo_picture.jpg")
 """A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
 
 
-@dataclass(frozen=True, slots=True)
+_HIDDEN: dict[str, Any] = {"flags": ("",)}  # not offered: the demo is the same for everybody
+
+
+@dataclass(frozen=True)
 class DemoSettings:
-    """The demo's settings; everything that could flatter the result is here, in the open.
+    """The demo's settings; everything that could flatter the result is here, in the open."""
 
-    Attributes
-    ----------
-    preset : str
-        The simulated optics: ``"pco"`` is the dissertation's prototype (Kuo 2020, Sec. 4.3).
-    camera_binning, binning : int
-        In the camera (2 as in Sec. 4.3) and of PSFs and photograph in software: to the optical resolution.
-    z_mm : (float, float)
-        Nearest and farthest plane of the sweep.
-    planes : int
-    scene_plane : int
-        The plane, counted from the nearest, in which the scene stands.
-    half_field_deg : float
-        Half the angle under which the picture's width is seen.
-    average : int
-        Frames averaged, for PSFs and for the photograph.
-    reconstruction_s : float
-        Time budget of the reconstruction.
-    time_scale : float
-        Real seconds per simulated second of motion and exposure.
-    seed : int
-        Of the diffuser, the sensor and all noise.
-    """
-
-    preset: str = "pco"
-    camera_binning: int = 2
-    binning: int = 2
-    z_mm: tuple[float, float] = (100.0, 500.0)
-    planes: int = 7
-    scene_plane: int = 5
-    half_field_deg: float = 18.0
-    average: int = 4
-    reconstruction_s: float = 12.0
-    time_scale: float = 1.0
-    seed: int = 0
+    preset: str = option(
+        "pco",
+        help="The simulated optics; pco: the dissertation's prototype (Kuo 2020, Sec. 4.3).",
+        **_HIDDEN,
+    )
+    camera_binning: int = option(2, least=1, help="In the camera, 2 as in Kuo 2020, Sec. 4.3.", **_HIDDEN)
+    binning: int = option(
+        2, least=1, help="Of PSFs and photograph in software: to the optical resolution.", **_HIDDEN
+    )
+    z_mm: tuple[float, float] = option(
+        (100.0, 500.0), unit="mm", help="Nearest and farthest plane of the sweep.", **_HIDDEN
+    )
+    planes: int = option(7, least=1, help="Planes of the sweep.", **_HIDDEN)
+    scene_plane: int = option(
+        5, least=0, help="The plane, counted from the nearest, in which the scene stands.", **_HIDDEN
+    )
+    half_field_deg: float = option(
+        18.0, unit="deg", help="Half the angle under which the picture's width is seen.", **_HIDDEN
+    )
+    average: int = option(4, least=1, help="Frames averaged, for PSFs and for the photograph.", **_HIDDEN)
+    reconstruction_s: float = option(
+        12.0,
+        unit="s",
+        least=0.1,
+        flags=("--reconstruction-s",),
+        metavar="S",
+        help="Time for the reconstruction.",
+    )
+    time_scale: float = option(
+        1.0, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
+    )
+    seed: int = option(0, least=0, help="Of the simulated diffuser, sensor and noise.")
 
     @property
     def sweep(self) -> AxialSweep:

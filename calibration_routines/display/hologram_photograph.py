@@ -13,19 +13,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench
+from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
 from instrument.bench.display_setup import bench_display
 from instrument.files.alignment_file import Alignment
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
+from recon.base.declare import option
 from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
-from recon.holography.camera_map import CameraMap, register_camera
+from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
 from recon.holography.lowpass import make_band
 from recon.holography.options import Envelope
 
 Array = npt.NDArray[Any]
+_GAIN = 0.8  # part of what a photograph lacked that is asked for beyond
+_ITERATIONS = 15  # between two photographs
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,104 +52,6 @@ class Capture:
     saturated_fraction: float
 
 
-def capture_hologram(
-    io: DisplayBench,
-    fields: Sequence[Array],
-    display: Display,
-    target: Target,
-    camera: CameraMap,
-    *,
-    mean_per_ms: float,
-    average: int = 1,
-) -> Capture:
-    """Show SLM fields one after the other, add their photographs, and compare with the target.
-
-    Parameters
-    ----------
-    io : DisplayBench
-    fields : sequence of ndarray, complex, (height, width)
-        Time-multiplexed frames.
-    display : Display
-    target : Target
-    camera : CameraMap
-    mean_per_ms : float
-        Counts a millisecond of the mean intensity, from the registration.
-    average : int
-        Photographs of each frame.
-    """
-    full = (1 << io.bench.camera.significant_bits) - 1
-    exposure_ms = full / (12 * mean_per_ms)
-    total = np.zeros(io.bench.camera.image_shape)
-    for field in fields:
-        io.show(field)
-        for _ in range(average):
-            total += io.photograph(exposure_ms)
-    ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
-    shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
-    picture = np.fft.ifftshift(camera.resample(total, shape))
-    seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
-    wanted, peak = wanted_picture(target, display)
-    scaled = seen * (wanted.mean() / seen.mean())
-    return Capture(
-        scaled / peak, wanted / peak, compare(scaled, wanted, peak), float((total >= ceiling).mean())
-    )
-
-
-def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
-    """Return the low-passed target on the smallest grid that holds it, and its peak."""
-    band = make_band(display.slm_shape, display.factor, "alias-free")
-    spectrum, peak = target.spectrum(display, band)
-    height, width = band.seen_shape
-    half = np.zeros((height, width // 2 + 1), complex)
-    rows = np.r_[0 : band.top, height - (band.kept[0] - band.top) : height]
-    half[rows, : band.kept[1]] = spectrum
-    image = np.fft.irfft2(half, (height, width)) * (height * width)
-    return np.fft.fftshift(low_pass(image, display.slm_shape)), peak
-
-
-def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
-    """Blank the SLM, register the camera by the mask's speckle, and learn how bright the mean intensity is.
-
-    Returns
-    -------
-    CameraMap
-    float
-        Counts a millisecond of the mean intensity.
-
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
-    """
-    camera = io.bench.camera
-    pitch_um = camera.pixel_pitch_um * camera.binning
-    across = display.wavelength_nm * display.focal_mm / display.mask_pitch_um / pitch_um
-    io.show(np.ones(display.slm_shape, complex))
-    frame = io.photograph(camera.exposure_ms)
-    found = register_camera(frame, display, across)
-    return found, _inner_mean(frame, found)
-
-
-def random_brightness(io: DisplayBench, display: Display, camera: CameraMap, mean_per_ms: float) -> float:
-    """Return counts a millisecond of the mean intensity of random phases.
-
-    A blank SLM adds up with light that is not modulated, so that its picture is brighter or darker than that
-    of any hologram; ``mean_per_ms``, from :func:`find_camera`, only sets the exposure.
-    """
-    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, display.slm_shape)
-    io.show(np.exp(1j * phases))
-    full = (1 << io.bench.camera.significant_bits) - 1
-    return _inner_mean(io.photograph(full / (12 * mean_per_ms)), camera)
-
-
-def _inner_mean(frame: Array, camera: CameraMap) -> float:
-    """Return the mean over the inner field of view, the mask pixels' envelope divided out."""
-    rows, columns = camera.pixels(np.array([-0.3, 0.3]), np.array([-0.3, 0.3]))
-    inner = frame[round(rows[0]) : round(rows[1]), round(columns[0]) : round(columns[1])]
-    envelope = (np.sinc(np.linspace(-0.3, 0.3, 101)) ** 2).mean() ** 2
-    return float(inner.mean() / envelope)
-
-
 @dataclass(frozen=True, slots=True)
 class Refinement:
     """The best hologram found.
@@ -166,73 +71,127 @@ class Refinement:
     psnr_db: tuple[float, ...]
 
 
-def refine_hologram(
-    io: DisplayBench,
-    slm: Array,
-    display: Display,
-    target: Target,
-    camera: CameraMap,
-    *,
-    mean_per_ms: float,
-    rounds: int = 4,
-    iterations: int = 15,
-    average: int = 4,
-    gain: float = 0.8,
-    progress: Callable[[int, float], object] | None = None,
-) -> Refinement:
-    """Photograph, let the model aim as far beyond as the picture falls short, compute again, photograph.
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How a hologram is photographed."""
 
-    The model is wrong, but it knows well which change of the pattern changes the picture how. So it is asked
-    for what it showed last plus what the photograph lacked. The best pattern by photograph is kept: the
-    result is the given one where nothing helps (its photograph decides, with the camera's noise averaged).
+    average: int = option(
+        4, least=1, help="Photographs a frame.", applies=("hologram",), group="Photographed, with --capture"
+    )
+    refine: int = option(
+        0,
+        least=0,
+        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
+        applies=("hologram",),
+        group="Photographed, with --capture",
+    )
 
-    Parameters
+
+@dataclass(frozen=True, slots=True)
+class HologramCamera:
+    """The bench's camera on a display whose picture is known where it lies on the sensor.
+
+    Attributes
     ----------
     io : DisplayBench
-    slm : ndarray, complex, (1, height, width)
-        Start, from :func:`recon.holography.compute_hologram`.
     display : Display
-        As the hologram was computed for, displacement included.
-    target : Target
+        With the mask's displacement where it is known.
     camera : CameraMap
     mean_per_ms : float
-    rounds, iterations : int
-        Photographs after the first, and iterations between them.
-    average : int
-        Photographs averaged in each round.
-    gain : float
-        Part of the shortfall that is added.
-    progress : callable, optional
-        ``progress(round, psnr_db)``.
+        Counts a millisecond of the mean intensity, from the registration.
     """
-    best_slm = now = np.asarray(slm, np.complex64)
-    first = _capture(io, now, display, target, camera, mean_per_ms, average)
-    best, measured, history = first, first, [first.scores.psnr_db]
-    plain = HologramModel(display, [target])
-    for number in range(1, rounds + 1):
-        shown = plain.seen(now) / plain.peaks[0]
-        aim = np.maximum(shown + gain * (measured.wanted - measured.seen), 0)
-        model = HologramModel(display, [replace(target, image=aim, white=1.0)])
-        now = compute_hologram(model, initial=now, iterations=iterations, tolerance=0).slm
-        measured = _capture(io, now, display, target, camera, mean_per_ms, average)
-        history.append(measured.scores.psnr_db)
-        if progress is not None:
-            progress(number, measured.scores.psnr_db)
-        if measured.scores.psnr_db > best.scores.psnr_db:
-            best, best_slm = measured, now
-    return Refinement(best_slm, first, best, tuple(history))
+
+    io: DisplayBench
+    display: Display
+    camera: CameraMap
+    mean_per_ms: float
+
+    @classmethod
+    def registered(cls, io: DisplayBench, display: Display) -> HologramCamera:
+        """Register the camera (:func:`find_camera`)."""
+        return cls(io, display, *find_camera(io, display))
+
+    def capture(self, fields: Sequence[Array], target: Target, *, average: int = 1) -> Capture:
+        """Show SLM fields one after the other, add their photographs, and compare with the target.
+
+        Parameters
+        ----------
+        fields : sequence of ndarray, complex, (height, width)
+            Time-multiplexed frames.
+        target : Target
+        average : int
+            Photographs of each frame.
+        """
+        io, display = self.io, self.display
+        full = (1 << io.bench.camera.significant_bits) - 1
+        exposure_ms = full / (12 * self.mean_per_ms)
+        total = np.zeros(io.bench.camera.image_shape)
+        for field in fields:
+            io.show(field)
+            for _ in range(average):
+                total += io.photograph(exposure_ms)
+        ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
+        shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
+        picture = np.fft.ifftshift(self.camera.resample(total, shape))
+        seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
+        wanted, peak = wanted_picture(target, display)
+        scaled = seen * (wanted.mean() / seen.mean())
+        return Capture(
+            scaled / peak, wanted / peak, compare(scaled, wanted, peak), float((total >= ceiling).mean())
+        )
+
+    def refine(
+        self,
+        slm: Array,
+        target: Target,
+        options: CaptureOptions,
+        progress: Callable[[int, float], object] | None = None,
+    ) -> Refinement:
+        """Photograph, let the model aim as far beyond as the picture falls short, compute again, photograph.
+
+        The model is wrong, but it knows well which change of the pattern changes the picture how. So it is
+        asked for what it showed last plus what the photograph lacked. The best pattern by photograph is kept:
+        the result is the given one where nothing helps (its photograph decides, with the camera's noise
+        averaged).
+
+        Parameters
+        ----------
+        slm : ndarray, complex, (1, height, width)
+            Start, from :func:`recon.holography.compute_hologram` for this display.
+        target : Target
+        options : CaptureOptions
+            Rounds, and photographs averaged in each.
+        progress : callable, optional
+            ``progress(round, psnr_db)``.
+        """
+        best_slm = now = np.asarray(slm, np.complex64)
+        first = self.capture(list(now), target, average=options.average)
+        best, measured, history = first, first, [first.scores.psnr_db]
+        plain = HologramModel(self.display, [target])
+        for number in range(1, options.refine + 1):
+            shown = plain.seen(now) / plain.peaks[0]
+            aim = np.maximum(shown + _GAIN * (measured.wanted - measured.seen), 0)
+            model = HologramModel(self.display, [replace(target, image=aim, white=1.0)])
+            now = compute_hologram(model, initial=now, iterations=_ITERATIONS, tolerance=0).slm
+            measured = self.capture(list(now), target, average=options.average)
+            history.append(measured.scores.psnr_db)
+            if progress is not None:
+                progress(number, measured.scores.psnr_db)
+            if measured.scores.psnr_db > best.scores.psnr_db:
+                best, best_slm = measured, now
+        return Refinement(best_slm, first, best, tuple(history))
 
 
-def _capture(
-    io: DisplayBench,
-    slm: Array,
-    display: Display,
-    target: Target,
-    camera: CameraMap,
-    mean: float,
-    average: int,
-) -> Capture:
-    return capture_hologram(io, list(slm), display, target, camera, mean_per_ms=mean, average=average)
+def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the low-passed target on the smallest grid that holds it, and its peak."""
+    band = make_band(display.slm_shape, display.factor, "alias-free")
+    spectrum, peak = target.spectrum(display, band)
+    height, width = band.seen_shape
+    half = np.zeros((height, width // 2 + 1), complex)
+    rows = np.r_[0 : band.top, height - (band.kept[0] - band.top) : height]
+    half[rows, : band.kept[1]] = spectrum
+    image = np.fft.irfft2(half, (height, width)) * (height * width)
+    return np.fft.fftshift(low_pass(image, display.slm_shape)), peak
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,9 +242,7 @@ def photograph_hologram(
     fields: Sequence[Array],
     display: Display,
     target: Target,
-    *,
-    average: int = 4,
-    refine: int = 0,
+    options: CaptureOptions | None = None,
     progress: Callable[[int, float], object] | None = None,
 ) -> Photographed:
     """Register the camera by the mask's speckle, photograph a hologram, and compare it with its target.
@@ -298,10 +255,7 @@ def photograph_hologram(
     display : Display
         With the mask's displacement where it is known.
     target : Target
-    average : int
-        Photographs of each frame.
-    refine : int
-        Rounds with the camera in the loop.
+    options : CaptureOptions, optional
     progress : callable, optional
         ``progress(round, psnr_db)``.
 
@@ -312,27 +266,16 @@ def photograph_hologram(
     DeviceError
         When a device fails.
     """
-    camera, mean_per_ms = find_camera(io, display)
+    options = options or CaptureOptions()
+    seen = HologramCamera.registered(io, display)
     refined = None
-    if refine:
-        refined = refine_hologram(
-            io,
-            np.asarray(fields[0])[None],
-            display,
-            target,
-            camera,
-            mean_per_ms=mean_per_ms,
-            rounds=refine,
-            average=average,
-            progress=progress,
-        )
+    if options.refine:
+        refined = seen.refine(np.asarray(fields[0])[None], target, options, progress)
         capture = refined.best
     else:
-        capture = capture_hologram(
-            io, fields, display, target, camera, mean_per_ms=mean_per_ms, average=average
-        )
+        capture = seen.capture(fields, target, average=options.average)
     return Photographed(
-        capture, refined, camera.residual_px, io.estimates_background, bool(io.bench.simulated_kinds)
+        capture, refined, seen.camera.residual_px, io.estimates_background, bool(io.bench.simulated_kinds)
     )
 
 

@@ -18,22 +18,39 @@ nothing moves at first: each picture holds many spots, each computed for another
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.alignment_session import (
+from calibration_routines.display.display_io import (
+    DisplayBench,
+    SpotLook,
+    approach_from_below,
+    refuse_existing,
+    require_slm,
+    writable,
+)
+from calibration_routines.display.mask_search import (
+    ALIGNMENT_FILE,
     AlignmentFailedError,
     AlignmentSession,
     AlignmentSettings,
+    Measured,
     Progress,
+    measure_sections,
+    refine_pose,
+    search_pose,
 )
-from calibration_routines.display.display_io import DisplayBench, approach_from_below
-from calibration_routines.display.mask_search import Measured, measure_sections, refine_pose, search_pose
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
-from calibration_routines.display.spot_camera import SpotLook
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, home_if_needed, under_control
+from instrument.bench.bench import Bench
+from instrument.bench.display_setup import bench_display
+from instrument.files.alignment_file import Alignment, save_alignment
+from instrument.files.slm_image import load_slm_correction
+from instrument.runs.run_control import RunControl
 from recon.errors import InputError
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap
@@ -230,3 +247,160 @@ def _place(
     plain = pose.with_(cubic=0.0)
     rest = smooth.rest + pose.displacement(mask_shape) - plain.displacement(mask_shape)
     return plain.plus(smooth.change), rest
+
+
+# Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class AlignmentProcedure:
+    """Find the scattering mask by spots, move it to its place, keep what is left."""
+
+    settings: AlignmentSettings = field(default_factory=AlignmentSettings)
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
+        slm = require_slm(bench)
+        self._refuse_existing()
+        if self.settings.slm_calibration is not None:
+            load_slm_correction(self.settings.slm_calibration)
+        display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        moves = self.settings.moves
+        return Outlook(
+            (
+                f"Mask of {display.mask.shape[0]} x {display.mask.shape[1]} pixels, searched for within "
+                f"±{self.settings.reach:g} of its pixels and ±{self.settings.depth_um:g} µm",
+                f"{self.settings.max_frames} frames at most; "
+                + (f"the stage moves {moves} times at most" if moves and bench.stage else "nothing moves"),
+            )
+        )
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Align, and save the alignment with its picture."""
+        heard, slm, settings = listener or Listener(), require_slm(bench), self.settings
+        self._refuse_existing()
+        out = writable(bench, folder, self.settings.out, "alignment")
+        correction = (
+            load_slm_correction(self.settings.slm_calibration) if self.settings.slm_calibration else None
+        )
+        display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+        io = DisplayBench(bench, bench.config.display.slm_binning, correction)
+        with under_control(bench, control) as control:
+            if settings.moves:
+                home_if_needed(bench, heard)
+            heard.step("aligning the mask")
+
+            def tell(words: str, frames: int) -> None:
+                control.check()
+                heard.said(words)
+                heard.share(frames, settings.max_frames, at_most=True)
+
+            report = MaskAlignment(io, display, settings, progress=tell, on_look=heard.look).run()
+            alignment = _alignment(report, bench, display.mask.shape)
+            bench.safe_state()
+        figure = out.with_suffix(".png")
+        save_alignment(out, alignment, _facts(report, bench))
+        from instrument.display.figures import (
+            write_alignment_figure,  # matplotlib, only where it is drawn
+        )
+
+        write_alignment_figure(
+            figure,
+            report.pose.displacement(display.mask.shape),
+            report.rest,
+            display.mask.shape,
+            report.efficiencies,
+            "Mask alignment",
+            simulated=alignment.simulated,
+        )
+        return Outcome(
+            verdict=tuple(alignment_lines(report, simulated=alignment.simulated)),
+            good=True,
+            calibration=out,
+            files=(figure,),
+            result=report,
+        )
+
+    def _refuse_existing(self) -> None:
+        if self.settings.out is not None:
+            refuse_existing(self.settings.out, overwrite=self.settings.overwrite)
+            refuse_existing(self.settings.out.with_suffix(".png"), overwrite=self.settings.overwrite)
+
+
+def alignment_lines(report: AlignmentReport, *, simulated: bool) -> list[str]:
+    """Return what was found and what it costs, in lines."""
+    mark = " (SIMULATED)" if simulated else ""
+    spots = f"spots at {100 * report.efficiency:.0f} % of the ideal"
+    lines = [f"Aligned with {report.frames} frames{mark}: {spots}"]
+    for name, value, error in zip(NAMES, report.pose.vector(), report.error, strict=True):
+        if name != "cubic":  # part of the smooth rest
+            lines.append(f"  {name:<12}{value:+10.4f} +- {error:.4f}")
+    size = np.hypot(report.rest[..., 0], report.rest[..., 1])
+    lines.append(f"  smooth rest {np.sqrt(np.mean(size**2)):.2f} mask pixels rms, {size.max():.2f} at most")
+    lines.append(
+        f"  what remains costs a hologram about {report.psnr_lost_db:.2f} dB"
+        + (
+            ""
+            if np.isnan(report.repeatability_db)
+            else f"; stage repeatable to {report.repeatability_db:.2f} dB"
+        )
+    )
+    reversed_axes = [name for name, direction in report.directions.items() if direction < 0]
+    if reversed_axes:
+        lines.append(f"  these axes go against their names: {', '.join(reversed_axes)}")
+    return lines
+
+
+def _alignment(report: AlignmentReport, bench: Bench, mask_shape: tuple[int, int]) -> Alignment:
+    return Alignment(
+        report.pose,
+        dict(zip(NAMES, map(float, report.error), strict=True)),
+        report.rest,
+        report.efficiency,
+        bench.stage.commanded_position() if bench.stage else {},
+        mask_shape,
+        bool(bench.simulated_kinds),
+    )
+
+
+def _facts(report: AlignmentReport, bench: Bench) -> dict[str, Any]:
+    return {
+        "bench": bench.label,
+        "frames": report.frames,
+        "found_at": asdict(report.found_at),
+        "psnr_lost_db": report.psnr_lost_db,
+        "repeatability_db": None if np.isnan(report.repeatability_db) else report.repeatability_db,
+        "axis_directions": report.directions,
+        "camera_residual_px": report.camera.residual_px,
+        "log": report.log,
+    }
+
+
+ROUTINES = (
+    Routine(
+        name="mask",
+        title="Mask alignment",
+        help="Find the mask's pose by spots on the camera, move the stage, and store what is left as an "
+        "alignment.",
+        details="The camera must see the whole field of view. The search moves nothing. Then a small move "
+        "and back tells which way the stage's axes go and how well it comes back (it is homed "
+        "before); it takes out shift, distance, rotation and clear tilts until a move promises "
+        "less than that. What stays is measured section by section. Give the file to hologram "
+        "--alignment.",
+        options=AlignmentSettings,
+        procedure=AlignmentProcedure,
+        needs=("slm",),
+        examples=(
+            "diffuserbench align mask --bench display.toml",
+            "diffuserbench align mask --reach 30 --depth-um 300 --moves 0",
+        ),
+        file=ALIGNMENT_FILE,
+        command="align",
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -10,9 +10,13 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.alignment_session import AlignmentFailedError, AlignmentSession
 from calibration_routines.display.display_io import approach_from_below
-from calibration_routines.display.mask_search import Measured, refine_pose
+from calibration_routines.display.mask_search import (
+    AlignmentFailedError,
+    AlignmentSession,
+    Measured,
+    refine_pose,
+)
 from drivers.stage import Stage
 from instrument.files.sample_images import load_sample
 from recon.holography import Display, Target

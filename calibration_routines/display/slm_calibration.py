@@ -4,21 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench
-from calibration_routines.display.spot_camera import SpotCamera
-from instrument.files.errors import BenchError
-from instrument.files.slm_correction import SlmCorrection
+from calibration_routines.display.display_io import (
+    DisplayBench,
+    SpotCamera,
+    bring_mask,
+    refuse_existing,
+    require_slm,
+    writable,
+)
+from calibration_routines.options import problems_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
+from instrument.bench.bench import Bench
+from instrument.bench.display_setup import bench_display
+from instrument.files.alignment_file import load_alignment
+from instrument.files.errors import BenchError, SettingsError
+from instrument.files.slm_image import SlmCorrection
+from instrument.runs.run_control import RunControl
+from recon.base.declare import option
 from recon.holography import Display
 from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases_from_frames
 
 Array = npt.NDArray[Any]
 Progress = Callable[[str, int], object]
+SLM_FILE = "slm-calibration.json"
+"""Where the command line writes it."""
+_FLATNESS_FRAMES = 22
+"""Of a flatness measurement, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,3 +165,115 @@ def _exposure_ms(io: DisplayBench) -> float:
     if lit <= 0:
         raise BenchError(f"{camera.name}: it is dark. Check that the laser shines and the exposure.")
     return full / (12 * lit)
+
+
+# Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class SlmProcedure:
+    """Measure the SLM's phase against its grey levels and, with an alignment, its flatness."""
+
+    levels: int = option(33, least=8, most=256, label="Grey levels", help="Grey levels to measure.")
+    alignment: Path | None = option(
+        None,
+        metavar="FILE",
+        help="Of the mask, from align mask: flatness is measured too.",
+        default_words="none",
+    )
+    out: Path | None = option(
+        None,
+        flags=("--out", "-o"),
+        metavar="FILE",
+        label="File",
+        help="Where the calibration goes (.json).",
+        default_words=f"{SLM_FILE}; in the window dated, beside the runs",
+    )
+    overwrite: bool = option(False, flags=("--force",), help="Overwrite a file that exists.")
+
+    def __post_init__(self) -> None:
+        if problems := problems_of(self):
+            raise SettingsError(problems)
+
+    @property
+    def frames(self) -> int:
+        """Frames it takes at most."""
+        return self.levels + 2 + (_FLATNESS_FRAMES if self.alignment is not None else 0)
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
+        require_slm(bench)
+        refuse_existing(self.out, overwrite=self.overwrite)
+        if self.alignment is not None:
+            load_alignment(self.alignment)
+        return Outlook((f"{self.levels} grey levels, {self.frames} frames at most",))
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Measure, and save what ``align mask`` and ``show`` take."""
+        heard, slm = listener or Listener(), require_slm(bench)
+        refuse_existing(self.out, overwrite=self.overwrite)
+        out = writable(bench, folder, self.out, "slm calibration")
+        place = load_alignment(self.alignment) if self.alignment is not None else None
+        io = DisplayBench(bench, bench.config.display.slm_binning)
+        with under_control(bench, control) as control:
+            heard.step("measuring the look-up table")
+
+            def tell(_words: str, _n: int) -> None:
+                control.check()
+                heard.share(io.frames, self.frames)
+
+            found = measure_look_up_table(io, n_levels=self.levels, progress=tell)
+            if place is not None:
+                heard.step("measuring flatness")
+                bring_mask(bench, place.stage_position)
+                display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+                found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=tell)
+            bench.safe_state()
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
+        found.correction.save(out, facts)
+        return Outcome(
+            verdict=tuple(slm_lines(found, simulated=bool(bench.simulated_kinds))),
+            good=True,
+            files=(out,),
+            result=found,
+        )
+
+
+def slm_lines(found: SlmCalibration, *, simulated: bool) -> list[str]:
+    """Return what was found out about an SLM, in lines."""
+    ideal = np.arange(256) * (2 * np.pi / 256)
+    worst = float(np.abs(found.correction.phase_of_level_rad - ideal).max())
+    mark = " (SIMULATED)" if simulated else ""
+    lines = [
+        f"{found.frames} frames{mark}: {found.phases_rad[-1]:.3f} rad at level {found.levels[-1]},",
+        f"  up to {worst:.3f} rad from an ideal SLM's 256 levels a turn",
+    ]
+    if found.flatness_rms_rad is not None:
+        lines.append(f"  flatness error {found.flatness_rms_rad:.3f} rad rms")
+    return lines
+
+
+ROUTINES = (
+    Routine(
+        name="slm",
+        title="SLM look-up table",
+        help="Measure the SLM's phase against its grey levels, and with an alignment its flatness, by the "
+        "camera.",
+        details="Half of the pixels interfere with the other half; neither mask nor optics need to be "
+        "known for that. Give the file to align mask and show (--slm-calibration).",
+        options=SlmProcedure,
+        procedure=lambda options: options,
+        needs=("slm",),
+        examples=(
+            "diffuserbench calibrate slm --bench display.toml",
+            "diffuserbench calibrate slm --bench display.toml --alignment alignment.json",
+        ),
+        file=SLM_FILE,
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -9,111 +9,107 @@ solid angle seen from the side and the source's own directivity. What remains is
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
-from calibration_routines.errors import CalibrationError, RunEndedError
-from calibration_routines.optics.angular_response import AngularResponse, Curve, save_response
-from calibration_routines.psf.analysis import DarkModel, replace_hot
-from calibration_routines.psf.exposure import SweepExposures, expose_sweep
-from calibration_routines.psf.stage_fit import Drift, judge_drift
-from calibration_routines.psf.sweep_plan import (
-    DARK,
-    PSF,
-    REFERENCE,
-    PointSweep,
-    Position,
-    check_sweep,
-    sweep_plan,
+from calibration_routines.errors import CalibrationError, completed
+from calibration_routines.optics.angular_response import (
+    EMISSIONS,
+    AngularResponse,
+    Emission,
+    analyse_angular,
+    response_figure,
+    response_lines,
+    save_response,
 )
+from calibration_routines.options import MM, problems_of
+from calibration_routines.procedure import (
+    Listener,
+    Outcome,
+    Outlook,
+    Routine,
+    home_if_needed,
+    outlook_of,
+    under_control,
+)
+from calibration_routines.psf.analysis import DarkModel, dark_model, drift_of, light_of
+from calibration_routines.psf.exposure import SweepExposures, expose_sweep
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.stage_fit import Drift
+from calibration_routines.psf.sweep_options import PointSweep
+from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, sweep_plan
 from instrument.bench.bench import Bench
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, SettingsError
+from instrument.files.figures import save_figure
 from instrument.plan import Plan
 from instrument.runs.acquire import prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
-from recon.camera.registration import Registration, aligned, expected_shift, register
+from recon.base.declare import RARE, option
 
-Emission = Literal["pinhole", "bead"]
-_POWER: dict[Emission, float] = {"pinhole": 4.0, "bead": 3.0}
-"""Cosines in the light through the aperture: three of its solid angle, one of a flat source that faces it."""
-LEAST_SEEN = 0.08
-"""Part of the pattern's light that must still fall onto the sensor for an angle to be measured."""
 MOST_STEPS = 300
 """More angles to one side of an axis are a mistake."""
 RESPONSE_FILE = "angular_response.json"
 ANGULAR_FILE = "angular.json"
 """In the run's folder: what its frames are for."""
 _REACH_MARGIN = 0.98  # of the stage's travel
-_SMOOTH_PX, _SUPPORT = 6.0, 0.05  # the pattern is where its smoothed light is above this part of its maximum
-_NEAR_PX = 40.0  # about where the stage says, the pattern is looked for
-
-Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class AngularSweep:
-    """What is measured.
+    """What is measured."""
 
-    Attributes
-    ----------
-    z_um : float
-        Distance of the source's plane from the diffuser.
-    largest_deg, step_deg : float
-        Angles measured to both sides along x and y.
-    emission : {"pinhole", "bead"}
-        A flat source that faces the sensor, or one that glows alike in all directions.
-    average, dark_frames : int
-    """
-
-    z_um: float
-    largest_deg: float = 45.0
-    step_deg: float = 3.0
-    emission: Emission = "pinhole"
-    average: int = 4
-    dark_frames: int = 4
+    z_um: float | None = option(
+        None,
+        **MM,
+        flags=("--z",),
+        above=0,
+        label="Distance",
+        help="Distance of the source's plane from the diffuser.",
+        default_words="the farthest that spans the angles",
+    )
+    largest_deg: float = option(
+        45.0,
+        unit="deg",
+        above=0,
+        below=80,
+        flags=("--largest",),
+        label="Largest angle",
+        help="Largest angle, to both sides along x and y.",
+    )
+    step_deg: float = option(3.0, unit="deg", above=0, flags=("--step",), help="Between angles.")
+    emission: Emission = option(
+        "pinhole",
+        choices=EMISSIONS,
+        label="Source",
+        help="A flat pinhole that faces the sensor, or a fluorescent bead that glows alike everywhere.",
+    )
+    average: int = option(4, least=1, label="Frames a place", help="Frames a place, averaged.")
+    dark_frames: int = option(4, least=1, help="Dark frames, at two exposures each.", group=RARE)
 
     def __post_init__(self) -> None:
-        problems = []
-        if not 0 < self.z_um < np.inf:
+        problems = problems_of(self)
+        if not problems and self.step_deg > self.largest_deg:
+            words = f"0 < step <= largest angle, not {self.step_deg:g} and {self.largest_deg:g}"
+            problems.append(("step_deg", words))
+        elif not problems and self.largest_deg / self.step_deg > MOST_STEPS:
             words = (
-                f"the source stands in front of the diffuser, at a finite z > 0, not {self.z_um / 1e3:g} mm"
+                f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than {MOST_STEPS}: "
+                "choose larger steps"
             )
-            problems.append(("z_um", words))
-        if not 0 < self.step_deg <= self.largest_deg < 80:
-            problems.append(
-                (
-                    "step_deg" if 0 < self.largest_deg < 80 else "largest_deg",
-                    f"0 < step <= largest angle < 80 degrees, not {self.step_deg:g} and {self.largest_deg:g}",
-                )
-            )
-        elif self.largest_deg / self.step_deg > MOST_STEPS:
-            problems.append(
-                (
-                    "step_deg",
-                    f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than "
-                    f"{MOST_STEPS}: choose larger steps",
-                )
-            )
-        if self.emission not in _POWER:
-            problems.append(("emission", f"emission is pinhole or bead, not {self.emission!r}"))
-        problems += [
-            (name, f"{name} must be at least 1, not {getattr(self, name)}")
-            for name in ("average", "dark_frames")
-            if getattr(self, name) < 1
-        ]
+            problems.append(("step_deg", words))
         if problems:
             raise SettingsError(problems)
+
+    def planned(self, bench: Bench) -> AngularSweep:
+        """Return the sweep with its distance filled in."""
+        return self if self.z_um is not None else replace(self, z_um=farthest_um(bench, self.largest_deg))
 
     @property
     def angles_deg(self) -> tuple[float, ...]:
@@ -121,16 +117,28 @@ class AngularSweep:
         number = int(np.floor(self.largest_deg / self.step_deg + 1e-9))
         return tuple(self.step_deg * (k + 1) for k in range(number))
 
+    @property
+    def distance_um(self) -> float:
+        """The distance, which must have been given or filled in."""
+        if self.z_um is None:
+            raise SettingsError(
+                [("z_um", "the distance was left to the bench: take what planned(bench) returns")]
+            )
+        return self.z_um
+
     def points(self) -> PointSweep:
         """Return the places of the source: the axis, then outwards along x and along y."""
-        axis: Position = (0.0, 0.0, self.z_um)
+        z_um = self.distance_um
+        axis: Position = (0.0, 0.0, z_um)
         points = [axis]
         for along in (0, 1):
             for sign in (1.0, -1.0):
                 for angle in self.angles_deg:
-                    away = round(float(sign * self.z_um * np.tan(np.deg2rad(angle))), 3)
-                    points.append((away, 0.0, self.z_um) if along == 0 else (0.0, away, self.z_um))
-        return PointSweep(tuple(points), kind="angular", average=self.average, dark_frames=self.dark_frames)
+                    away = round(float(sign * z_um * np.tan(np.deg2rad(angle))), 3)
+                    points.append((away, 0.0, z_um) if along == 0 else (0.0, away, z_um))
+        return PointSweep(
+            points_um=tuple(points), kind="angular", average=self.average, dark_frames=self.dark_frames
+        )
 
 
 def farthest_um(bench: Bench, largest_deg: float) -> float:
@@ -164,7 +172,7 @@ def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None)
         When something else of the plan cannot be done.
     """
     reach, (low, high) = _reach(bench)
-    z_um = sweep.z_um
+    z_um = sweep.distance_um
     if not low <= z_um <= high:
         raise BenchError(
             f"The source at z = {z_um / 1e3:.4g} mm is outside the stage's limits {low / 1e3:.4g} to "
@@ -229,6 +237,7 @@ def measure_angular_response(
         When no exposure is usable, the run ended early, or too little can be seen.
     """
     where = Path(folder) if folder is not None else None
+    sweep = sweep.planned(bench)
     points = sweep.points()
     geometry = bench.geometry
     if geometry.diffuser_distance_mm is None or geometry.pixel_pitch_um is None:
@@ -261,11 +270,11 @@ def finish_angular(run: Run) -> tuple[AngularResponse, Path]:
         When the run is none of the angular response's, is not complete, or too little can be seen.
     """
     sweep, geometry, bench, simulated = _read_record(run.path)
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
+    completed(run)
     points = sweep.points()
-    drift = _drift(run, points)
-    images = _images(run, points, drift)
+    dark = dark_model(run)
+    drift = drift_of(run, points, dark)
+    images = _images(run, points, dark, drift)
     response = analyse_angular(
         images,
         points.points_um,
@@ -298,128 +307,12 @@ def _read_record(run: Path) -> tuple[AngularSweep, dict[str, float], str, bool]:
         ) from error
 
 
-def analyse_angular(
-    images: Sequence[npt.NDArray[np.float32]],
-    points_um: Sequence[Position],
-    *,
-    pitch_um: float,
-    distance_um: float,
-    emission: Emission = "pinhole",
-    findings: Sequence[str] = (),
-    bench: str = "",
-    simulated: bool = False,
-) -> AngularResponse:
-    """Compute the response from images of the source at places along x and y.
-
-    Parameters
-    ----------
-    images : sequence of ndarray, float32, (height, width)
-        Light at one common exposure, dark frame subtracted; the first with the source on the axis.
-    points_um : sequence of (x, y, z)
-    pitch_um, distance_um : float
-        Of the pixels; from diffuser to sensor.
-    emission : {"pinhole", "bead"}
-    findings, bench, simulated
-        Kept with the result.
-
-    Raises
-    ------
-    CalibrationError
-        When fewer than three angles along x or y could be measured.
-    """
-    axis_image = np.asarray(images[0], np.float64)
-    axis_bare = axis_image / _geometric(points_um[0], axis_image.shape, pitch_um, distance_um, emission)
-    measured: dict[str, list[tuple[float, float, float]]] = {"x": [], "y": []}
-    for image, point in zip(images[1:], points_um[1:], strict=True):
-        found = _compare(image, images[0], axis_bare, point, points_um[0], pitch_um, distance_um, emission)
-        if found is not None:
-            measured["x" if point[0] != points_um[0][0] else "y"].append(found)
-    curves = {}
-    for along, rows in measured.items():
-        if len(rows) < 3:
-            raise CalibrationError(
-                f"Only {len(rows)} angles along {along} could be measured: the pattern leaves the sensor. "
-                "Use smaller steps."
-            )
-        rows = sorted([*rows, (0.0, 1.0, 1.0)])
-        angles, values, seen = (tuple(column) for column in zip(*rows, strict=True))
-        curves[along] = Curve(angles, values, seen)
-    return AngularResponse(curves["x"], curves["y"], tuple(findings), bench, simulated)
-
-
-def _compare(
-    image: npt.NDArray[np.float32],
-    axis_image: npt.NDArray[np.float32],
-    axis_bare: Floats,
-    point: Position,
-    origin: Position,
-    pitch_um: float,
-    distance_um: float,
-    emission: Emission,
-) -> tuple[float, float, float] | None:
-    """Return ``(angle, response, seen)`` of one place, or None when too little of its pattern is seen."""
-    here, there = (expected_shift(p, distance_um, pitch_um) for p in (point, origin))
-    near = here[0] - there[0], here[1] - there[1]
-    if _part_seen(axis_bare, near) < LEAST_SEEN:
-        return None  # nothing but noise may be left, in which a pattern would be found by chance
-    found = register(image, axis_image, near=near, within_px=_NEAR_PX)
-    if not found.reliable:  # too little is seen to tell; the stage knows well enough for a sum over pixels
-        found = _by_stage(found, near)
-    expected = _displaced(axis_bare, (found.rows, found.columns))
-    seen = float(expected.sum(dtype=np.float64) / axis_bare.sum())
-    if seen < LEAST_SEEN:
-        return None
-    weight = expected * _geometric(point, image.shape, pitch_um, distance_um, emission)
-    smooth = ndimage.gaussian_filter(expected, _SMOOTH_PX)
-    support = smooth > _SUPPORT * float(ndimage.gaussian_filter(axis_bare, _SMOOTH_PX).max())
-    angle = _tangent(point, image.shape, pitch_um, distance_um)
-    mean = float((weight[support] * angle[support]).sum() / weight[support].sum())
-    ratio = float(image[support].sum(dtype=np.float64) / weight[support].sum(dtype=np.float64))
-    return float(np.rad2deg(np.arctan(mean))), ratio, seen
-
-
-def _geometric(
-    point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float, emission: Emission
-) -> Floats:
-    """Light from the source on each pixel without any response: a power of the ray's cosine."""
-    tangents = _tangents(point, shape, pitch_um, distance_um)
-    return np.asarray((1 + tangents[0] ** 2 + tangents[1] ** 2) ** (-0.5 * _POWER[emission]))
-
-
-def _tangent(point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float) -> Floats:
-    """Signed tangent of the incidence along the axis on which the source was moved, (height, width)."""
-    y, x = _tangents(point, shape, pitch_um, distance_um)
-    return -np.broadcast_to(x if abs(point[0]) >= abs(point[1]) else y, shape)
-
-
-def _tangents(
-    point: Position, shape: tuple[int, ...], pitch_um: float, distance_um: float
-) -> tuple[Floats, Floats]:
-    """Tangents of the straight ray from the source to each pixel, along y (h, 1) and x (1, w)."""
-    x, y, z = point
-    rows, columns = (np.asarray((np.arange(n) - (n - 1) / 2) * pitch_um, np.float64) for n in shape)
-    tan_y, tan_x = (rows[:, None] - y) / (z + distance_um), (columns[None, :] - x) / (z + distance_um)
-    return np.asarray(tan_y, np.float64), np.asarray(tan_x, np.float64)
-
-
-def _by_stage(found: Registration, shift: tuple[float, float]) -> Registration:
-    return replace(found, rows=shift[0], columns=shift[1])
-
-
-def _displaced(image: Floats, shift: tuple[float, float]) -> npt.NDArray[np.float32]:
-    """Move an image by ``(rows, columns)``; aligned() takes a displacement back, so it gets the opposite."""
-    return aligned(image.astype(np.float32), Registration(-shift[0], -shift[1], 1.0, 1.0, 1.0))
-
-
-def _part_seen(image: Floats, shift: tuple[float, float]) -> float:
-    """Return the part of an image's light that is left when it is displaced."""
-    return float(_displaced(image, shift).sum(dtype=np.float64) / image.sum())
-
-
 # Frames to light ---------------------------------------------------------------------------------------
-def _images(run: Run, points: PointSweep, drift: Drift | None) -> list[npt.NDArray[np.float32]]:
+def _images(
+    run: Run, points: PointSweep, dark: DarkModel, drift: Drift | None
+) -> list[npt.NDArray[np.float32]]:
     """Return the light of every point at the first point's exposure, the source's drift taken out."""
-    dark = _dark(run)
+    began = run.metadata(run.steps(REFERENCE)[0]).utc if drift is not None else None
     taken: dict[Position, list[int]] = {}
     for step in run.steps(PSF):
         if step.source_um is not None:
@@ -429,44 +322,89 @@ def _images(run: Run, points: PointSweep, drift: Drift | None) -> list[npt.NDArr
     for point in points.points_um:
         exposure_ms = run.metadata(taken[point][0]).exposure_ms
         brightness = 1.0
-        if drift is not None:
-            brightness = drift.brightness_at(
-                (run.metadata(taken[point][0]).utc - _began(run)).total_seconds()
-            )
-        images.append(_light(run, taken[point], dark) * np.float32(reference_ms / exposure_ms / brightness))
+        if drift is not None and began is not None:
+            brightness = drift.brightness_at((run.metadata(taken[point][0]).utc - began).total_seconds())
+        images.append(light_of(run, taken[point], dark) * np.float32(reference_ms / exposure_ms / brightness))
     return images
 
 
-def _light(run: Run, indices: Sequence[int], dark: DarkModel) -> npt.NDArray[np.float32]:
-    mean = np.mean([run.frame(index) for index in indices], axis=0, dtype=np.float32)
-    light = replace_hot(mean - dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
-    return np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+# Procedure ---------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class AngularProcedure:
+    """Measure the sensor's angular response."""
+
+    sweep: AngularSweep
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold every place against the stage's limits."""
+        sweep = self.sweep.planned(bench)
+        points = sweep.points()
+        plan = check_angular(bench, sweep, folder or bench.config.data_folder)
+        reason = (
+            f"{len(points.points_um)} places at z = {sweep.distance_um / 1e3:.4g} mm, up to "
+            f"+-{sweep.largest_deg:g} degrees along x and y"
+        )
+        given = self.sweep.z_um is not None
+        farthest = "" if given else ", the farthest from which the stage spans the angles"
+        return outlook_of(bench, plan, folder, [reason + farthest])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Home, move the source, and save the response with its picture in the run's folder."""
+        heard, sweep = listener or Listener(), self.sweep.planned(bench)
+        check_angular(bench, sweep, folder)
+        with under_control(bench, control) as control:
+            home_if_needed(bench, heard)
+            heard.step("moving the source")
+            response, file = measure_angular_response(
+                bench,
+                sweep,
+                folder,
+                on_progress=heard.frame,
+                on_exposures=heard.exposures,
+                control=control,
+            )
+        return response_outcome(response, file)
 
 
-def _dark(run: Run) -> DarkModel:
-    steps: dict[float, list[int]] = {}
-    for step in run.steps(DARK):
-        steps.setdefault(run.metadata(step).exposure_ms, []).append(step.index)
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    stacks = [np.stack([run.frame(index) for index in indices]) for indices in steps.values()]
-    return DarkModel(list(steps), stacks, full_scale)
+def response_outcome(response: AngularResponse, file: Path) -> Outcome:
+    """Draw a response beside its file, and say what it is."""
+    picture = file.with_suffix(".png")
+    save_figure(response_figure(response), picture)
+    return Outcome(
+        verdict=tuple(response_lines(response)),
+        good=not response.findings,
+        runs=(file.parent,),
+        files=(file, picture),
+        result=response,
+    )
 
 
-def _began(run: Run) -> datetime:
-    """Return when the reference was visited first."""
-    return run.metadata(run.steps(REFERENCE)[0]).utc
-
-
-def _drift(run: Run, points: PointSweep) -> Drift | None:
-    dark = _dark(run)
-    visits: dict[int, list[int]] = {}
-    for step in run.steps(REFERENCE):
-        visits.setdefault(step.part, []).append(step.index)
-    images = [_light(run, indices, dark) for indices in visits.values()]
-    if len(images) < 2:
-        return None
-    total = len(points.points_um)
-    before = [min(k * points.reference_every, total) for k in range(len(images))]
-    times = [run.metadata(indices[0]).utc for indices in visits.values()]
-    seconds = [(time - _began(run)).total_seconds() for time in times]
-    return judge_drift(images, before, total, seconds)
+ROUTINES = (
+    Routine(
+        name="angular",
+        title="Angular response",
+        help="Move the point source sideways and measure the sensor's angular response and its 20 % cut-off "
+        "angles.",
+        details="Writes angular_response.json (for the spacing of calibrate lateral and volume) and a "
+        "picture into the run's folder.",
+        options=AngularSweep,
+        procedure=AngularProcedure,
+        needs=("stage",),
+        lacks_result=lambda run: is_angular(run) and not (run / RESPONSE_FILE).exists(),
+        finish=lambda run: response_outcome(*finish_angular(run)),
+        examples=(
+            "diffuserbench calibrate angular --dry-run",
+            "diffuserbench calibrate angular",
+            "diffuserbench calibrate angular --largest 20 --step 2 --emission bead",
+            "diffuserbench calibrate lateral --z 300 --response runs/..._angular-sweep/angular_response.json",
+        ),
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -14,11 +14,16 @@ import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError
 from calibration_routines.optics.photograph import expose_scene, photograph
+from calibration_routines.options import MM, Size, problems_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
 from calibration_routines.psf.analysis import binned
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError, OperatorNeededError, SettingsError
+from instrument.files.calibration_file import save_calibration
+from instrument.files.errors import BenchError, FileError, OperatorNeededError, SettingsError
+from instrument.runs.folder import dated_name, free_name
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress as RunProgress
+from recon.base.declare import RARE, option
 from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
 from recon.types import Calibration, Geometry
 
@@ -26,6 +31,8 @@ Floats = npt.NDArray[np.float32]
 Ask = Callable[[str], None]
 Progress = Callable[[str, float], object]
 
+BEADS_FOLDER = "calibration-beads"
+"""Where the command line writes the calibration."""
 MANY_PX = 1_000_000
 """Pixels beyond which solving takes long."""
 BIN_FIRST = (
@@ -42,42 +49,115 @@ class SlideChanger(Protocol):
         """Show slide ``number``; each has its beads at other places."""
 
 
-@dataclass(frozen=True, slots=True)
+_SOLVER = BlindSettings()
+
+
+@dataclass(frozen=True, kw_only=True)
 class BeadSlides:
-    """What to photograph, and how to solve it.
+    """What to photograph, and how to solve it."""
 
-    Attributes
-    ----------
-    z_um : float
-        Depth of the slide.
-    images : int
-        Photographs, the slide moved by any amount in between (Kuo 2020: 9).
-    average : int
-        Frames a photograph.
-    binning : int
-        Software binning, on top of the camera's.
-    window_px : (int, int) or None
-        Height and width that hold the whole pattern, binned pixels; None: from the aperture.
-    solver : BlindSettings
-    """
-
-    z_um: float
-    images: int = 9
-    average: int = 4
-    binning: int = 1
-    window_px: tuple[int, int] | None = None
-    solver: BlindSettings = field(default_factory=BlindSettings)
+    z_um: float = option(
+        2.5e3, **MM, flags=("--z",), above=0, label="Depth", help="Depth of the slide, from the diffuser."
+    )
+    images: int = option(
+        9, least=2, label="Photographs", help="Photographs to take, the slide moved by any amount in between."
+    )
+    average: int = option(4, least=1, label="Frames a photograph", help="Frames a photograph, averaged.")
+    binning: int = option(1, least=1, help="Software binning, on top of the camera's.")
+    grid: Size = option(
+        Size(*_SOLVER.grid),
+        flags=("--psfs",),
+        metavar="RxC",
+        label="PSFs",
+        help="Rows and columns of PSFs over the field.",
+        parse=Size.of,
+    )
+    rank: int = option(
+        max(_SOLVER.ranks),
+        least=1,
+        label="Highest rank",
+        help="Highest rank tried with beads on the pixel grid; raised step by step up to this.",
+    )
+    degree: int = option(
+        _SOLVER.degree,
+        least=0,
+        most=2,
+        help="How PSFs vary over the field in the end: 0 not, 1 linearly, 2 quadratically.",
+        group=RARE,
+    )
+    iterations: int = option(
+        _SOLVER.iterations,
+        least=1,
+        flags=("--iterations", "-n"),
+        help="Of each half-step.",
+        group=RARE,
+    )
+    tau: float = option(
+        _SOLVER.tau, label="Sparsity", help="Weight of the beads' sparsity, relative.", group=RARE
+    )
+    reach: float = option(_SOLVER.reach, help="Part of the sensor's field that the PSFs span.", group=RARE)
+    window_px: Size | None = option(
+        None,
+        flags=("--window",),
+        metavar="HxW",
+        label="Window",
+        help="Height and width that hold the whole pattern, binned pixels.",
+        default_words="from the aperture",
+        parse=Size.of,
+        group=RARE,
+    )
+    out: Path | None = option(
+        None,
+        flags=("--out", "-o"),
+        metavar="FOLDER",
+        label="Folder",
+        help="Where the calibration goes.",
+        default_words=f"{BEADS_FOLDER}; in the window dated, beside the runs",
+    )
+    overwrite: bool = option(False, flags=("--force",), help="Replace a calibration that exists.")
 
     def __post_init__(self) -> None:
-        problems = []
-        if not 0 < self.z_um < np.inf:
-            problems.append(
-                ("z_um", f"the slide lies in front of the diffuser: z above 0, not {self.z_um / 1e3:g} mm")
-            )
-        if self.images < 2:
-            problems.append(("images", f"{self.images} photograph: at least 2 are needed, 9 are usual"))
-        if problems:
+        if problems := problems_of(self):
             raise SettingsError(problems)
+
+    @property
+    def solver(self) -> BlindSettings:
+        """How the images are solved."""
+        return BlindSettings(
+            grid=self.grid.shape,
+            ranks=tuple(range(1, self.rank + 1)),
+            iterations=self.iterations,
+            degree=self.degree,
+            tau=self.tau,
+            reach=self.reach,
+        )
+
+    def refuse_existing(self) -> None:
+        """Refuse to write over a calibration that nobody allowed to be replaced."""
+        if self.out is not None and self.out.exists() and not self.overwrite:
+            raise FileError(self.out, "exists already.", "Choose another name, or replace it with --force.")
+
+    def record(self) -> dict[str, Any]:
+        """Return what is kept of it with a calibration."""
+        taken = {name: getattr(self, name) for name in ("z_um", "images", "average", "binning")}
+        window = None if self.window_px is None else self.window_px.shape
+        return {**taken, "window_px": window, "solver": asdict(self.solver)}
+
+
+_FILES = "With image files"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BeadFiles:
+    """What is not known of photographs that were taken elsewhere."""
+
+    dark: float = option(0.0, least=0, help="The dark level, counts.", group=_FILES)
+    pixel_um: float | None = option(
+        None, unit="um", above=0, help="Pixel pitch.", default_words="not known", group=_FILES
+    )
+    distance_mm: float | None = option(
+        None, unit="mm", above=0, help="From diffuser to sensor.", default_words="not known", group=_FILES
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +270,7 @@ def calibrate_beads(
         "made_by": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "method": "beads at unknown places, blind deconvolution (Kuo 2020, Eqs. 5.11-5.13)",
-        "slides": asdict(slides),
+        "slides": slides.record(),
         **(provenance or {}),
     }
     calibration = Calibration(
@@ -234,7 +314,7 @@ def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -
     BenchError
         When it neither is given nor follows from the geometry.
     """
-    height, width = slides.window_px or window_of(geometry, slides.z_um)
+    height, width = slides.window_px.shape if slides.window_px else window_of(geometry, slides.z_um)
     return min(height, shape[0]), min(width, shape[1])
 
 
@@ -284,17 +364,116 @@ def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
     return np.stack(grey).astype(np.float32)
 
 
-__all__ = [
-    "BIN_FIRST",
-    "MANY_PX",
-    "BeadCalibration",
-    "BeadSlides",
-    "SlideChanger",
-    "bench_geometry",
-    "calibrate_beads",
-    "mean_images",
-    "needed_geometry",
-    "photograph_slides",
-    "window_for",
-    "window_of",
-]
+# Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class BeadProcedure:
+    """Photograph bead slides and recover PSFs from them, without a stage.
+
+    The slide is moved in between by the simulated bench, or by the operator, who is asked.
+    """
+
+    slides: BeadSlides
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Refuse what cannot be solved because the optics are not known, or saved."""
+        self.slides.refuse_existing()
+        slides = self.slides
+        geometry = bench_geometry(bench, slides)
+        frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
+        frames = slides.images * (slides.average + 4)
+        return Outlook(
+            (
+                f"{slides.images} photographs of {slides.average} frames, each with 4 dark frames: {frames} "
+                "frames; the slide is moved in between",
+                *psf_lines(slides, geometry, frame),
+            )
+        )
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph, solve, and save the calibration."""
+        heard = listener or Listener()
+        self.slides.refuse_existing()
+        geometry = bench_geometry(bench, self.slides)
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
+        with under_control(bench, control) as control:
+            heard.step("photographing bead slides")
+            taken = photograph_slides(
+                bench, self.slides, folder, ask=bench.ask, on_progress=heard.frame, control=control
+            )
+            heard.step("blind deconvolution")
+
+            def solving(_words: str, done: float) -> None:
+                control.check()
+                heard.share(done, 1.0)
+
+            solved = calibrate_beads(taken, self.slides, geometry, provenance=facts, progress=solving)
+        out = self.slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
+        return save_beads(solved, self.slides, out)
+
+
+def psf_lines(slides: BeadSlides, geometry: Geometry, shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Return which PSFs will be recovered from images of a shape, in words.
+
+    Raises
+    ------
+    BenchError
+        When they cannot be, because the optics are not known.
+    """
+    needed_geometry(geometry)
+    height, width = window_for(slides, geometry, (shape[0], shape[1]))
+    rows, columns = slides.grid.shape
+    words = (
+        f"{rows} x {columns} PSFs of {height} x {width} pixels at z = {slides.z_um / 1e3:g} mm, over "
+        f"{slides.reach:.0%} of the field of {shape[0]} x {shape[1]} pixels"
+    )
+    return (words, BIN_FIRST) if shape[0] * shape[1] > MANY_PX else (words,)
+
+
+def save_beads(solved: BeadCalibration, slides: BeadSlides, out: Path) -> Outcome:
+    """Save a calibration from bead images."""
+    path = save_calibration(solved.calibration, out, overwrite=slides.overwrite)
+    return Outcome(verdict=tuple(bead_lines(solved)), good=True, calibration=path, result=solved)
+
+
+def bead_lines(done: BeadCalibration) -> list[str]:
+    """Return what the bead images gave, in lines."""
+    result = done.result
+    misfits, between = (", ".join(f"{m:.3f}" for m in ms) for ms in (result.misfits, result.point_misfits))
+    simulated = bool(done.calibration.provenance.get("simulated"))
+    return [
+        *(["SIMULATED: the photographs come from the simulated bench"] if simulated else []),
+        f"Beads found: {', '.join(map(str, done.calibration.quality['beads_found']))}",
+        f"Misfit by rank: {misfits} with beads on the pixel grid ({result.stopped});",
+        f"  {between} with beads between pixels, PSFs of rank {result.rank}",
+    ]
+
+
+ROUTINES = (
+    Routine(
+        name="beads",
+        title="Bead slides",
+        help="Recover PSFs over the field from a few photographs of some twenty beads at unknown places: "
+        "no stage is needed.",
+        details="Blind deconvolution under a rank constraint that is raised step by step (Kuo 2020, Eqs. "
+        "5.11-5.13). Between photographs the slide is moved by any amount: the operator is asked, "
+        "or the simulated bench does it. Brightness and absolute place of the beads stay unknown: "
+        "every PSF has unit light, their mean is centred.",
+        options=BeadSlides,
+        procedure=BeadProcedure,
+        examples=(
+            "diffuserbench calibrate beads --z 2.5 --binning 4             photographs 9 slides, then solves",
+            "diffuserbench calibrate beads --z 2.5 --binning 4 --dry-run   only says what it would do",
+            "diffuserbench calibrate beads --z 2.5 slide-*.tif --pixel-um 11.6 --distance-mm 3.8 "
+            "--window 221x221",
+        ),
+        file=BEADS_FOLDER,
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -8,29 +8,35 @@ slope and deflection that tell a diffuser's quality.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, RunEndedError
-from calibration_routines.psf.analysis import DarkModel, replace_hot
+from calibration_routines.errors import CalibrationError, completed
+from calibration_routines.options import problems_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
+from calibration_routines.psf.analysis import dark_model, full_scale, light_of
 from calibration_routines.psf.exposure import AutoExposure, auto_expose, hot_pixels
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import BenchError, SettingsError
+from instrument.files.figures import save_figure
 from instrument.plan import OFF, Light, Part, Plan, check
 from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
+from recon.base.declare import RARE, option
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 OVERFILL = 1.3
 """Aperture of the lit half circles over the objective's. More than 1, so that deflected light enters on one
@@ -42,50 +48,38 @@ RESULT_FILE, HEIGHT_FILE = "dpc.json", "height_um.npy"
 SETUP_FILE = "dpc_setup.json"
 """In the run's folder: what its frames are for."""
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
+_COLOURS = ("#00798c", "#d1495b")
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
 
 Image = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DpcSetup:
-    """The microscope and the sample.
+    """The microscope and the sample."""
 
-    Attributes
-    ----------
-    objective_na : float
-    magnification : float
-        From the sample to the camera.
-    index : float
-        Refractive index of the sample at the wavelength, in air (polycarbonate: 1.58).
-    band : {"red", "green", "blue"}
-        LEDs used.
-    average, dark_frames : int
-    """
-
-    objective_na: float
-    magnification: float
-    index: float = 1.58
-    band: str = "green"
-    average: int = 8
-    dark_frames: int = 8
+    objective_na: float = option(
+        MISSING,
+        above=0,
+        below=0.95,
+        flags=("--na",),
+        label="Objective's NA",
+        help="Numerical aperture of the objective.",
+    )
+    magnification: float = option(MISSING, above=0, help="From the sample to the camera.")
+    index: float = option(
+        1.58,
+        above=1,
+        below=4,
+        label="Refractive index",
+        help="Refractive index of the diffuser at the wavelength, in air; polycarbonate: 1.58.",
+    )
+    band: str = option("green", choices=BANDS, label="LEDs", help="Which LEDs to light.")
+    average: int = option(8, least=1, label="Frames a half", help="Frames a half circle, averaged.")
+    dark_frames: int = option(8, least=1, help="Dark frames, averaged.", group=RARE)
 
     def __post_init__(self) -> None:
-        problems = []
-        if not 0 < self.objective_na < 0.95:
-            problems.append(
-                ("objective_na", f"the objective's NA lies between 0 and 0.95, not {self.objective_na:g}")
-            )
-        if not self.magnification > 0:
-            problems.append(("magnification", f"the magnification is above 0, not {self.magnification:g}"))
-        if not 1 < self.index < 4:
-            problems.append(("index", f"the index lies between 1 and 4, not {self.index:g}"))
-        if self.band not in BANDS:
-            problems.append(("band", f"the LEDs are red, green or blue, not {self.band!r}"))
-        if min(self.average, self.dark_frames) < 1:
-            name = "average" if self.average < 1 else "dark_frames"
-            problems.append((name, "average and dark frames are at least 1"))
-        if problems:
+        if problems := problems_of(self):
             raise SettingsError(problems)
 
 
@@ -222,9 +216,7 @@ def finish_diffuser(run: Run) -> tuple[DiffuserSurface, Path]:
             f"{path} cannot be read ({error}): the run is none of calibrate dpc, or the file was changed. "
             "The frames beside it are not touched."
         ) from error
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
-    phase = phase_from_halves(_halves(run), optics)
+    phase = phase_from_halves(_halves(completed(run)), optics)
     height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (setup.index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)
     surface = DiffuserSurface(
@@ -304,15 +296,12 @@ def _expose(bench: Bench, array: LedArray, setup: DpcSetup) -> AutoExposure:
 
 
 def _halves(run: Run) -> dict[str, Image]:
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    dark = DarkModel((1.0,), (run.images("dark"),), full_scale)
+    dark = dark_model(run)
     halves = {}
     for side in SIDES:
-        frames = run.images(side)
-        if np.any((frames >= full_scale).any(axis=0) & ~dark.hot):
+        if np.any((run.images(side) >= full_scale(run)).any(axis=0) & ~dark.hot):
             raise CalibrationError(f"The half {side!r} saturates; lower the light. The run is in {run.path}.")
-        light = replace_hot(frames.mean(axis=0, dtype=np.float32) - dark.at(1.0), dark.hot)
-        halves[side] = np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+        halves[side] = light_of(run, [step.index for step in run.steps(side)], dark)
     return halves
 
 
@@ -333,3 +322,130 @@ def _save(surface: DiffuserSurface, setup: DpcSetup, optics: DpcOptics, exposure
     }
     write_text(run.path / RESULT_FILE, json.dumps(data, indent=1) + "\n")
     return run.path / RESULT_FILE
+
+
+# Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class DpcProcedure:
+    """Measure the diffuser's surface by differential phase contrast."""
+
+    setup: DpcSetup
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold the half circles against the LED array and the objective."""
+        if bench.led_array is None:
+            raise BenchError(f"{bench.label} has no [led_array].")
+        folder = folder or bench.config.data_folder
+        optics = dpc_optics(bench, self.setup)
+        plan = dpc_plan(bench.led_array, self.setup, bench.camera.exposure_ms)
+        check(plan, abilities_of(bench, folder))
+        lit = len(plan.parts[1].light[0].leds)
+        reason = (
+            f"4 half circles of {lit} LEDs up to NA {optics.illumination_na:.3g} (the objective's "
+            f"{self.setup.objective_na:g}, and beyond, so that deflected light is not only lost). "
+            f"Pixels are {optics.pitch_um:.3g} um in the sample, at {optics.wavelength_nm:g} nm."
+        )
+        return outlook_of(bench, plan, folder, [reason])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph the halves and save the surface with its picture in the run's folder."""
+        heard = listener or Listener()
+        with under_control(bench, control) as control:
+            heard.step("half circles")
+            surface, file = measure_diffuser(
+                bench, self.setup, folder, on_progress=heard.frame, control=control
+            )
+        return surface_outcome(surface, file)
+
+
+def surface_outcome(surface: DiffuserSurface, file: Path) -> Outcome:
+    """Draw a surface beside its file, and say what it is."""
+    picture = file.with_suffix(".png")
+    save_figure(surface_figure(surface), picture)
+    return Outcome(
+        verdict=(surface_line(surface),),
+        good=True,
+        runs=(file.parent,),
+        files=(file, picture),
+        result=surface,
+    )
+
+
+def surface_line(surface: DiffuserSurface) -> str:
+    """Return a surface's figures of merit in a line."""
+    figures = surface.figures
+    return (
+        f"Height       {figures['height_rms_um']:.3g} um rms; slope {figures['slope_mean_deg']:.3g} degrees "
+        f"on average; deflection half width {figures['deflection_hwhm_deg']:.3g}, largest "
+        f"{figures['deflection_largest_deg']:.3g} degrees"
+    )
+
+
+def surface_figure(surface: DiffuserSurface) -> Figure:
+    """Draw a diffuser's height, a cut, and histograms of slope and deflection (Kuo 2020, Fig. A.1)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), height_ratios=(1.6, 1))
+    height, width = (n * surface.pitch_um for n in surface.height_um.shape)
+    axes = figure.add_subplot(grid[0, 0])
+    shown = axes.imshow(surface.height_um, extent=(0, width, height, 0), cmap="viridis")
+    axes.axhline(height / 2, color="white", ls="--", lw=0.8)
+    axes.set(xlabel="x in the sample, µm", ylabel="y, µm", title="Height above the best plane")
+    figure.colorbar(shown, ax=axes, label="height, µm")
+    axes = figure.add_subplot(grid[1, 0])
+    row = surface.height_um[surface.height_um.shape[0] // 2]
+    axes.plot((np.arange(len(row)) + 0.5) * surface.pitch_um, row, color=_COLOURS[0])
+    axes.set(xlabel="x in the sample, µm", ylabel="height, µm", title="Along the dashed line")
+    figures = surface.figures
+    for place, values, colour, title in (
+        (
+            grid[0, 1],
+            surface.slope_deg,
+            _COLOURS[0],
+            f"Slope: mean {figures['slope_mean_deg']:.2f}°",
+        ),
+        (
+            grid[1, 1],
+            surface.deflection_deg,
+            _COLOURS[1],
+            f"Deflection: half width {figures['deflection_hwhm_deg']:.2f}°, largest "
+            f"{figures['deflection_largest_deg']:.2f}°",
+        ),
+    ):
+        axes = figure.add_subplot(place)
+        axes.hist(values.ravel(), bins=80, color=colour, density=True)
+        axes.set(xlabel=f"{title.split(':')[0].lower()}, degrees", ylabel="density, 1/degree", title=title)
+    figure.suptitle(f"Diffuser by differential phase contrast, {surface.bench}", fontsize=10)
+    return figure
+
+
+ROUTINES = (
+    Routine(
+        name="dpc",
+        title="Diffuser surface (DPC)",
+        help="Measure the diffuser's phase and height in an LED array microscope, with slope and deflection.",
+        details="Lights the left, right, top and bottom half circles of the array. Writes dpc.json, the "
+        "height (NumPy) and a picture into the run's folder.",
+        options=DpcSetup,
+        procedure=DpcProcedure,
+        needs=("led_array",),
+        lacks_result=lambda run: is_dpc(run) and not (run / RESULT_FILE).exists(),
+        finish=lambda run: surface_outcome(*finish_diffuser(run)),
+        examples=(
+            "diffuserbench new microscope.toml --led-microscope",
+            "diffuserbench calibrate dpc --bench microscope.toml --na 0.1 --magnification 4",
+        ),
+        start=lambda _: {"objective_na": 0.1, "magnification": 4.0},
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -8,17 +8,23 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, RunEndedError
-from calibration_routines.psf.analysis import DarkModel, channels_first, replace_hot
+from calibration_routines.errors import CalibrationError, completed
+from calibration_routines.options import problems_of
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
+from calibration_routines.psf.analysis import channels_first, dark_model, full_scale, replace_hot
 from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
 from instrument.bench.bench import Bench
-from instrument.plan import OFF, Part, Plan
-from instrument.runs.acquire import acquire
-from instrument.runs.layout import RunCondition
+from instrument.files.errors import SettingsError
+from instrument.files.images import write_image
+from instrument.plan import OFF, Part, Plan, check
+from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Progress
 from recon.base.blocks import block_mean
+from recon.base.declare import RARE, option
+
+PHOTOGRAPH_FILE = "photograph.tif"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,15 +123,12 @@ def photograph(
     if exposure_ms is None:
         exposure_ms = expose_scene(bench).exposure_ms
     plan = photograph_plan(exposure_ms, average, dark_frames)
-    run = acquire(bench, plan, folder, on_progress=on_progress, control=control)
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The run", run)
+    run = completed(acquire(bench, plan, folder, on_progress=on_progress, control=control))
     frames = run.images("scene")
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    dark = DarkModel((exposure_ms,), (run.images("dark"),), full_scale)
-    light = frames.mean(axis=0, dtype=np.float32) - dark.at(exposure_ms)
+    dark = dark_model(run)
+    light = frames.mean(axis=0, dtype=np.float32) - dark.at(run.metadata(0).exposure_ms)
     binned = block_mean(channels_first(replace_hot(light, dark.hot)), binning)
-    saturated = (frames >= full_scale).any(axis=0) & ~dark.hot
+    saturated = (frames >= full_scale(run)).any(axis=0) & ~dark.hot
     return Photograph(
         measurement=np.ascontiguousarray(np.moveaxis(binned, 0, -1)) if frames.ndim == 4 else binned[0],
         raw=frames[0],
@@ -133,3 +136,89 @@ def photograph(
         saturated_pixels=int(np.count_nonzero(saturated)),
         run=run,
     )
+
+
+# Procedure -------------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class PhotographProcedure:
+    """Photograph the lit scene for a reconstruction: exposure, frames, dark frames taken off."""
+
+    exposure_ms: float | None = option(
+        None, unit="ms", above=0, help="Of each frame.", default_words="found, so that nothing saturates"
+    )
+    average: int = option(4, least=1, label="Frames", help="Frames; all are stored, their mean is taken.")
+    dark_frames: int = option(4, least=1, help="Frames without light.")
+    binning: int = option(
+        1, least=1, help="In software, on top of the camera's; the same as the calibration's.", group=RARE
+    )
+
+    def __post_init__(self) -> None:
+        if problems := problems_of(self):
+            raise SettingsError(problems)
+
+    def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
+        """Hold exposure, frames and disk against the bench."""
+        folder = folder or bench.config.data_folder
+        present_ms = self.exposure_ms or bench.camera.exposure_ms
+        low, high = bench.camera.exposure_limits_ms
+        if not low <= present_ms <= high:
+            words = f"{present_ms:g} ms is outside the camera's {low:g} to {high:g} ms"
+            raise SettingsError([("exposure_ms", words)])
+        plan = photograph_plan(present_ms, self.average, self.dark_frames)
+        check(plan, abilities_of(bench, folder))
+        found = "as given" if self.exposure_ms is not None else "found at the start"
+        return outlook_of(bench, plan, folder, [f"The exposure is {found}."])
+
+    def carry_out(
+        self,
+        bench: Bench,
+        folder: Path | None = None,
+        *,
+        control: RunControl | None = None,
+        listener: Listener | None = None,
+    ) -> Outcome:
+        """Photograph, and write the picture that ``reconstruct`` takes into the run's folder."""
+        heard = listener or Listener()
+        with under_control(bench, control) as control:
+            exposure_ms = self.exposure_ms
+            if exposure_ms is None:
+                heard.step("finding the exposure")
+                exposure_ms = expose_scene(bench).exposure_ms
+                control.check()
+            heard.step("photographing")
+            taken = photograph(
+                bench,
+                exposure_ms,
+                folder,
+                average=self.average,
+                dark_frames=self.dark_frames,
+                binning=self.binning,
+                on_progress=heard.frame,
+                control=control,
+            )
+        file = taken.run.path / PHOTOGRAPH_FILE
+        facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": self.binning}
+        write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})
+        words = f"Photograph: {taken.exposure_ms:.4g} ms, {taken.saturated_pixels} saturated pixels"
+        return Outcome(
+            verdict=(words,),
+            good=taken.saturated_pixels == 0,
+            runs=(taken.run.path,),
+            files=(file,),
+            result=taken,
+        )
+
+
+ROUTINES = (
+    Routine(
+        name="photograph",
+        title="Photograph of the scene",
+        help="Photograph the lit scene as a reconstruction wants it: well exposed, dark frames taken off.",
+        details="Finds the exposure at which nothing saturates unless one is given. Writes photograph.tif "
+        "into the run's folder.",
+        options=PhotographProcedure,
+        procedure=lambda options: options,
+        examples=("diffuserbench calibrate photograph", "diffuserbench calibrate photograph --binning 2"),
+    ),
+)
+"""Row of :data:`calibration_routines.procedure.routines`."""

@@ -17,7 +17,10 @@ from calibration_routines.psf.psf_quality import (
     remove_low_frequencies,
     temporal_noise,
 )
-from calibration_routines.psf.stage_fit import StageFit, judge_points
+from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
+from calibration_routines.psf.sweep_options import Sweep
+from calibration_routines.psf.sweep_plan import DARK, REFERENCE
+from instrument.runs.run import Run
 from recon.base.blocks import block_mean
 from recon.types import Geometry
 
@@ -275,3 +278,39 @@ def feature_size_px(first: npt.NDArray[np.floating], second: npt.NDArray[np.floa
 def optical_binning(first: npt.NDArray[np.floating], second: npt.NDArray[np.floating]) -> int:
     """Return the largest binning that leaves the finest structure two pixels wide; arguments as above."""
     return max(1, int(feature_size_px(first, second) / FEATURE_PX))
+
+
+# Runs --------------------------------------------------------------------------------------------------
+def full_scale(run: Run) -> int:
+    """Return the largest count of a run's camera."""
+    return (1 << run.metadata(0).significant_bits) - 1
+
+
+def dark_model(run: Run) -> DarkModel:
+    """Return what a sweep's run shows without light."""
+    steps: dict[float, list[int]] = {}
+    for step in run.steps(DARK):
+        steps.setdefault(run.metadata(step).exposure_ms, []).append(step.index)
+    stacks = [np.stack([run.frame(index) for index in indices]) for indices in steps.values()]
+    return DarkModel(list(steps), stacks, full_scale(run))
+
+
+def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Float:
+    """Return the light of some frames of one exposure, (height, width): their mean, colours averaged."""
+    mean = np.mean([run.frame(index) for index in indices], axis=0, dtype=np.float32)
+    light = replace_hot(mean - dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
+    return np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
+
+
+def drift_of(run: Run, sweep: Sweep, dark: DarkModel) -> Drift | None:
+    """Return how the source changed between its visits to the reference; None for a sweep without any."""
+    visits: dict[int, list[int]] = {}
+    for step in run.steps(REFERENCE):
+        visits.setdefault(step.part, []).append(step.index)
+    if not visits:
+        return None
+    images = [light_of(run, indices, dark) for indices in visits.values()]
+    total = len(sweep.points_um)
+    before = [min(k * sweep.reference_every, total) for k in range(len(images))]
+    times = [run.metadata(indices[0]).utc for indices in visits.values()]
+    return judge_drift(images, before, total, [(time - times[0]).total_seconds() for time in times])

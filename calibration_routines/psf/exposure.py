@@ -22,7 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.errors import CalibrationError, TooDarkError
-from calibration_routines.psf.sweep_plan import Position, Sweep, axis_point, depths_um
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.sweep_options import Sweep
+from calibration_routines.psf.sweep_plan import axis_point, depths_um
 from drivers.frame import Frame
 from instrument.bench.bench import Bench
 from instrument.runs.run_control import RunControl

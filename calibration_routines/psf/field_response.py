@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError
-from calibration_routines.psf.analysis import DarkModel, replace_hot
+from calibration_routines.errors import CalibrationError, completed
+from calibration_routines.psf.analysis import dark_model, light_of
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
+from calibration_routines.psf.sweep_plan import DARK, PSF
 from instrument.bench.bench import Bench
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints
 from instrument.runs.acquire import acquire
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.runner import Progress
 
@@ -154,9 +154,9 @@ def measure_field_response(
     plan = Plan(
         label="field response",
         parts=(
-            Part(label="dark", light=(OFF,), exposures_ms=(exposure_ms,), repeats=average),
+            Part(label=DARK, light=(OFF,), exposures_ms=(exposure_ms,), repeats=average),
             Part(
-                label="psf",
+                label=PSF,
                 positions=SourcePoints(points_um=places),
                 light=(SOURCE,),
                 exposures_ms=(exposure_ms,),
@@ -165,19 +165,14 @@ def measure_field_response(
             ),
         ),
     )
-    run = acquire(bench, plan, folder, on_progress=on_progress)
-    if run.condition is not RunCondition.COMPLETED:
-        raise CalibrationError(f"The run ended early ({run.condition}); what was taken is in {run.path}.")
+    run = completed(acquire(bench, plan, folder, on_progress=on_progress))
     return fit_field_response(places, [_light(run, place) for place in places])
 
 
 def _light(run: Run, place: tuple[float, float, float]) -> float:
-    dark = run.images("dark")
-    full_scale = (1 << run.metadata(0).significant_bits) - 1
-    model = DarkModel((1.0,), (dark,), full_scale)
-    frames = np.stack([run.frame(step) for step in run.steps("psf") if step.source_um == place])
-    light = replace_hot(frames.mean(axis=0, dtype=np.float32) - model.at(1.0), model.hot)
-    clipped = measure_psf(light.reshape(1, *light.shape[:2]), z_um=place[2], noise=0.0).clipped
+    indices = [step.index for step in run.steps(PSF) if step.source_um == place]
+    light = light_of(run, indices, dark_model(run))
+    clipped = measure_psf(light[np.newaxis], z_um=place[2], noise=0.0).clipped
     if clipped > MAX_CLIPPED:
         raise CalibrationError(
             f"With the source at x = {place[0] / 1e3:g}, y = {place[1] / 1e3:g} mm the pattern reaches over "

@@ -7,17 +7,21 @@ moves (Eq. 4.7), or lenslets go out of focus (Eq. 5.10).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibration_routines.psf.axial_plan import planes_needed
-from calibration_routines.psf.sweep_plan import Position
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError
+from instrument.files.errors import BenchError, SettingsError
 from recon.optics.fall_off import FallOff
 from recon.types import Geometry
 
+Position = tuple[float, float, float]
+"""Of the source: ``(x, y, z)`` from the diffuser's centre, micrometres."""
+MOST_PLANES = 256
+"""More planes than these are a mistake, or must be asked for."""
 BANDWIDTH_LEVEL = 0.01
 """Part of the response's mean below which its frequencies no longer count. With it the microscope's 13
 degrees give 0.41 mm at 1.7 mm; the dissertation says 0.4 mm, and not at which level or depth."""
@@ -300,3 +304,105 @@ def _reach(bench: Bench, centre_um: tuple[float, float]) -> tuple[float, float]:
         low, high = limits.get(axis, (0.0, 0.0))
         reach.append(max(0.0, _REACH_MARGIN * min(high + offset - centre, centre - low - offset)))
     return reach[0], reach[1]
+
+
+def planes_needed(z_min_um: float, z_max_um: float, geometry: Geometry, feature_px: float = 2.0) -> int:
+    """Return how many planes leave no depth between them unsampled.
+
+    From plane to plane the edge of the aperture's shadow moves on the sensor by ``w / 2 * d * (1/z1 - 1/z2)``
+    (from the scaling ``1 + d/z``), which may be one feature of the PSF at most: the constant of Kuo 2020,
+    Eq. 4.7. The PSF's smallest features are about two pixels (Sec. 4.3).
+
+    Raises
+    ------
+    BenchError
+        When the geometry lacks the aperture, the distance d or the pixel pitch.
+    """
+    if (
+        geometry.aperture_mm is None
+        or geometry.diffuser_distance_mm is None
+        or geometry.pixel_pitch_um is None
+    ):
+        raise BenchError(
+            "How many planes are needed follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
+            "give them in [geometry] of bench.toml, or give the number of planes."
+        )
+    edge_um2 = 1e6 * max(geometry.aperture_mm) / 2 * geometry.diffuser_distance_mm
+    travel_px = edge_um2 * (1 / z_min_um - 1 / z_max_um) / geometry.pixel_pitch_um
+    return 1 + int(np.ceil(travel_px / feature_px - 1e-9))
+
+
+def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:
+    """Refuse settings that put the source beyond the stage's travel.
+
+    Parameters
+    ----------
+    bench : Bench
+    places : mapping
+        Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
+    """
+    if bench.stage is None:
+        return  # what needs one says so
+    problems = []
+    for name, (axis, place_um) in places.items():
+        limits = bench.stage.limits.get(f"{'xyz'[axis]}_um")
+        if limits is None:
+            continue
+        low_mm, high_mm = ((end + bench.config.source.offset_um[axis]) / 1e3 for end in limits)
+        if not low_mm <= place_um / 1e3 <= high_mm:
+            words = (
+                f"{'xyz'[axis]} = {place_um / 1e3:g} mm is outside the stage's limits, {low_mm:g} to "
+                f"{high_mm:g} mm"
+            )
+            problems.append((name, words))
+    if problems:
+        raise SettingsError(problems)
+
+
+def reachable_depths_um(bench: Bench) -> tuple[float, float]:
+    """Return a near and a far depth that the stage reaches, to begin with: the far third of its travel.
+
+    Where the bench has no stage, both are one hundred times the diffuser's distance from the sensor (or 100
+    mm), which a photographic camera may call far.
+    """
+    if bench.stage is None or "z_um" not in bench.stage.limits:
+        distance_mm = bench.geometry.diffuser_distance_mm or 1.0
+        return 1e5 * distance_mm, 1e5 * distance_mm
+    offset_um = bench.config.source.offset_um[2]
+    low, high = (end + offset_um for end in bench.stage.limits["z_um"])
+    far_um = _rounded_down(high)
+    return max(_rounded_down(far_um / 3), math.ceil(max(low, 1.0))), far_um
+
+
+def _rounded_down(length_um: float) -> float:
+    """Return a length with two digits, not longer."""
+    unit = 10.0 ** (math.floor(math.log10(length_um)) - 1)
+    return unit * math.floor(length_um / unit + 1e-9)
+
+
+def planes_for(
+    bench: Bench,
+    z_min_um: float,
+    z_max_um: float,
+    *,
+    lenslet_um: float | None = None,
+    wavelength_nm: float | None = None,
+) -> tuple[int, tuple[str, ...]]:
+    """Return how many planes the bench's optics need (:func:`axial_planes`), and why.
+
+    Raises
+    ------
+    SettingsError
+        When they are more than :data:`MOST_PLANES`.
+    """
+    needed = axial_planes(
+        z_min_um, z_max_um, bench.geometry, lenslet_um=lenslet_um, wavelength_nm=wavelength_nm
+    )
+    number = int(needed.value)
+    if number > MOST_PLANES:
+        words = (
+            f"from {z_min_um / 1e3:g} to {z_max_um / 1e3:g} mm these optics need {number} planes, more than "
+            f"{MOST_PLANES}: narrow the range, or say how many planes"
+        )
+        raise SettingsError([("planes", words)])
+    return number, (f"{needed.reason}. Another number of planes can be chosen.",)

@@ -17,25 +17,27 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.errors import RunEndedError
+from calibration_routines.errors import completed
 from calibration_routines.psf.analysis import (
     DarkModel,
     PlaneFrames,
     SweepAnalysis,
     analyse_sweep,
     binned,
+    dark_model,
+    drift_of,
+    full_scale,
     optical_binning,
     replace_hot,
 )
 from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
-from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.stage_fit import Drift, StageFit
+from calibration_routines.psf.sweep_options import Sweep
 from calibration_routines.psf.sweep_plan import (
-    DARK,
     PSF,
     REFERENCE,
-    Position,
-    Sweep,
     axis_point,
     check_image_settings,
     check_sweep,
@@ -61,7 +63,6 @@ from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
 from instrument.plan import Step
 from instrument.runs.acquire import acquire, prepare
-from instrument.runs.layout import RunCondition
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError
 from instrument.runs.runner import Progress, Runner
@@ -256,7 +257,7 @@ def _judged(
     """Analyse, take again what needs it, judge the source, save."""
     sweep, exposures = record.sweep, record.exposures
     where = run.path.parent
-    dark = _dark_model(run)
+    dark = dark_model(run)
     if sweep.binning == 0:
         sweep = _binned_to_resolution(run, sweep, dark)
     try:
@@ -272,7 +273,7 @@ def _judged(
         runs += [] if retake in runs else [retake]
         takes[point] = retake
         rounds[point] += 1
-    drift = _drift(run, sweep, dark)
+    drift = drift_of(run, sweep, dark)
     analysis = _analysed(takes, run, sweep, dark, record.geometry, drift, on_analysis)
     while bench is not None:
         again = [q for q in analysis.quality if q.retake and rounds[q.source_um] < sweep.retakes]
@@ -339,24 +340,10 @@ def _stored(run: Run, index: int) -> Snapshot:
 
 
 def _complete(run: Run) -> Run:
-    if run.condition is not RunCondition.COMPLETED:
-        raise RunEndedError("The sweep", run, f"Go on with: diffuserbench resume {run.path}")
-    return run
+    return completed(run, "The sweep", f"Go on with: diffuserbench resume {run.path}")
 
 
 # Frames to PSFs ----------------------------------------------------------------------------------------
-def _dark_model(run: Run) -> DarkModel:
-    steps: dict[float, list[int]] = {}
-    for step in run.steps(DARK):
-        steps.setdefault(run.metadata(step).exposure_ms, []).append(step.index)
-    stacks = [np.stack([run.frame(index) for index in indices]) for indices in steps.values()]
-    return DarkModel(list(steps), stacks, _full_scale(run))
-
-
-def _full_scale(run: Run) -> int:
-    return (1 << run.metadata(0).significant_bits) - 1
-
-
 def _analysed(
     takes: Mapping[Position, Run],
     first: Run,
@@ -390,7 +377,7 @@ def _planes(
             source_um=point,
             exposure_ms=run.metadata(steps[0]).exposure_ms,
             frames=np.stack([run.frame(step) for step in steps]),
-            full_scale=_full_scale(run),
+            full_scale=full_scale(run),
             off_axis=point not in central,
             brightness=1.0 if drift is None else drift.brightness_at(seconds),
         )
@@ -414,24 +401,6 @@ def _binned_to_resolution(run: Run, sweep: Sweep, dark: DarkModel) -> Sweep:
     ]
     grey = [frame.mean(axis=-1) if frame.ndim == 3 else frame for frame in frames]
     return rebinned(sweep, optical_binning(grey[0], grey[-1]))
-
-
-def _drift(run: Run, sweep: Sweep, dark: DarkModel) -> Drift | None:
-    visits: dict[int, list[int]] = {}
-    for step in run.steps(REFERENCE):
-        visits.setdefault(step.part, []).append(step.index)
-    if not visits:
-        return None
-    images = []
-    for indices in visits.values():
-        mean = np.mean([run.frame(index) for index in indices], axis=0, dtype=np.float32)
-        light = replace_hot(mean - dark.at(run.metadata(indices[0]).exposure_ms), dark.hot)
-        images.append(light.mean(axis=-1) if light.ndim == 3 else light)
-    every = sweep.reference_every
-    before = [min(k * every, len(sweep.points_um)) for k in range(len(images))]
-    times = [run.metadata(indices[0]).utc for indices in visits.values()]
-    seconds = [(time - times[0]).total_seconds() for time in times]
-    return judge_drift(images, before, len(sweep.points_um), seconds)
 
 
 def _provenance(

@@ -1,20 +1,19 @@
-"""A sweep of the point source as data: where it goes, how each PSF is taken, its plan on the bench."""
+"""A sweep's plan on the bench: dark frames, the points in order, visits to a reference point."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.sweep_options import Sweep
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check
 from instrument.runs.acquire import abilities_of
-
-Position = tuple[float, float, float]
 
 DARK, PSF, REFERENCE = "dark", "psf", "reference"
 """Labels of a sweep's steps."""
@@ -22,100 +21,6 @@ LEAST_POINTS_WITH_REFERENCE = 4
 """A shorter sweep is over before a source drifts: no reference visits."""
 LEAST_SIDE_PX = 16
 """A PSF image with a shorter side shows no pattern that could be judged or reconstructed with."""
-
-
-class Sweep(Protocol):
-    """What the sweeping, and the analysis after it, need to know of a sweep."""
-
-    @property
-    def kind(self) -> str:
-        """``"axial"``, ``"lateral"`` or ``"volume"``."""
-
-    @property
-    def points_um(self) -> tuple[Position, ...]:
-        """Where the source stands for each PSF, in the order of the visits."""
-
-    @property
-    def average(self) -> int:
-        """Frames a point."""
-
-    @property
-    def dark_frames(self) -> int:
-        """Frames without light, at the shortest and at the longest exposure each."""
-
-    @property
-    def target(self) -> float:
-        """Fraction of full scale for the 99.9th percentile of the PSF on the axis."""
-
-    @property
-    def dct_order(self) -> int:
-        """Lowest DCT coefficients removed along each axis; 0 removes none."""
-
-    @property
-    def binning(self) -> int:
-        """Software binning; 0: to the optical resolution."""
-
-    @property
-    def retakes(self) -> int:
-        """How often PSFs that saturate or slipped are taken again."""
-
-    @property
-    def by_hand(self) -> bool:
-        """Whether the source stands where it was put by hand; nothing moves then."""
-
-    @property
-    def reference_every(self) -> int:
-        """Points between two visits to the reference point; 0: none."""
-
-
-@dataclass(frozen=True, slots=True)
-class PointSweep:
-    """PSFs at listed places; the attributes are those of :class:`Sweep`."""
-
-    points_um: tuple[Position, ...]
-    kind: str = "volume"
-    average: int = 4
-    dark_frames: int = 4
-    target: float = 0.7
-    dct_order: int = 0
-    binning: int = 1
-    retakes: int = 1
-    reference_every: int = 10
-    by_hand: bool = False
-
-    def __post_init__(self) -> None:
-        problems = settings_problems(self)
-        if not self.points_um:
-            problems.append(("points_um", "a sweep needs at least one point"))
-        if len(set(self.points_um)) != len(self.points_um):
-            problems.append(("points_um", "a point is listed twice"))
-        if not np.isfinite(self.points_um).all():
-            problems.append(("points_um", "every coordinate of a point must be a finite number"))
-        if any(z <= 0 for _, _, z in self.points_um):
-            problems.append(("points_um", "every point must lie in front of the diffuser, z > 0"))
-        if problems:
-            raise SettingsError(problems)
-
-
-def settings_problems(sweep: Sweep) -> list[tuple[str, str]]:
-    """Return what is wrong with a sweep's settings: their names, and words."""
-    problems = [
-        (name, f"{name} must be at least {least}, not {getattr(sweep, name)}")
-        for name, least in (
-            ("average", 1),
-            ("dark_frames", 1),
-            ("binning", 0),
-            ("dct_order", 0),
-            ("retakes", 0),
-            ("reference_every", 0),
-        )
-        if getattr(sweep, name) < least
-    ]
-    if not 0.05 <= sweep.target <= 0.9:
-        problems.append(
-            ("target", f"target must lie between 0.05 and 0.9 of full scale, not {sweep.target:g}")
-        )
-    return problems
 
 
 def check_image_settings(sweep: Sweep, frame_shape: Sequence[int]) -> None:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration_routines.procedure import Listener, Outcome, Outlook, outlook_of, under_control
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
 from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.psf_quality import place_of
+from calibration_routines.psf.sampling import reachable_depths_um
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
-from calibration_routines.psf.sweep_plan import Sweep, check_sweep
-from calibration_routines.psf.sweep_request import SweepRequest
+from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, Sweep, VolumeSweep
+from calibration_routines.psf.sweep_plan import DARK, check_sweep, depths_um, reference_point, sweep_plan
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
 from instrument.bench.bench import Bench
+from instrument.files.formatting import count
+from instrument.plan import Plan, estimate
+from instrument.runs.acquire import abilities_of
 from instrument.runs.run_control import EndedEarlyError, RunControl
 
 
@@ -21,13 +25,21 @@ from instrument.runs.run_control import EndedEarlyError, RunControl
 class SweepProcedure:
     """Carries out what was asked of a sweep; the :class:`~calibration_routines.procedure.Procedure` of it."""
 
-    request: SweepRequest
+    sweep: AskedSweep
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Plan the sweep and hold it against the bench's limits and the disk."""
-        planned = self.request.plan(bench)
+        planned = self.sweep.planned(bench)
         plan = check_sweep(bench, planned.sweep, folder or bench.config.data_folder)
-        return outlook_of(bench, plan, folder, planned.reasons, homes=not planned.sweep.by_hand)
+        outlook = outlook_of(bench, plan, folder, planned.reasons, homes=not planned.sweep.by_hand)
+        caveat = (
+            f"Seconds are for the camera's present {bench.camera.exposure_ms:g} ms; the exposures are found "
+            "at the start."
+        )
+        if len(planned.sweep.points_um) > 1:
+            caveat += " Dark frames are for two exposures; one suffices if all points get the same."
+        lines = plan_lines(bench, planned.sweep, plan, folder)
+        return replace(outlook, plan_lines=(*lines, caveat))
 
     def carry_out(
         self,
@@ -38,7 +50,7 @@ class SweepProcedure:
         listener: Listener | None = None,
     ) -> Outcome:
         """Take the sweep and save its calibration; everything is as in :func:`take_sweep`."""
-        sweep = self.request.plan(bench).sweep
+        sweep = self.sweep.planned(bench).sweep
         return sweep_outcome(take_sweep(bench, sweep, folder, control=control, listener=listener))
 
 
@@ -67,6 +79,7 @@ def take_sweep(
             interruption.add_note("The sweep had not begun: no frame was kept, start it again.")
             raise
         heard.exposures(exposures)
+        heard.planned(plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), folder))
         heard.step("sweeping")
         return calibrate_sweep(
             bench,
@@ -103,7 +116,39 @@ def sweep_outcome(done: SweepCalibration) -> Outcome:
     )
 
 
+_MUCH_BYTES = 10e9  # of a sweep, above which the plan says how to need less
 _MOST_LINES = 12  # findings in words; all of them are in calibration.json
+
+
+def plan_lines(bench: Bench, sweep: Sweep, plan: Plan, folder: Path | None) -> list[str]:
+    """Return what a sweep will do and cost, before it starts."""
+    cost = estimate(plan, abilities_of(bench, folder))
+    depths = depths_um(sweep)
+    listed = ", ".join(f"{z_um / 1e3:.4g}" for z_um in depths)
+    if sweep.kind == "axial":
+        lines = [f"Planes (mm): {listed}"]
+        what = count(len(depths), "plane")
+    else:
+        planes = f"at {len(depths)} depths (mm): {listed}" if len(depths) > 1 else "at one depth"
+        lines = [f"Points: {len(sweep.points_um)} {planes}"]
+        what = count(len(sweep.points_um), "point")
+    lit = len(sweep.points_um) * sweep.average
+    dark = sum(step.label == DARK for step in plan.steps())
+    revisits = ""
+    if reference_point(sweep) is not None:
+        visits = (cost.frames - lit - dark) // sweep.average
+        revisits = f" + {count(visits, 'visit')} to a reference x {sweep.average}"
+    lines.append(
+        f"Plan: {what} x {count(sweep.average, 'frame')}{revisits} + {count(dark, 'dark frame')} "
+        f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
+        f"{cost.seconds:.0f} s of exposure and motion."
+    )
+    if cost.total_bytes > _MUCH_BYTES:
+        lines.append(
+            f"Note: {cost.total_bytes / 1e9:.0f} GB are much. Fewer frames a PSF (--average), a larger "
+            "--spacing or fewer --planes make it less, and so does binning in [camera]."
+        )
+    return lines
 
 
 def exposure_lines(exposures: SweepExposures) -> list[str]:
@@ -183,3 +228,62 @@ def _verdict(done: SweepCalibration) -> str:
         words += [f"{cut} patterns reach the sensor's edge"] if cut else []
     plural = "s" if count > 1 else ""
     return f"{'all ' if count > 1 else ''}{count} PSF{plural} good. No saturated pixel; {'; '.join(words)}."
+
+
+def _depths(bench: Bench) -> dict[str, float]:
+    near_um, far_um = reachable_depths_um(bench)
+    return {"z_min_um": near_um, "z_max_um": far_um, "z_um": far_um}
+
+
+ROUTINES = (
+    Routine(
+        name="axial",
+        title="Axial sweep",
+        help="Move the point source along the axis and measure one PSF a plane.",
+        details="For volumes, and with one plane for photographs. Finds the exposures without saturating, "
+        "takes dark frames, sweeps, judges every PSF in words, takes bad planes again, and saves "
+        "the calibration in the run's folder. Ends with the light off.",
+        options=AxialSweep,
+        procedure=SweepProcedure,
+        examples=(
+            "diffuserbench calibrate axial --z-min 100 --z-max 300 --planes 12",
+            "diffuserbench calibrate axial --z-min 300          one PSF, 300 mm in front of the diffuser",
+            "diffuserbench calibrate axial --z-min 100 --z-max 300 --dry-run",
+        ),
+        start=_depths,
+    ),
+    Routine(
+        name="lateral",
+        title="Lateral sweep",
+        help="Move the point source over a grid at one depth and measure a PSF at each point.",
+        details="For a camera whose PSF changes over the field: reconstruct --volume CALIBRATION --model "
+        "local, lowrank or auto. Each pattern's shift is measured and held against the stage; a "
+        "reference point is visited again and again to tell whether the source drifts.",
+        options=LateralSweep,
+        procedure=SweepProcedure,
+        needs=("stage",),
+        examples=(
+            "diffuserbench calibrate lateral --z 300 --dry-run          the grid, and why",
+            "diffuserbench calibrate lateral --z 1.7 --fall-off-deg 13 --half-field-x 1.2 --half-field-y 0.8",
+            "diffuserbench calibrate lateral --z 300 --spacing 40",
+        ),
+        start=_depths,
+    ),
+    Routine(
+        name="volume",
+        title="Volume sweep",
+        help="Move the point source over a grid at each of several depths, evenly spaced in 1/z.",
+        details="As lateral, plane after plane. The number of planes and of points follows from the optics"
+        " unless given.",
+        options=VolumeSweep,
+        procedure=SweepProcedure,
+        needs=("stage",),
+        examples=(
+            "diffuserbench calibrate volume --z-min 100 --z-max 300 --dry-run",
+            "diffuserbench calibrate volume --z-min 1.7 --z-max 3 --lenslet 250 --wavelength 520 "
+            "--fall-off-deg 13",
+        ),
+        start=_depths,
+    ),
+)
+"""Rows of :data:`calibration_routines.procedure.routines`."""

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from calibration_routines.errors import CalibrationError
-from calibration_routines.psf.axial_plan import AxialSweep
 from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, ExposureTrial, SweepExposures
-from calibration_routines.psf.sweep_plan import PointSweep, Position, Sweep
+from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.sweep_options import AxialSweep, PointSweep, Sweep
 from instrument.files.atomic import write_text
+from recon.base.declare import options_of
 from recon.types import Geometry
 
 SWEEP_FILE = "sweep.json"
@@ -44,7 +45,9 @@ def rebinned(sweep: Sweep, binning: int) -> Sweep:
 
 def sweep_json(sweep: Sweep) -> dict[str, Any]:
     """Return a sweep's settings as JSON-compatible values."""
-    return asdict(_known(sweep)) | {"kind": sweep.kind}
+    left_out = {o.name for o in options_of(_known(sweep)) if not o.declaration.recorded}
+    kept = {name: value for name, value in asdict(_known(sweep)).items() if name not in left_out}
+    return kept | {"kind": sweep.kind}
 
 
 def to_json(record: SweepRecord) -> str:

@@ -32,6 +32,7 @@ from calibration_routines.psf.psf_quality import (
     measure_psf,
     with_finding,
 )
+from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import (
     LARGEST_PX,
     MAX_GAIN_ERROR,
@@ -41,15 +42,8 @@ from calibration_routines.psf.stage_fit import (
     judge_visit,
     nominal_px_per_um,
 )
-from calibration_routines.psf.sweep_plan import (
-    DARK,
-    REFERENCE,
-    Position,
-    Sweep,
-    axis_point,
-    depths_um,
-    reference_point,
-)
+from calibration_routines.psf.sweep_options import Sweep
+from calibration_routines.psf.sweep_plan import DARK, REFERENCE, axis_point, depths_um, reference_point
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
 from recon.base.blocks import block_mean

@@ -17,7 +17,7 @@ from drivers.apt.protocol import (
     decode,
     short,
 )
-from drivers.common.framing import Matcher, Verdict
+from drivers.common.framing import Belongs, Matcher
 from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
 
@@ -155,11 +155,11 @@ class Link:
 
 
 def _reply(number: int, source: int | None, channel: int | None) -> Matcher:
-    def judge(frame: bytes) -> Verdict:
+    def judge(frame: bytes) -> Belongs:
         message = decode(frame)
         if message.number != number or source not in (None, message.source):
-            return Verdict.OTHER
+            return Belongs.OTHER
         found = int.from_bytes(message.data[:2], "little") if message.data else message.first
-        return Verdict.END if channel is None or found == channel else Verdict.OTHER
+        return Belongs.END if channel is None or found == channel else Belongs.OTHER
 
     return judge

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from drivers.aravis.features import FRAME_TRIGGERS
 from drivers.aravis.settings import AravisSettings
 from drivers.camera import Roi, TriggerMode
-from drivers.common.pixels import PixelFormat, genicam_format, prepare
+from drivers.common.pixels import PixelFormat, compile_kernels, genicam_format
 from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
 
@@ -119,7 +119,7 @@ class AravisImageSettings(AravisSettings):
 
     def _apply_format(self, pixel_format: str) -> None:
         self._format_name = self._features.choose("PixelFormat", pixel_format)
-        prepare(self._formats[pixel_format].packing)
+        compile_kernels(self._formats[pixel_format].packing)
 
     # Region and binning ----------------------------------------------------------------------------
     @property

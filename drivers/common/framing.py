@@ -49,7 +49,7 @@ class LineFramer:
         self._rest, self._too_long = b"", False
 
 
-class Verdict(Enum):
+class Belongs(Enum):
     """What a message is to a command that waits for its reply."""
 
     OTHER = auto()
@@ -60,23 +60,23 @@ class Verdict(Enum):
     """It ends the reply."""
 
 
-Matcher = Callable[[bytes], Verdict]
+Matcher = Callable[[bytes], Belongs]
 """Judges messages for one command."""
 
 
 def reply_line(pattern: bytes) -> Matcher:
     """Return a matcher for a reply of one line that matches a regular expression as a whole."""
     compiled = re.compile(pattern)
-    return lambda message: Verdict.END if compiled.fullmatch(message) else Verdict.OTHER
+    return lambda message: Belongs.END if compiled.fullmatch(message) else Belongs.OTHER
 
 
 def reply_until(end: bytes, body: bytes = rb".*") -> Matcher:
     """Return a matcher for a reply of lines that match ``body``, up to one that matches ``end``."""
     ends, belongs = re.compile(end), re.compile(body)
 
-    def judge(message: bytes) -> Verdict:
+    def judge(message: bytes) -> Belongs:
         if ends.fullmatch(message):
-            return Verdict.END
-        return Verdict.PART if belongs.fullmatch(message) else Verdict.OTHER
+            return Belongs.END
+        return Belongs.PART if belongs.fullmatch(message) else Belongs.OTHER
 
     return judge

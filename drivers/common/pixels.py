@@ -148,7 +148,7 @@ def _needed(packing: Packing, width: int) -> int:
     return whole + (group_bytes if bits is None else -(-rest * bits // 8))
 
 
-def prepare(packing: Packing) -> None:
+def compile_kernels(packing: Packing) -> None:
     """Have what unpacks a packing ready, so that the first frame need not wait for its compilation."""
     if packing not in ("bytes", "words", "big words"):
         unpack(np.zeros(8, np.uint8), packing, np.empty((1, 4), np.uint16))

@@ -18,9 +18,34 @@ from typing import Any
 
 import serial
 
-from drivers.common.framing import Framer, LineFramer, Matcher, Verdict
-from drivers.common.serial_errors import port_error
+from drivers.common.framing import Belongs, Framer, LineFramer, Matcher
+from drivers.device import port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
+from drivers.registry.claim import holder_of
+
+
+def port_error(device: str, port: str, error: Exception) -> DeviceError:
+    """Return the error of a serial port that does not open, in words an operator can act on."""
+    text = str(error)
+    if "exclusively lock" in text or "busy" in text.lower():
+        # This program claims a port before it opens it, so its own claim says nothing of who has the port.
+        if holder := holder_of(port_claim(port)):
+            return DeviceError(device, f"{port} is in use by {holder}.", "Close that program.")
+        return DeviceError(
+            device,
+            f"{port} is in use by another program, or by another device of this bench.",
+            f"Close that program (fuser {port} names it), or give each device its own port.",
+        )
+    if "No such file" in text or ("could not open port" in text and "Permission" not in text):
+        return DeviceError(device, f"there is no port {port}.", "Is it plugged in and switched on?")
+    if "Permission" in text:
+        return DeviceError(
+            device,
+            f"{port} may not be used (permission denied).",
+            "Join the group that owns it (Debian: sudo adduser $USER dialout) and log in again.",
+        )
+    return DeviceError(device, f"{port} cannot be opened: {text}.", "Check port and baud rate.")
+
 
 _log = logging.getLogger(__name__)
 _POLL_S = 0.1
@@ -322,15 +347,15 @@ class SerialTransport:
     def _dispatch(self, message: bytes) -> None:
         with self._changed:
             awaited = self._awaited
-            verdict = Verdict.OTHER
+            verdict = Belongs.OTHER
             if awaited is not None and not awaited.done and awaited.error is None:
                 verdict = awaited.matcher(message)
-                if verdict is not Verdict.OTHER:
+                if verdict is not Belongs.OTHER:
                     awaited.messages.append(message)
-                if verdict is Verdict.END:
+                if verdict is Belongs.END:
                     awaited.done = True
                     self._changed.notify_all()
-        if verdict is Verdict.OTHER:
+        if verdict is Belongs.OTHER:
             self.unmatched += 1
             _log.debug("%s: %s belongs to no command", self.device, _shown(message))
             if self._on_message is not None:

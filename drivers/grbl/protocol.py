@@ -9,7 +9,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from drivers.common.framing import Matcher, Verdict
+from drivers.common.framing import Belongs, Matcher
 
 STATUS = b"?"
 JOG_CANCEL = b"\x85"
@@ -134,19 +134,19 @@ def _places(text: bytes) -> tuple[float, ...] | None:
     return tuple(float(number) for number in text.split(b",")) if _PLACES.fullmatch(text) else None
 
 
-def report_matcher(message: bytes) -> Verdict:
+def report_matcher(message: bytes) -> Belongs:
     """Judge a line for ``?``: only a whole report ends it."""
-    return Verdict.END if parse_report(message) is not None else Verdict.OTHER
+    return Belongs.END if parse_report(message) is not None else Belongs.OTHER
 
 
 def line_matcher(body: bytes = rb"[\[$].*") -> Matcher:
     """Return a matcher for a line command: lines that match ``body``, then ``ok`` or ``error:n``."""
     belongs = re.compile(body)
 
-    def judge(message: bytes) -> Verdict:
+    def judge(message: bytes) -> Belongs:
         if message == b"ok" or _ERROR.fullmatch(message):
-            return Verdict.END
-        return Verdict.PART if belongs.fullmatch(message) else Verdict.OTHER
+            return Belongs.END
+        return Belongs.PART if belongs.fullmatch(message) else Belongs.OTHER
 
     return judge
 
@@ -155,15 +155,15 @@ def modes_matcher() -> Matcher:
     """Return a matcher for ``$G`` that no older ``ok`` can end: its own line must have come before."""
     seen = False
 
-    def judge(message: bytes) -> Verdict:
+    def judge(message: bytes) -> Belongs:
         nonlocal seen
         if message.startswith(b"[GC:"):
             seen = True
-            return Verdict.PART
+            return Belongs.PART
         if seen and message == b"ok":
             seen = False  # the matcher is used again
-            return Verdict.END
-        return Verdict.OTHER
+            return Belongs.END
+        return Belongs.OTHER
 
     return judge
 

@@ -12,7 +12,6 @@ from drivers.common.polled_stage import PolledStage, StageState
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
-from drivers.grbl.options import GrblAxis, GrblOptions
 from drivers.grbl.protocol import (
     CRITICAL_ALARMS,
     FEED_HOLD,
@@ -24,7 +23,7 @@ from drivers.grbl.protocol import (
     parse_info,
     parse_settings,
 )
-from drivers.grbl.settings import REPORTED_STEP, ControllerSettings
+from drivers.grbl.settings import REPORTED_STEP, ControllerSettings, GrblAxis, GrblOptions
 from drivers.registry.buses import lasting_name
 from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis

@@ -22,7 +22,7 @@ _MICROMETRES_END = 10.0  # wavelengths below are in micrometres, above in nanome
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ArrayGeometry:
     """What the driver needs to know of an array.
 
     Attributes
@@ -50,7 +50,7 @@ class Geometry:
     serial_number: str
 
 
-def read_geometry(link: Link, distance_mm: float | None) -> Geometry:
+def read_geometry(link: Link, distance_mm: float | None) -> ArrayGeometry:
     """Ask an array for its properties and its LEDs' places.
 
     Parameters
@@ -90,7 +90,7 @@ def read_geometry(link: Link, distance_mm: float | None) -> Geometry:
     else:
         na = _agreed(link.device, _cosines(positions), told_na)
     na[np.hypot(told_na[:, 0], told_na[:, 1]) >= 1] = np.nan  # how the firmware marks LEDs without angle
-    return Geometry(
+    return ArrayGeometry(
         positions,
         na,
         _wavelengths(properties, channels),

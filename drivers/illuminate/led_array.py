@@ -12,7 +12,7 @@ from pydantic import Field
 
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.illuminate.geometry import Geometry, read_geometry
+from drivers.illuminate.geometry import ArrayGeometry, read_geometry
 from drivers.illuminate.link import Link
 from drivers.illuminate.sequencer import Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
@@ -62,7 +62,7 @@ class IlluminateLedArray(LedArray):
         self._darkenings = 0
         self._confirming = False
         """Whether ``off`` asks for its confirmation: another ``off`` need not cancel that."""
-        self._geometry: Geometry | None = None
+        self._geometry: ArrayGeometry | None = None
         self._pattern = OFF
         self._color: Rgb | None = None
         self._auto_clear: bool | None = None
@@ -184,7 +184,7 @@ class IlluminateLedArray(LedArray):
 
     # LedArray -------------------------------------------------------------------------------------
     @property
-    def geometry(self) -> Geometry:
+    def geometry(self) -> ArrayGeometry:
         """What the array said of itself; needs an open array."""
         if self._geometry is None:
             raise DeviceNotOpenError(self.name)

@@ -1,10 +1,12 @@
-"""The connection to an Illuminate array: who is there, commands and refusals."""
+"""The connection to an Illuminate array: who is there, how either firmware says it, refusals."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+
 from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError
-from drivers.illuminate.dialect import OLDEST, Dialect, dialect_of
 from drivers.illuminate.protocol import (
     Version,
     parse_short,
@@ -13,6 +15,127 @@ from drivers.illuminate.protocol import (
     reply_matcher,
     version_matcher,
 )
+from drivers.led_array import Rgb
+
+OLDEST = Version(1, 16)
+"""The first with brightness and a machine mode."""
+
+
+class Dialect(ABC):
+    """The commands that differ; a command is bytes without its newline.
+
+    Attributes
+    ----------
+    properties : bytes
+        The command that prints the array's properties.
+    longest_line : int
+        Longest command in bytes.
+    most_arguments : int
+        Most arguments of a command.
+    """
+
+    properties: bytes
+    longest_line: int
+    most_arguments: int
+
+    @abstractmethod
+    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
+        """Return the commands after which LEDs light with exactly these levels; the last echoes them."""
+
+    @abstractmethod
+    def sequence_pattern(self, leds: Sequence[int]) -> bytes:
+        """Return the command that appends a pattern to the stored sequence."""
+
+    @abstractmethod
+    def run(self, interval_ms: int, repeats: int, outputs: Sequence[int], inputs: Sequence[int]) -> bytes:
+        """Return the command that runs the stored sequence with the triggers' modes."""
+
+    prepare: tuple[bytes, ...] = ()
+    """Commands that bring a freshly opened array into the state that the others need."""
+    prepare_sequence: tuple[bytes, ...] = ()
+    """Commands before a sequence is stored."""
+    shortest_interval_ms: int = 0
+    """Shortest time a pattern of a sequence is shown; zero where triggers alone may pace it."""
+
+    def led_lists(self, leds: Sequence[int]) -> Iterator[bytes]:
+        """Yield ``l`` commands for these LEDs, each within what the firmware can take."""
+        words: list[bytes] = []
+        length = 1
+        for led in leds:
+            word = b"%d" % led
+            if words and (
+                length + 1 + len(word) > self.longest_line - 1 or len(words) == self.most_arguments
+            ):
+                yield b".".join((b"l", *words))
+                words, length = [], 1
+            words.append(word)
+            length += 1 + len(word)
+        if words:
+            yield b".".join((b"l", *words))
+
+
+class Firmware1(Dialect):
+    """Firmware 1.16 to 1.x.
+
+    It reads a command only as far as the USB packet that has arrived (64 bytes) and forgets the rest of a
+    longer one, so that long lists go in pieces. A sequence's pattern is ``COUNT.LED.VALUE.LED.VALUE``.
+    """
+
+    properties = b"pp"
+    longest_line = 64
+    most_arguments = 60
+    # Brightness multiplies colours there; at its maximum a colour is what it says.
+    prepare = (b"sb.255",)
+    prepare_sequence = (b"ssbd.1",)
+    shortest_interval_ms = 1
+
+    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
+        """Return one command: firmware 1 takes colours as they are."""
+        return (b"sc.%d.%d.%d" % rgb,)
+
+    def sequence_pattern(self, leds: Sequence[int]) -> bytes:
+        """Return the count, and a value of one bit behind each LED's number."""
+        if not leds:
+            return b"ssz.1"
+        return b".".join((b"ssv.%d" % len(leds), *(b"%d.1" % led for led in leds)))
+
+    def run(self, interval_ms: int, repeats: int, outputs: Sequence[int], inputs: Sequence[int]) -> bytes:
+        """Return outputs first, then inputs: always two places each."""
+        padded = [*([*outputs, 0, 0][:2]), *([*inputs, 0, 0][:2])]
+        return b".".join((b"rseq.%d.%d" % (interval_ms, repeats), *(b"%d" % mode for mode in padded)))
+
+
+class Firmware2(Dialect):
+    """Firmware 2, which scales a colour to its largest channel; single channels are taken as they are."""
+
+    properties = b"pprops"
+    longest_line = 8192  # its buffer holds 16 KiB
+    most_arguments = 250  # it keeps room for 300 words
+
+    def color(self, rgb: Rgb) -> tuple[bytes, ...]:
+        """Return one command a channel."""
+        return tuple(b"ssc.%d.%d" % (channel, level) for channel, level in enumerate(rgb))
+
+    def sequence_pattern(self, leds: Sequence[int]) -> bytes:
+        """Return the LEDs' numbers, or ``none``."""
+        return b".".join((b"ssv", *(b"%d" % led for led in leds))) if leds else b"ssv.none"
+
+    def run(self, interval_ms: int, repeats: int, outputs: Sequence[int], inputs: Sequence[int]) -> bytes:
+        """Return output and input of each trigger in turn; only those that the array has."""
+        words = [b"rseq.%d.%d" % (interval_ms, repeats)]
+        for place in range(max(len(outputs), len(inputs))):
+            output = outputs[place] if place < len(outputs) else 0
+            words.append(b"%d" % output)
+            words.append(b"%d" % (inputs[place] if place < len(inputs) else 0))
+        return b".".join(words)
+
+
+def dialect_of(version: Version) -> Dialect | None:
+    """Return how to speak to a firmware; None when it is too old or newer than what is known."""
+    if version < OLDEST or version.major > 2:
+        return None
+    return Firmware1() if version.major == 1 else Firmware2()
+
 
 BAUD_RATE = 115_200
 _POWER_CODES = (3,)

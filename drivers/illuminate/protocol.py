@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.common.framing import Matcher, Verdict
+from drivers.common.framing import Belongs, Matcher
 
 TERMINATOR = b"-==-"
 _REFUSAL = re.compile(rb"ERROR ?\[(\d+)\]: *(.*)")
@@ -45,26 +45,26 @@ class Version:
         return f"{self.major}.{self.minor:02d}"
 
 
-def reply_matcher(message: bytes) -> Verdict:
+def reply_matcher(message: bytes) -> Belongs:
     """Judge a line for a command whose reply ends as the firmware's replies do."""
     if message.rstrip().endswith(TERMINATOR) or _REFUSAL.match(message):
-        return Verdict.END
-    return Verdict.PART
+        return Belongs.END
+    return Belongs.PART
 
 
 def version_matcher() -> Matcher:
     """Return a matcher for the reply to ``version`` that no older reply can be taken for."""
     seen = False
 
-    def judge(message: bytes) -> Verdict:
+    def judge(message: bytes) -> Belongs:
         nonlocal seen
         if _VERSION.fullmatch(message.strip()):
             seen = True
-            return Verdict.PART
+            return Belongs.PART
         if seen and message.strip() == TERMINATOR:
             seen = False  # the matcher is used again
-            return Verdict.END
-        return Verdict.OTHER
+            return Belongs.END
+        return Belongs.OTHER
 
     return judge
 

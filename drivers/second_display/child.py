@@ -20,7 +20,7 @@ from PySide6.QtCore import QSocketNotifier, QTimer
 from PySide6.QtGui import QGuiApplication
 
 from drivers.errors import DeviceError
-from drivers.second_display.options import SecondDisplayOptions
+from drivers.second_display.outputs import SecondDisplayOptions
 from drivers.second_display.window import PatternScreen, outputs
 
 _WATCH_MS = 500

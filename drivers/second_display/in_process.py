@@ -12,8 +12,7 @@ from PySide6.QtCore import QObject, Qt, QThread, Signal
 from PySide6.QtGui import QGuiApplication
 
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.second_display.options import SecondDisplayOptions
-from drivers.second_display.outputs import Output
+from drivers.second_display.outputs import Output, SecondDisplayOptions
 from drivers.second_display.window import PatternScreen, outputs
 
 _T = TypeVar("_T")

@@ -21,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.second_display.options import SecondDisplayOptions
-from drivers.second_display.outputs import Output
+from drivers.second_display.outputs import Output, SecondDisplayOptions
 
 _log = logging.getLogger(__name__)
 _START_S = 30.0

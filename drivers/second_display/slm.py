@@ -14,8 +14,7 @@ import numpy.typing as npt
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
 from drivers.registry.discovery import FoundDevice
-from drivers.second_display.options import SecondDisplayOptions
-from drivers.second_display.outputs import Output
+from drivers.second_display.outputs import Output, SecondDisplayOptions
 from drivers.slm import Slm
 
 _INSTALL = 'Install it: pip install "diffuserbench[gui]".'

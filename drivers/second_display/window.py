@@ -19,10 +19,8 @@ from PySide6.QtGui import (
 )
 
 from drivers.errors import DeviceError
-from drivers.second_display.options import SecondDisplayOptions
-from drivers.second_display.outputs import Output, choose
-from drivers.second_display.screen_saver import ScreenSaverInhibition
-from drivers.second_display.x11 import Place, XConnection
+from drivers.second_display.outputs import Output, SecondDisplayOptions, choose
+from drivers.second_display.x11 import Place, ScreenSaverInhibition, XConnection
 
 _EXPOSE_S = 5.0
 

@@ -1,16 +1,200 @@
-"""Camera, six-axis stage and SLM of the simulated holographic display."""
+"""The simulated holographic display: its world, and the camera, six-axis stage and SLM in it."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable, Mapping
+from math import pi
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from drivers.common.stage_axes import AXIS_NAMES
 from drivers.device import DriverOptions, SharedPart
 from drivers.simulated.camera import SimulatedCamera
-from drivers.simulated.display_world import DisplayWorld
 from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
+from drivers.simulated.surroundings import Clock, Surroundings
+from recon.base.blocks import block_sum
+from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
+from recon.optics.sensor import SensorSpec
+
+Image = npt.NDArray[np.float32]
+
+SENSOR = SensorSpec(
+    name="display camera",
+    shape=(1088, 1088),
+    pitch_um=5.5,
+    quantum_efficiency=(0.6, 0.6, 0.6),
+    full_well_e=30_000,
+    read_noise_e=3.0,
+    dark_current_e_per_s=5.0,
+    prnu=0.005,
+    dsnu_e=1.0,
+    bits=12,
+    exposure_limits_ms=(0.02, 10_000.0),
+)
+
+
+class DisplayOptions(DriverOptions):
+    """Options of the simulated holographic display; what is off is off as on a bench just put together."""
+
+    seed: int = Field(0, ge=0, description="The same seed gives the same sensor, noise and flatness error.")
+    time_scale: float = Field(
+        1.0,
+        ge=0,
+        description="Real seconds per simulated second of motion, exposure; 0: no waiting.",
+    )
+    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
+    fixed_pattern: bool = Field(True, description="Whether camera pixels differ.")
+    light: float = Field(
+        2e5, gt=0, description="Mean electrons a second in a camera pixel inside the field of view."
+    )
+    mask_seed: int = Field(0, ge=0, description="Of the random binary mask.")
+    mask_pitch_um: float = Field(4.0, gt=0, description="Pitch of the mask's pixels.")
+    wavelength_nm: float = Field(660.0, gt=0, description="Of the laser; the mask is made for it.")
+    focal_mm: float = Field(35.0, gt=0, description="Focal length of the Fourier lens.")
+    oversampling: int = Field(2, ge=1, le=4, description="Samples per mask pixel along each axis.")
+    shift_um: tuple[float, float] = Field(
+        (120.0, -70.0), description="Where the mask is when the stage reads zero: x, y from its right place."
+    )
+    z_um: float = Field(300.0, description="The same along the optical axis.")
+    roll_mrad: float = Field(1.5, description="Rotation of the mask about the optical axis.")
+    pitch_mrad: float = Field(2.0, description="Tilt of the mask about x.")
+    yaw_mrad: float = Field(-1.5, description="Tilt of the mask about y.")
+    magnification: float = Field(0.001, description="Of the relay, less one.")
+    relay_distortion_um: float = Field(3.0, description="Displacement of the SLM's image at its corners.")
+    relay_centre_um: tuple[float, float] = Field(
+        (0.0, 0.0), description="x, y of the relay's axis, which its distortion is centred on."
+    )
+    lens_distortion: float = Field(
+        0.002, ge=-0.05, le=0.05, description="Of the Fourier lens at the middle of the field's border."
+    )
+    sensor_offset_um: tuple[float, float] = Field(
+        (18.0, -11.0), description="Of the camera's centre from the optical axis, y, x."
+    )
+    sensor_roll_mrad: float = Field(2.0, description="Rotation of the camera.")
+    dc_power: float = Field(0.1, ge=0, lt=1, description="Share of the light that the SLM does not modulate.")
+    dc_phase_rad: float = Field(0.6, description="Its phase.")
+    fill: float = Field(0.93, gt=0, le=1, description="Modulating part of an SLM pixel's area.")
+    flatness_rad: float = Field(0.0, ge=0, description="Peak of the SLM's flatness error.")
+
+
+class DisplayWorld(Surroundings):
+    """What the simulated SLM, stage and camera of a holographic display share, coupled by physics.
+
+    The laser shines while ``scene_lit``. The mask rides on the stage; its place when the stage reads zero is
+    off by what the options say and nobody else is told.
+
+    Parameters
+    ----------
+    options : DisplayOptions
+        The table ``[simulated_display]`` of ``bench.toml``.
+    """
+
+    table = "simulated_display"
+    Options = DisplayOptions
+
+    def __init__(self, options: DriverOptions) -> None:
+        if not isinstance(options, DisplayOptions):
+            raise TypeError(f"The simulated display takes DisplayOptions, not {type(options).__name__}.")
+        self.options: DisplayOptions = options
+        self.clock = Clock(options.time_scale)
+        self.sensor = SENSOR
+        self.scene_lit = False
+        self._lock = threading.RLock()
+        self._phase: Callable[[], npt.NDArray[np.float32]] | None = None
+        self._stage: Callable[[], Mapping[str, float]] = dict
+        self._slm_pitch_um = 8.0
+        self._optics: ScatteringDisplay | None = None
+        self._flatness: npt.NDArray[np.float32] | None = None
+        self._image: tuple[Any, Image] | None = None
+
+    # What the devices do to the world ---
+    def mount_slm(self, phase: Callable[[], npt.NDArray[np.float32]], pitch_um: float) -> None:
+        """Put an SLM in the beam: what tells its phase, and its pitch."""
+        self._phase, self._slm_pitch_um = phase, pitch_um
+
+    def mount_mask(self, position: Callable[[], Mapping[str, float]]) -> None:
+        """Put the mask on a stage: what tells the carriage's true position by axis name."""
+        self._stage = position
+
+    # What there is to see ---
+    def pose(self) -> MaskPose:
+        """Return where the mask truly is."""
+        stage, options = self._stage(), self.options
+        return MaskPose(
+            options.shift_um[0] + stage.get("x_um", 0.0),
+            options.shift_um[1] + stage.get("y_um", 0.0),
+            options.z_um + stage.get("z_um", 0.0),
+            options.roll_mrad + stage.get("roll_mrad", 0.0),
+            options.pitch_mrad + stage.get("pitch_mrad", 0.0),
+            options.yaw_mrad + stage.get("yaw_mrad", 0.0),
+        )
+
+    def photons_per_s(self, weights: tuple[float, float, float], binning: int = 1) -> Image | None:
+        """Return electrons a second on every binned camera pixel now, or None when the laser is off."""
+        if not self.scene_lit or self._phase is None:
+            return None
+        with self._lock:
+            key = self.light_key()
+            if self._image is None or self._image[0] != key:
+                phase = self._phase()
+                optics = self._scattering_display(phase.shape)
+                light = optics.irradiance(phase + self._flatness_map(phase.shape), self.pose())
+                light *= np.float32(self.options.light)
+                self._image = (key, light)
+            image = self._image[1]
+        return image if binning == 1 else block_sum(image, binning)
+
+    def light_key(self) -> tuple[Any, ...]:
+        """Return something that changes whenever :meth:`photons_per_s` does."""
+        if not self.scene_lit or self._phase is None:
+            return (False,)
+        return (True, hash(self._phase().tobytes()), self.pose())
+
+    def _scattering_display(self, slm_shape: tuple[int, ...]) -> ScatteringDisplay:
+        if self._optics is None:
+            options = self.options
+            height, width = (round(n * self._slm_pitch_um / options.mask_pitch_um) for n in slm_shape)
+            bits = np.random.default_rng(options.mask_seed).integers(0, 2, (height, width), dtype=np.uint8)
+            spec = DisplaySpec(
+                slm_pitch_um=self._slm_pitch_um,
+                mask_pitch_um=options.mask_pitch_um,
+                wavelength_nm=options.wavelength_nm,
+                focal_mm=options.focal_mm,
+                magnification=options.magnification,
+                relay_distortion_um=options.relay_distortion_um,
+                relay_centre_um=options.relay_centre_um,
+                dc_power=options.dc_power,
+                dc_phase_rad=options.dc_phase_rad,
+                fill=options.fill,
+                oversampling=options.oversampling,
+                sensor_shape=self.sensor.shape,
+                sensor_pitch_um=self.sensor.pitch_um,
+                sensor_offset_um=options.sensor_offset_um,
+                sensor_roll_mrad=options.sensor_roll_mrad,
+                lens_distortion=options.lens_distortion,
+            )
+            self._optics = ScatteringDisplay(spec, pi * bits)
+        return self._optics
+
+    def _flatness_map(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+        """Return a smooth phase error of the SLM: random polynomials up to third order, radians."""
+        if self._flatness is None:
+            rng = np.random.default_rng(self.options.seed + 3)
+            y, x = (np.linspace(-1, 1, n) for n in shape)
+            error = np.zeros(shape)
+            for i in range(4):
+                for j in range(4 - i):
+                    if i + j >= 2:
+                        error += rng.normal() * np.multiply.outer(y**i, x**j)
+            error -= error.mean()
+            self._flatness = (error * (self.options.flatness_rad / np.abs(error).max())).astype(np.float32)
+        return self._flatness
 
 
 class DisplayStageOptions(StageOptions):

@@ -13,9 +13,8 @@ from pydantic import Field
 from drivers.device import DriverOptions, SharedPart
 from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
-from drivers.simulated.clock import Clock
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
-from drivers.simulated.surroundings import Surroundings
+from drivers.simulated.surroundings import Clock, Surroundings
 from recon.base.blocks import block_sum
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.led_microscope import led_image

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.clock import Clock
+from drivers.simulated.surroundings import Clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Self
+from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -14,13 +14,12 @@ from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
+from drivers.simulated.options import NotNegative, Positive
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import Stage, StageAxis
 
 POLL_S = 0.002
 REFERENCE_S = 1.0
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 
 
 class AxisOptions(BaseModel):

@@ -1,7 +1,9 @@
-"""What a simulated camera needs of the world it looks at, whatever that world is."""
+"""What a simulated camera needs of the world it looks at, whatever that world is, and the world's time."""
 
 from __future__ import annotations
 
+import threading
+import time
 from abc import abstractmethod
 from typing import Any, Protocol
 
@@ -10,8 +12,27 @@ import numpy.typing as npt
 
 from drivers.device import SharedPart
 from drivers.errors import DeviceError
-from drivers.simulated.clock import Clock
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
+
+
+class Clock:
+    """Waits ``time_scale`` real seconds for every simulated second (1: real time, 0: no waiting)."""
+
+    def __init__(self, time_scale: float) -> None:
+        self.time_scale = time_scale
+
+    def wait(self, seconds: float, cancelled: threading.Event) -> bool:
+        """Wait; returns False as soon as ``cancelled`` is set."""
+        return not cancelled.wait(max(seconds, 0.0) * self.time_scale)
+
+    def elapsed_since(self, start: float) -> float:
+        """Return the simulated seconds since ``start``, a reading of ``time.monotonic()``.
+
+        Infinite when nothing is waited for.
+        """
+        if self.time_scale == 0:
+            return float("inf")
+        return (time.monotonic() - start) / self.time_scale
 
 
 class CommonOptions(Protocol):

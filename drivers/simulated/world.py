@@ -1,4 +1,4 @@
-"""The simulated world: what all simulated devices of one bench share, coupled by physics."""
+"""The simulated world: what all simulated devices of one bench share, coupled by physics, and its scenes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
+from matplotlib import cbook
 
 from drivers.device import DriverOptions
-from drivers.simulated.clock import Clock
-from drivers.simulated.options import WorldOptions
-from drivers.simulated.presets import PRESETS, Preset
-from drivers.simulated.scene_choice import make_scene, make_slide
+from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
-from drivers.simulated.surroundings import Surroundings
+from drivers.simulated.surroundings import Clock, Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -27,12 +26,79 @@ from recon.optics.fall_off import (
 )
 from recon.optics.grid import PixelGrid
 from recon.optics.render import RenderSettings, render
-from recon.optics.scene import Scene
+from recon.optics.scene import Scene, TruthGrid, true_scene
+from recon.optics.scenes import bar_target, bead_volume, picture, tilted_target
 from recon.optics.sensor import SensorSpec
 from recon.optics.spectrum import mixed_spectrum
-from recon.optics.truth import true_scene
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
+
+FIELD_SHARE = 0.5
+SHEET_SHARE = 2.0
+"""Of what the sensor sees: a sheet reaches beyond it on all sides."""
+
+SHEET_PIXELS = 128
+"""A side: fine enough for the light of single LEDs."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Scene | None:
+    """Build the scene that the options name; sizes left out follow from what the sensor sees."""
+    if options.scene == "none":
+        return None
+    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
+    sensor_um = preset.sensor.shape[0] * preset.sensor.pitch_um
+    height_um = FIELD_SHARE * sensor_um * z_um / distance_um
+    if options.scene_height_mm is not None:
+        height_um = 1e3 * options.scene_height_mm
+    if options.scene in ("picture", "color_picture"):
+        portrait = sample_picture()
+        if options.scene == "picture":
+            portrait = portrait @ LUMINANCE
+        return picture(portrait, z_um, height_um * portrait.shape[1] / portrait.shape[0])
+    if options.scene == "sheet":
+        if options.scene_height_mm is None:
+            height_um *= SHEET_SHARE / FIELD_SHARE
+        return picture(np.ones((SHEET_PIXELS, SHEET_PIXELS)), z_um, height_um, name="sheet")
+    if options.scene == "bars":
+        return picture(bar_target(), z_um, height_um, name="bar target")
+    if options.scene == "tilted_bars":
+        return tilted_target(bar_target(), z_um, height_um, options.scene_tilt_deg)
+    depth_um = 0.5 * z_um if options.scene_depth_mm is None else 1e3 * options.scene_depth_mm
+    near, far = z_um - depth_um / 2, z_um + depth_um / 2
+    extent_um = (height_um * near / z_um, height_um * near / z_um)
+    return bead_volume(
+        options.beads, extent_um, (near, far), diameter_um=options.bead_diameter_um, seed=options.seed
+    )
+
+
+def make_slide(options: WorldOptions, preset: Preset, distance_um: float, number: int) -> Scene:
+    """Build a flat slide of beads where the scene is; each ``number`` has its beads at other places."""
+    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
+    sensor_um = preset.sensor.shape[0] * preset.sensor.pitch_um
+    height_um = FIELD_SHARE * sensor_um * z_um / distance_um
+    if options.scene_height_mm is not None:
+        height_um = 1e3 * options.scene_height_mm
+    return bead_volume(
+        options.beads,
+        (height_um, height_um),
+        (z_um, z_um),
+        diameter_um=options.bead_diameter_um,
+        seed=options.seed + 1000 * (number + 1),
+    )
+
+
+def sample_picture() -> npt.NDArray[np.float32]:
+    """Load the photograph that ships with matplotlib, ``(600, 512, 3)`` float32 linear brightness, 0 to 1."""
+    path = cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise ValueError(f"matplotlib's sample picture {path} cannot be read")
+    srgb = bgr[:, :, ::-1].astype(np.float32) / 255
+    low = srgb <= 0.04045
+    return np.where(low, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
 
 Position = tuple[float, float, float]
 Rgb = tuple[float, float, float]
@@ -287,15 +353,17 @@ class SimulatedWorld(Surroundings):
             raise ValueError("There is no scene, so there is no ground truth.")
         return true_scene(
             self._scene,
-            shape,
-            pitch_um,
-            self.distance_um,
+            TruthGrid(
+                shape,
+                pitch_um,
+                self.distance_um,
+                source_um or (0.0, 0.0, 1.0),
+                layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
+                bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,
+            ),
             z_um=z_um,
-            source_um=source_um or (0.0, 0.0, 1.0),
             light=self._glow(self.options.scene_rgb),
             sensitivity=None if color else self.sensor.quantum_efficiency,
-            layer_scale=self.preset.scene_photons_per_s_mm2_sr / self.preset.source_photons_per_s_sr,
-            bead_scale=self.preset.bead_photons_per_s_sr / self.preset.source_photons_per_s_sr,
             fall_off=self.fall_off if collected else None,
         )
 

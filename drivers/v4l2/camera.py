@@ -15,10 +15,9 @@ from drivers.errors import DeviceError
 from drivers.registry.buses import video_devices
 from drivers.registry.discovery import FoundDevice
 from drivers.v4l2 import api
-from drivers.v4l2.device import FilledBuffer, VideoDevice
+from drivers.v4l2.device import FilledBuffer, VideoDevice, lasting_path
 from drivers.v4l2.formats import decode
 from drivers.v4l2.image_settings import V4l2ImageSettings
-from drivers.v4l2.sysfs import lasting_path
 
 _SEQUENCE_MODULUS = 1 << 32
 

@@ -13,8 +13,7 @@ from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
 from drivers.errors import DeviceError, LimitError
 from drivers.v4l2 import api
 from drivers.v4l2.controls import Control, Controls
-from drivers.v4l2.device import VideoDevice
-from drivers.v4l2.sysfs import usb_strings
+from drivers.v4l2.device import VideoDevice, usb_strings
 
 _EXPOSURE_COUNT_MS = 0.1
 """Unit of the control exposure_time_absolute: 100 us."""

@@ -6,7 +6,7 @@ import itertools
 import logging
 import threading
 
-from drivers.common.framing import Verdict
+from drivers.common.framing import Belongs
 from drivers.common.serial_transport import SerialTransport
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.zaber.protocol import FAULTS, REJECTIONS, Message, command, flag_words, parse
@@ -117,11 +117,11 @@ class Chain:
         self._transport.send_now(command("stop"))
 
     def _exchange(self, text: str, device: int, axis: int, number: int) -> Message:
-        def judge(line: bytes) -> Verdict:
+        def judge(line: bytes) -> Belongs:
             message = self._parsed(line)
             if message is None or (message.kind, message.device, message.number) != ("@", device, number):
-                return Verdict.OTHER
-            return Verdict.END
+                return Belongs.OTHER
+            return Belongs.END
 
         lines = self._transport.request(command(text, device, axis, number), judge)
         message = self._parsed(lines[-1])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import typing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,22 +38,37 @@ class Behaviour:
         Of that dialogue, as QFileDialog has them.
     must_exist : bool
         Whether a path must name something that is there.
+    needed : bool
+        Whether it must be given here, although the declaration lets it be left out.
+    needed_when : callable, optional
+        Called when it was left out; returns why it is needed, empty where it is not.
     understand : callable, optional
         Turns a text into the value in place of the declaration; BenchError with the reason where it cannot.
     require : callable, optional
         Called with a value that the declaration allows; returns why it cannot be all the same, empty where
         it can.
     enabled_when : callable, optional
-        Called with the form's present values by name; returns why the field does not apply, empty where it
-        does. One that does not apply has its default.
+        Called with what is chosen and ticked in the form, by name; returns why the field does not apply,
+        empty where it does. One that does not apply has its default.
     """
 
     browse: Browse = "open"
     filters: str = ""
     must_exist: bool = False
+    needed: bool = False
+    needed_when: Callable[[], str] | None = None
     understand: Callable[[str], Any] | None = None
     require: Callable[[Any], str] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Whom a field tells of changes, of what it refused, and of what it took."""
+
+    edited: Callable[[], object]
+    refused: Callable[[str], object]
+    settled: Callable[[], object]
 
 
 class OptionField:
@@ -124,8 +141,12 @@ class OptionField:
         """Show a value in the option's own unit; no change is told of."""
         raise NotImplementedError
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
-        """Have changes and refusals told."""
+    def raw(self) -> object:
+        """Return what stands in the widget; equal as long as nothing was changed."""
+        return self.read()
+
+    def listen(self, told: Told) -> None:
+        """Have changes, refusals and what is settled told."""
         raise NotImplementedError
 
 
@@ -156,7 +177,13 @@ class NumberField(OptionField):
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
         number, problem = self.widget.typed()
+        if number is None and not problem and self.behaviour.needed_when is not None:
+            problem = self.behaviour.needed_when()
         return (None, problem) if number is None or problem else (self._in_own_unit(number), "")
+
+    def raw(self) -> object:
+        """Return the text without its unit."""
+        return self.widget.text().strip().removesuffix(self.unit).strip()
 
     def show(self, value: Any) -> None:
         """Show a value."""
@@ -165,10 +192,11 @@ class NumberField(OptionField):
         self.widget.set_value(scaled, overwrite=True)
         blocked.unblock()
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+    def listen(self, told: Told) -> None:
         """Have changes told."""
-        self.widget.textChanged.connect(lambda _: edited())
-        self.widget.refused.connect(refused)
+        self.widget.textChanged.connect(lambda _: told.edited())
+        self.widget.refused.connect(told.refused)
+        self.widget.submitted.connect(lambda _: told.settled())
 
 
 class SwitchField(OptionField):
@@ -190,9 +218,10 @@ class SwitchField(OptionField):
         self.widget.setChecked(bool(value))
         blocked.unblock()
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+    def listen(self, told: Told) -> None:
         """Have changes told."""
-        self.widget.toggled.connect(lambda _: edited())
+        self.widget.toggled.connect(lambda _: told.edited())
+        self.widget.toggled.connect(lambda _: told.settled())
 
 
 class ChoiceField(OptionField):
@@ -204,13 +233,28 @@ class ChoiceField(OptionField):
         self.whole = self.widget
         narrow(self.widget)
         self.widget.setToolTip(self.tip)
-        none_word = option.declaration.none_word
-        if none_word or option.default is None:
-            self.widget.addItem(none_word or AUTOMATIC, None)
+        if type(None) in typing.get_args(option.type):
+            word = AUTOMATIC if option.default is None else "none"
+            self.widget.addItem(option.declaration.none_word or word, None)
         if bool in option.kinds:
             self.widget.addItem("yes", True)
             self.widget.addItem("no", False)
-        for word in option.words:
+        self._words_from = self.widget.count()
+        self._add(option.words)
+
+    def offer(self, words: Sequence[str]) -> None:
+        """Offer only some of its words; the default, else the first, where another was chosen."""
+        blocked = QSignalBlocker(self.widget)
+        chosen = self.widget.currentText()
+        while self.widget.count() > self._words_from:
+            self.widget.removeItem(self._words_from)
+        self._add(words)
+        left = next((word for word in (chosen, self.option.default) if word in words), words[0])
+        self.widget.setCurrentText(str(left))
+        blocked.unblock()
+
+    def _add(self, words: Sequence[str]) -> None:
+        for word in words:
             self.widget.addItem(word, read(self._spoken, word))
 
     def read(self) -> tuple[Any, str]:
@@ -225,9 +269,10 @@ class ChoiceField(OptionField):
         self.widget.setCurrentIndex(at.index(value) if value in at else 0)
         blocked.unblock()
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+    def listen(self, told: Told) -> None:
         """Have changes told."""
-        self.widget.currentIndexChanged.connect(lambda _: edited())
+        self.widget.currentIndexChanged.connect(lambda _: told.edited())
+        self.widget.currentIndexChanged.connect(lambda _: told.settled())
 
 
 class EntryField(OptionField):
@@ -235,7 +280,8 @@ class EntryField(OptionField):
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
         super().__init__(option, behaviour)
-        empty = default_shown(option) or ("none" if option.default is None else "")
+        optional = option.default is None and not behaviour.needed
+        empty = default_shown(option) or ("none" if optional else "")
         self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=empty)
         self.whole = self.widget
         if option.kinds == (Path,):
@@ -245,7 +291,7 @@ class EntryField(OptionField):
 
     def _understood(self, text: str) -> Any:
         if not text:
-            if self.option.is_required:
+            if self.option.is_required or self.behaviour.needed:
                 raise BenchError(f"{self.bare_label} is needed here.")
             return self.option.default
         try:
@@ -264,8 +310,13 @@ class EntryField(OptionField):
 
     def _parts(self, text: str) -> str | list[str]:
         """Return one text, or the parts of what is repeated or has several words."""
-        has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
-        return text.replace(",", " ").split() if has_parts and not self.option.declaration.parse else text
+        said = self.option.declaration
+        if said.parse_all is not None:
+            return re.split(r"[,;]?\s+", text)
+        if said.parse is None:
+            has_parts = self.option.item is not None or isinstance(self.option.default, tuple)
+            return text.replace(",", " ").split() if has_parts else text
+        return [part.strip() for part in text.split(";") if part.strip()] if self.option.item else text
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
@@ -274,16 +325,21 @@ class EntryField(OptionField):
         except BenchError as error:
             return None, str(error)
 
+    def raw(self) -> object:
+        """Return the text: whether it names a file is not looked up at every key."""
+        return self.widget.text()
+
     def show(self, value: Any) -> None:
         """Show a value."""
         blocked = QSignalBlocker(self.widget)
         self.widget.setText("" if value is None else shown(self.option, value))
         blocked.unblock()
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+    def listen(self, told: Told) -> None:
         """Have changes told."""
-        self.widget.textChanged.connect(lambda _: edited())
-        self.widget.refused.connect(refused)
+        self.widget.textChanged.connect(lambda _: told.edited())
+        self.widget.refused.connect(told.refused)
+        self.widget.understood.connect(told.settled)
 
 
 class LinesField(OptionField):
@@ -309,9 +365,9 @@ class LinesField(OptionField):
         self.widget.setPlainText(str(value or ""))
         blocked.unblock()
 
-    def listen(self, edited: Callable[[], object], refused: Callable[[str], object]) -> None:
+    def listen(self, told: Told) -> None:
         """Have changes told."""
-        self.widget.textChanged.connect(edited)
+        self.widget.textChanged.connect(told.edited)
 
 
 def field_for(option: Option, behaviour: Behaviour) -> OptionField:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QVBoxLayout, QWidget
 
-from gui.forms.fields import Behaviour, LinesField, OptionField, field_for
+from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, Told, field_for
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, options_of
 from recon.errors import InputError
@@ -17,6 +17,8 @@ from recon.errors import InputError
 FOLDED = ("Rarely needed", "Advanced")
 """Groups that are folded away, wherever they are declared."""
 
+_MARGINS = (2, 6, 8, 2)
+_ABOVE_HEADING_PX = 6
 _T = TypeVar("_T")
 
 
@@ -33,6 +35,8 @@ class OptionsForm(QWidget):
         Something was typed, ticked or chosen.
     refused : object, str
         A field's widget and why its content is refused.
+    settled : str
+        The name of an option whose value was taken: chosen, or typed and the field left.
 
     Parameters
     ----------
@@ -47,6 +51,7 @@ class OptionsForm(QWidget):
 
     changed = Signal()
     refused = Signal(object, str)
+    settled = Signal(str)
 
     def __init__(
         self,
@@ -71,7 +76,7 @@ class OptionsForm(QWidget):
         self._hidden: set[str] = set()
         self._disabled: dict[str, str] = {}
         layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setContentsMargins(*_MARGINS)
         usual, seldom = QWidget(), QWidget()
         self._fill(usual, [f for f in self.fields.values() if not self._is_folded(f)])
         self._fill(seldom, [f for f in self.fields.values() if self._is_folded(f)])
@@ -92,8 +97,10 @@ class OptionsForm(QWidget):
         layout.addStretch(1)
         for name, field in self.fields.items():
             field.show(field.default)
-            field.listen(self._edited, partial(self._refused_itself, name))
-        self._state = self._read()
+            field.listen(
+                Told(self._edited, partial(self._refused_itself, name), partial(self.settled.emit, name))
+            )
+        self._state = self._raw()
         self._update_enabled()
 
     # Values --------------------------------------------------------------------------------------
@@ -147,10 +154,12 @@ class OptionsForm(QWidget):
 
     def set_values(self, values: Mapping[str, Any]) -> None:
         """Show values; names that the form does not have are left out."""
-        for name, value in values.items():
-            if name in self.fields:
-                self.fields[name].show(value)
+        known = {name: value for name, value in values.items() if name in self.fields}
+        for name, value in known.items():
+            self.fields[name].show(value)
         self._edited()
+        for name in known:
+            self.settled.emit(name)
 
     def begin_with(self, values: Mapping[str, Any]) -> None:
         """Show values in the fields that are empty."""
@@ -166,12 +175,13 @@ class OptionsForm(QWidget):
         """Whether a field is shown for what is asked for, and goes with the others."""
         return name not in self._hidden and name not in self._disabled
 
-    def show_for(self, *subjects: str) -> None:
-        """Show what is declared to apply to one of these subjects, or to everything."""
+    def show_for(self, *subjects: str, but_not: Collection[str] = ()) -> None:
+        """Show what is declared to apply to one of these subjects, or to everything, but not some fields."""
         self.hide_fields(
             name
             for name, field in self.fields.items()
-            if (about := field.option.declaration.applies) and not set(about) & set(subjects)
+            if name in but_not
+            or ((about := field.option.declaration.applies) and not set(about) & set(subjects))
         )
 
     def hide_fields(self, names: Iterable[str]) -> None:
@@ -197,13 +207,27 @@ class OptionsForm(QWidget):
         self.refused.emit(self.widgets[name], self._reasons[name].text())
         return False
 
+    def recheck(self, *names: str) -> bool:
+        """Look again at some fields, whose limits another one sets, and tell whether all of them can be."""
+        good = True
+        for name in names:
+            problem = self.fields[name].read()[1] if self.applies(name) else ""
+            if problem:
+                good = False
+                self._refused_itself(name, problem)
+            else:
+                self._clear_reason(name)
+        return good
+
     def refuse(self, name: str, why: str) -> bool:
         """Mark a field as wrong, with the reason below it; returns whether there is such a field."""
         widget = self.widgets.get(name)
         if widget is None:
             return False
         reason = self._reasons[name]
-        text = why[:1].upper() + why[1:] + ("" if why.endswith((".", "?")) else ".")
+        text = why if why.endswith((".", "?")) else f"{why}."
+        if text.partition(" ")[0].isalpha():  # no file's name
+            text = text[:1].upper() + text[1:]
         reason.setText(text)
         reason.show()
         widget.setToolTip(text)
@@ -243,6 +267,7 @@ class OptionsForm(QWidget):
             if group and (len(groups) > 1) and group not in FOLDED:
                 self._headings[group] = heading = QLabel(group)
                 heading.setProperty("role", "heading")
+                heading.setContentsMargins(0, _ABOVE_HEADING_PX if rows.rowCount() else 0, 0, 0)
                 rows.addRow(heading)
             for field in (f for f in fields if self._group(f) == group):
                 self._add(rows, field)
@@ -277,12 +302,12 @@ class OptionsForm(QWidget):
     def _shown_fields(self) -> list[OptionField]:
         return [field for name, field in self.fields.items() if name not in self._hidden]
 
-    def _read(self) -> dict[str, tuple[Any, str]]:
-        return {name: field.read() for name, field in self.fields.items()}
+    def _raw(self) -> dict[str, object]:
+        return {name: field.raw() for name, field in self.fields.items()}
 
     def _edited(self) -> None:
         """Tell of a change; a field that is merely left, and shows its number anew, has not changed."""
-        state = self._read()
+        state = self._raw()
         if state == self._state:
             return
         for name in state:
@@ -294,10 +319,12 @@ class OptionsForm(QWidget):
 
     def _update_enabled(self) -> None:
         """Disable what does not go with the others, with the reason as its tool tip."""
-        present = {name: value for name, (value, _) in self._state.items() if name not in self._hidden}
-        for name, field in self.fields.items():
-            rule = field.behaviour.enabled_when
-            why = "" if rule is None else rule(present)
+        ruled = {name: rule for name, f in self.fields.items() if (rule := f.behaviour.enabled_when)}
+        chosen = (ChoiceField, SwitchField)  # texts have no say: to read one may look for a file
+        usable = {n: f for n, f in self.fields.items() if n not in self._hidden and isinstance(f, chosen)}
+        present = {name: field.read()[0] for name, field in usable.items()}
+        for name, rule in ruled.items():
+            field, why = self.fields[name], rule(present)
             if why == self._disabled.get(name, ""):
                 continue
             if why:
@@ -326,3 +353,13 @@ def _mark(widget: QWidget, *, refused: bool) -> None:
     widget.setProperty("refused", refused)
     widget.style().unpolish(widget)
     widget.style().polish(widget)
+
+
+def scrolled(form: QWidget) -> QScrollArea:
+    """Return a frameless place for a form, which scrolls up and down."""
+    scroll = QScrollArea()
+    scroll.setWidgetResizable(True)
+    scroll.setFrameShape(QScrollArea.Shape.NoFrame)
+    scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+    scroll.setWidget(form)
+    return scroll

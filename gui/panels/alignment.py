@@ -19,10 +19,10 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from calibration_routines.display.display_io import SpotLook
 from calibration_routines.display.mask_alignment import AlignmentReport
-from calibration_routines.display.spot_camera import SpotLook
 from calibration_routines.procedure import Outcome
-from gui.forms.alignment import ALIGNMENT
+from gui.forms.routines import forms
 from gui.procedure_panel import ProcedurePanel
 from gui.session import BenchSession
 from gui.theme import colours
@@ -57,7 +57,7 @@ class AlignmentPanel(ProcedurePanel):
         self.before = DisplacementPlot("Before")
         self.after = DisplacementPlot("After")
         self.pose = PoseView()
-        super().__init__(session, [ALIGNMENT], "Align", parent)
+        super().__init__(session, forms("align"), "Align", parent)
         self._older: Any = self.score.plot([], [])
         self._points: Any = self.score.plot([], [])
         self._best: Any = self.progress.plot([], [])

@@ -9,15 +9,14 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBo
 
 from gui.jobs import Job
 from gui.panel import Panel
-from gui.python_lines import expression
 from gui.session import BenchSession
 from gui.widgets.chart_view import ChartView
 from gui.widgets.dialogues import choose_path
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart_reader import read_chart
-from instrument.evaluation.chart_words import subject_of
+from instrument.evaluation.chart_data import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
+from recon.base.declare import expression
 from recon.verdict.shipped import shipped_file
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
@@ -106,7 +105,7 @@ class ChartsPanel(Panel):
             lines = [
                 "from pathlib import Path",
                 "",
-                "from instrument.evaluation.chart_reader import read_chart",
+                "from instrument.evaluation.chart_data import read_chart",
                 "",
                 f"points = read_chart({expression(self.chart_path)})['points']",
                 f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "

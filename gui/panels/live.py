@@ -33,8 +33,8 @@ from gui.widgets.record_bar import RecordBar
 from instrument.live.frame_view import histogram, line_profile, percentiles, sensor_roi
 from instrument.live.live_camera import LiveCameraStatus
 from instrument.runs.snapshot import (
-    Light,
-    check_target,
+    LightState,
+    check_photograph_file,
     led_pattern,
     light_of,
     photograph_name,
@@ -134,15 +134,19 @@ class LivePanel(Panel):
         self.light_buttons.setExclusive(False)  # what is lit is shown as it is, not as it was clicked
         light = QHBoxLayout()
         light.setSpacing(2)
-        for choice, words in ((Light.SCENE, "Scene"), (Light.SOURCE, "Source"), (Light.DARK, "Dark")):
+        for choice, words in (
+            (LightState.SCENE, "Scene"),
+            (LightState.SOURCE, "Source"),
+            (LightState.DARK, "Dark"),
+        ):
             button = QPushButton(words)
             button.setCheckable(True)
             button.setProperty("light", choice.value)
             button.setToolTip(
                 {
-                    Light.SCENE: "Light the scene",
-                    Light.SOURCE: "Light the point source",
-                    Light.DARK: "Light nothing",
+                    LightState.SCENE: "Light the scene",
+                    LightState.SOURCE: "Light the point source",
+                    LightState.DARK: "Light nothing",
                 }[choice]
             )
             button.clicked.connect(lambda _=False, choice=choice: self.switch_light(choice))
@@ -241,7 +245,7 @@ class LivePanel(Panel):
             "from drivers.camera import Roi",
             "from drivers.led_array import LedPattern",
             "from instrument.bench.bench import open_bench",
-            "from instrument.runs.snapshot import Light, photograph_name, switch_light, write_snapshot",
+            "from instrument.runs.snapshot import LightState, photograph_name, switch_light, write_snapshot",
             "",
             f"with open_bench({str(path) if path else None!r}) as bench:",
         ]
@@ -255,14 +259,14 @@ class LivePanel(Panel):
                 f"    bench.camera.set_exposure_ms({state.exposure_ms!r})",
             ]
         light, pattern = self.light, led_pattern(self.session.bench)
-        if light is Light.AS_IS:
+        if light is LightState.AS_IS:
             lines += [f"    bench.led_array.set_pattern({pattern!r})"]
             lines += ["    bench.scene_on()"] if self.session.bench.scene_lit else []
         else:
-            lines += [f"    switch_light(bench, Light.{light.name})"]
+            lines += [f"    switch_light(bench, LightState.{light.name})"]
         lines += [
             f"    taken = bench.snap({int(self.average.value or 1)})",
-            f"    write_snapshot(bench, Path(photograph_name()), taken, Light.{light.name})",
+            f"    write_snapshot(bench, Path(photograph_name()), taken, LightState.{light.name})",
         ]
         return "\n".join(lines) + "\n"
 
@@ -410,7 +414,7 @@ class LivePanel(Panel):
 
         def work(context: JobContext) -> None:
             target.parent.mkdir(parents=True, exist_ok=True)
-            check_target(target, average)
+            check_photograph_file(target, average)
             with self.session.live.paused():
                 light = light_of(bench)
                 taken = bench.snap(average, on_frame=lambda n: context.report(n))
@@ -439,11 +443,11 @@ class LivePanel(Panel):
         return self.record_bar.job is not None
 
     @property
-    def light(self) -> Light:
+    def light(self) -> LightState:
         """What is lit, as far as the program knows."""
         return light_of(self.session.bench)
 
-    def switch_light(self, light: Light, *, quiet: bool = False) -> None:
+    def switch_light(self, light: LightState, *, quiet: bool = False) -> None:
         """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         try:
             self.tells(self.session.switch_light(light, quiet=quiet)).ended.connect(self._show_light)
@@ -483,10 +487,10 @@ class LivePanel(Panel):
 
     def _light_the_scene(self) -> None:
         """Begin with something to see, where the simulated world can light it by itself."""
-        if self.session.config.scene.control != "simulated" or self.light is not Light.DARK:
+        if self.session.config.scene.control != "simulated" or self.light is not LightState.DARK:
             return
         if "led_array" in self.session.kinds:
-            self.switch_light(Light.SCENE, quiet=True)
+            self.switch_light(LightState.SCENE, quiet=True)
         else:  # nobody is asked to darken a point source that may not be there
             job = self.session.device_job(
                 "Light: scene", lambda _: self.session.bench.scene_on(), {"light"}, quiet=True

@@ -30,10 +30,9 @@ from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.formatting import duration
-from instrument.live.full_picture import full_picture
-from instrument.live.live import LiveResult
+from instrument.live.live import LiveResult, full_picture
 from instrument.reconstruction.job import find_calibration
-from instrument.runs.snapshot import Light, light_of
+from instrument.runs.snapshot import LightState, light_of
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.streams.live import LiveReconstructor
@@ -297,7 +296,7 @@ class LiveReconstructionPanel(Panel):
         self._log_new(() if how is None else how.warnings)
         rate = "" if how is None or not how.pictures_per_s > 0 else f", {how.pictures_per_s:.1f} pictures/s"
         passed = "" if how is None else f", {how.passed_over} frames passed over"
-        dark = light_of(self.session.bench) is Light.DARK
+        dark = light_of(self.session.bench) is LightState.DARK
         warning = "Nothing is lit: this is a picture of noise. " if dark else ""
         self.status.setText(
             f"{warning}latency {result.latency_ms:.0f} ms{rate}{passed}\n{result.picture.quality}"

@@ -24,25 +24,25 @@ from PySide6.QtWidgets import (
 )
 
 from gui.background_reading import NewestOnly
+from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
-from gui.python_lines import expression
 from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
 from gui.theme import as_shown
 from gui.widgets.dialogues import Question, choose_path
-from gui.widgets.reconstruct_form import CALIBRATION, PSF, ReconstructForm
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import write_image
-from instrument.files.plane_steps import uneven_steps
+from instrument.files.volume_zarr import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.result_list import find_results, free_result
 from instrument.reconstruction.stored_result import StoredResult, open_result
+from recon.base.declare import expression
 from recon.reconstruction.choice import Choice
 
 Views = dict[Path, npt.NDArray[np.uint8]]
@@ -104,10 +104,8 @@ class ReconstructionsPanel(Panel):
         self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
         self._suggest_out()
-        self.form.image.editingFinished.connect(self._suggest_out)
-        self.form.psfs.editingFinished.connect(self._look_at_psfs)
         self._depths = NewestOnly(self.jobs, "Reading a calibration's depths")
-        self.form.kind.currentTextChanged.connect(lambda _: self._suggest_out())
+        self.form.options.settled.connect(self._settled)
         self.refresh()
 
     def _arrange(self) -> None:
@@ -145,7 +143,7 @@ class ReconstructionsPanel(Panel):
         whole.addWidget(self.tabs)
         whole.addWidget(right)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([270, 900])
+        whole.setSizes([310, 860])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)
@@ -317,13 +315,19 @@ class ReconstructionsPanel(Panel):
     # Reconstructing ------------------------------------------------------------------------------
     def _suggest_out(self) -> None:
         """Name the result after the photograph, where nothing is written yet; a name that was typed stays."""
-        field = self.form.out
-        if field.text() not in ("", str(self._suggested)):
+        if self.form.text("out") not in ("", str(self._suggested)):
             return
         folder = self.session.runs_folder / "reconstructions"
-        stem = Path(self.form.image.text()).stem or "reconstruction"
-        self._suggested = free_name(folder, stem, ".tif")
-        field.setText(str(self._suggested))
+        stem = Path(self.form.text("image")).stem or "reconstruction"
+        self._suggested = free_result(folder, stem, ".tif")
+        self.form.options.set_values({"out": self._suggested})
+
+    def _settled(self, name: str) -> None:
+        """Follow what was named in the form: the result's name, the depths to choose from."""
+        if name in ("image", "kind"):
+            self._suggest_out()
+        if name in ("calibration", "kind"):
+            self._look_at_depths()
 
     def reconstruct(self) -> Job | None:
         """Do what the form asks for; the picture so far is shown as it comes."""
@@ -432,24 +436,26 @@ class ReconstructionsPanel(Panel):
     def take(self, path: Path) -> None:
         """Put a calibration's folder, or a photograph, into the form."""
         self.tabs.setCurrentWidget(self.form)
-        if path.is_dir() and self.form.kind.currentText() == PSF:
-            self.form.kind.setCurrentText(CALIBRATION)
-        field = self.form.psfs if path.is_dir() else self.form.image
-        field.setText(str(path))
-        field.editingFinished.emit()
-        if field is self.form.image and not self.form.psfs.text() and self.form.kind.currentText() != PSF:
+        form = self.form
+        if path.is_dir() and form.kind == PSF:
+            form.options.set_values({"kind": CALIBRATION})
+        form.options.set_values({form.source if path.is_dir() else "image": path})
+        if not path.is_dir() and not form.text(form.source) and form.kind != PSF:
             folder = self.session.runs_folder
             self._depths.ask(lambda: newest_calibration(folder), self._offer_calibration)
 
     def _offer_calibration(self, newest: Path | None) -> None:
         """Begin with the newest calibration where none was named."""
-        if newest is not None and not self.form.psfs.text():
-            self.form.psfs.setText(str(newest))
-            self.form.psfs.editingFinished.emit()
+        if newest is not None and not self.form.text(self.form.source):
+            self.form.options.set_values({self.form.source: newest})
 
-    def _look_at_psfs(self) -> None:
-        path = Path(self.form.psfs.text().strip()).expanduser()
-        self._depths.ask(lambda: _depths_of(path), self.form.show_depths)
+    def _look_at_depths(self) -> None:
+        path = Path(self.form.text("calibration")).expanduser()
+        if self.form.kind == CALIBRATION and path.name:
+            self._depths.ask(lambda: _depths_of(path), self.form.show_depths)
+        else:
+            self._depths.forget()
+            self.form.show_depths(())
 
     def as_python(self) -> str:
         """Return lines that make the reconstruction of the form, or open the result that is shown."""
@@ -478,6 +484,7 @@ class ReconstructionsPanel(Panel):
         """Close the volume that is shown and end the work."""
         if self.job is not None:
             self.job.cancel()
+        self._depths.forget()
         self._close_result()
 
 

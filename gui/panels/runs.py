@@ -32,17 +32,15 @@ from calibration_routines.procedure import Outcome
 from calibration_routines.psf.sweep import FOLDER
 from calibration_routines.psf.sweep_record import is_sweep
 from gui.background_reading import NewestOnly
-from gui.forms.as_python import script
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun
+from gui.procedure_run import Ended, ProcedureRun, script
 from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.run_bar import RunBar
 from instrument.runs.catalogue import RunSummary, run_paths, summary
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _LEVELS = (0.1, 99.9)

@@ -25,8 +25,7 @@ from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
 from gui.widgets.plot import curve_pen, plot_widget, restyle
 from instrument.files.errors import BenchError
-from instrument.files.slm_correction import SlmCorrection, load_slm_correction, show_levels
-from instrument.files.slm_image import read_slm_image
+from instrument.files.slm_image import SlmCorrection, load_slm_correction, read_slm_image, show_levels
 
 _LOOK_MS = 500
 _IMAGES = "Phase pictures (*.png *.tif *.tiff *.bmp *.npy)"
@@ -101,7 +100,7 @@ class SlmPanel(Panel):
         return (
             "from pathlib import Path\n\n"
             "from instrument.bench.bench import open_bench\n"
-            "from instrument.files.slm_correction import load_slm_correction, show_levels\n"
+            "from instrument.files.slm_image import load_slm_correction, show_levels\n"
             "from instrument.files.slm_image import read_slm_image\n\n"
             f"correction = {f'load_slm_correction(Path({table!r}))' if table else None}\n"
             f"with open_bench({str(path) if path else None!r}) as bench:\n"

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxL
 from calibration_routines import Photograph, SweepCalibration
 from calibration_routines.procedure import Outcome, Outlook
 from calibration_routines.psf.sweep_watch import PointTaken
-from gui.forms.routines import ROUTINES
+from gui.forms.routines import PLAN, forms
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
 from gui.session import BenchSession
@@ -44,7 +44,7 @@ class SweepsPanel(ProcedurePanel):
         self.frame_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self.psfs = PsfTable()
         self.picture = Picture()
-        super().__init__(session, ROUTINES, "Start", parent)
+        super().__init__(session, [*forms(), PLAN], "Start", parent)
         shown = QWidget()
         column = QVBoxLayout(shown)
         column.setContentsMargins(0, 0, 0, 0)

@@ -18,8 +18,7 @@ from instrument.files.errors import FileError
 from instrument.files.formatting import size
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, there_now
-from instrument.runs.recorder import Recorder, RecordingStatus
-from instrument.runs.recording import prepare_recording
+from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
 from instrument.runs.snapshot import Lit
 

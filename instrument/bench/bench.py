@@ -20,14 +20,12 @@ from drivers.registry.claim import Claim
 from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.camera_settings import apply_table
-from instrument.bench.closing_at_exit import ClosingAtExit
 from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.bench.config_file import load_config
-from instrument.bench.known_optics import known_geometry
 from instrument.bench.lights import Ask, Lights, SceneSwitch
 from instrument.bench.photograph import Snapshot, photograph
-from instrument.bench.safety import Step, StepsFailedError, safe_steps, try_all
-from instrument.bench.source_mount import Position, SourceMount
+from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
+from instrument.bench.source_mount import Position, SourceMount, known_geometry
 from instrument.files.errors import BenchError
 from recon.types import Geometry
 
@@ -347,7 +345,7 @@ class Bench:
         self._opened.discard(device)
         device.close()
 
-    def _safe_steps(self) -> list[Step]:
+    def _safe_steps(self) -> list[SafeStep]:
         blanks = self.slm is not None and cast(SlmTable, self.config.devices["slm"].settings).blank_when_safe
         return safe_steps(
             self.led_array,

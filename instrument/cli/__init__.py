@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(_unknown(name))
         return 2
     try:
-        from instrument.cli.run import run_command
+        from instrument.cli.dispatch import run_command
 
         return run_command(name, command, rest, debug=debug)
     except KeyboardInterrupt:  # so early, or so late, that run_command could not say it

@@ -10,22 +10,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calibration_routines import finish_sweep, is_sweep, watch_resumed
-from calibration_routines.plan_procedures import finish_simple
-from calibration_routines.psf.sweep import FOLDER
-from calibration_routines.psf.sweep_procedure import event_lines
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.cli.progress import keys, one_task, progress_bar
-from instrument.cli.sweeping import describe_result, print_lines
 from instrument.files.formatting import duration, size
 from instrument.plan import Plan, check
 from instrument.plan.file import load_plan
 from instrument.runs.acquire import abilities_of, free_bytes, prepare
-from instrument.runs.layout import BENCH_TOML, FinishReason, RunCondition
 from instrument.runs.resume import prepare_resume
-from instrument.runs.run import Run
+from instrument.runs.run import BENCH_TOML, FinishReason, Run, RunCondition
 from instrument.runs.runner import Runner, RunState, RunStatus
 from instrument.runs.writer import RunWriter
 
@@ -145,6 +139,11 @@ def resume(
     cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
     last frame is there, a run of calibrate angular or dpc its response or surface.
     """
+    from calibration_routines import is_sweep, watch_resumed
+    from calibration_routines.psf.sweep import FOLDER
+    from calibration_routines.psf.sweep_procedure import event_lines
+    from instrument.cli.calibrate import print_lines
+
     found = Run.open(run)
     if found.plan is None:
         _close_recording(found)
@@ -175,18 +174,24 @@ def resume(
 
 def _finish(run: Path, bench: Bench | None) -> None:
     """Make a sweep's calibration of its complete run, with retakes where there is a bench."""
+    from calibration_routines import finish_sweep
+    from calibration_routines.psf.sweep_procedure import sweep_outcome
+    from instrument.cli.calibrate import print_outcome
+
     with one_task("Analysing") as advance:
         done = finish_sweep(run, bench, on_analysis=advance)
-    describe_result(Console(), done)
+    print_outcome(Console(), sweep_outcome(done))
 
 
 def _finish_others(run: Run) -> None:
     """Make the result of a complete run of calibrate angular or dpc that has none yet."""
+    from calibration_routines.plan_procedures import finish_simple
+    from instrument.cli.calibrate import print_outcome
+
     with one_task("Analysing"):
         outcome = finish_simple(run)
-    if outcome is None:
-        return
-    print_lines(Console(), [*outcome.verdict, *(f"Wrote        {file}" for file in outcome.files)])
+    if outcome is not None:
+        print_outcome(Console(), outcome)
 
 
 def _close_recording(run: Run) -> None:

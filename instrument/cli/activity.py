@@ -14,10 +14,10 @@ from instrument.cli.options import Only
 from instrument.files.errors import BenchError, FileError
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
-from instrument.reconstruction.inputs import InputOptions, SourceOptions
+from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.request import Settings
 from instrument.reconstruction.video_output import VideoPictures
-from instrument.runs.layout import STATE
+from instrument.runs.run import STATE
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions
 

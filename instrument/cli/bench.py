@@ -6,28 +6,19 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-from drivers.camera import Camera
-from drivers.device import Device, Setting
-from drivers.errors import DeviceError
-from drivers.led_array import LedArray
-from drivers.registry.discovery import BUSES, FoundDevice
-from drivers.registry.listing import Listing, list_devices
-from drivers.registry.registry import KINDS, driver_names, registration_mistakes
-from drivers.slm import Slm
-from drivers.stage import Stage
-from instrument.bench.bench import Bench
-from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
-from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, load_and_say
-from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from drivers.device import Device, Setting
+    from drivers.registry.discovery import FoundDevice
+    from drivers.registry.listing import Listing
 
 new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
 
@@ -44,7 +35,7 @@ _OF_THE_WINDOW = ("PySide6", "shiboken6", "pyqtgraph")
     )
 )
 def new(
-    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path(DEFAULT_NAME),
+    file: Annotated[Path, typer.Argument(help="The file to write.")] = Path("bench.toml"),
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     display: Annotated[bool, typer.Option("--display", help="A holographic display instead.")] = False,
     led_microscope: Annotated[
@@ -52,6 +43,9 @@ def new(
     ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
+    from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
+    from instrument.files.atomic import write_text
+
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
     if file.exists() and not force:
@@ -76,6 +70,12 @@ def check(bench: BenchOption = None) -> None:
 
     Ends with the light off. Nothing moves. Exit status 1 when a device fails; all failures are reported.
     """
+    from rich.console import Console
+
+    from drivers.errors import DeviceError
+    from instrument.bench.bench import Bench
+    from instrument.bench.safety import StepsFailedError
+
     console = Console()
     config = load_and_say(bench)
     opened = Bench(config)
@@ -103,6 +103,9 @@ def check(bench: BenchOption = None) -> None:
 
 
 def _print_device(console: Console, kind: str, device: Device) -> None:
+    from rich import box
+    from rich.table import Table
+
     identity = device.identity
     mark = "  SIMULATED" if identity.simulated else ""
     console.print(f"{kind}: {identity.vendor} {identity.model}{mark}", markup=False, style="bold")
@@ -126,6 +129,11 @@ def _settings(settings: Mapping[str, Setting]) -> Iterator[tuple[str, str]]:
 
 
 def _limits(device: Device) -> Iterator[tuple[str, str]]:
+    from drivers.camera import Camera
+    from drivers.led_array import LedArray
+    from drivers.slm import Slm
+    from drivers.stage import Stage
+
     if isinstance(device, Camera):
         yield "sensor, pixels", "{} x {}".format(*device.sensor_shape)
         yield "pixel pitch", f"{device.pixel_pitch_um:g} um"
@@ -163,6 +171,8 @@ def drivers() -> None:
     No device is touched. Their keys are in docs/reference/bench-toml.md, or in the documentation of the
     package that brings them.
     """
+    from drivers.registry.registry import KINDS, driver_names, registration_mistakes
+
     width = max(map(len, KINDS)) + 2
     for kind in KINDS:
         typer.echo(f"{kind:<{width}}{', '.join(driver_names(kind)) or 'none'}")
@@ -190,6 +200,8 @@ def devices(
     Devices that a driver is sure of come with the lines to put into bench.toml. Without --probe nothing is
     written to any serial port, so a stage behind a common USB adapter is only listed as a port.
     """
+    from drivers.registry.listing import list_devices
+
     listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
     typer.echo(_listing_json(listing) if as_json else _listing_words(listing))
 
@@ -200,6 +212,8 @@ def _listing_json(listing: Listing) -> str:
 
 
 def _listing_words(listing: Listing) -> str:
+    from drivers.registry.discovery import BUSES
+
     lines: list[str] = []
     others = sorted({device.bus for device in listing.found} - set(BUSES))
     for bus in (*BUSES, *others):

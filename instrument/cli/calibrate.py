@@ -1,296 +1,271 @@
-"""``diffuserbench calibrate``: measure what the reconstruction needs to know about the bench."""
+"""``diffuserbench calibrate`` and ``align``: a command for each registered routine, made of its options."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Self
 
+import numpy as np
+import numpy.typing as npt
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, TaskID
 
-from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
-from instrument.cli import calibrate_angular, calibrate_beads, calibrate_dpc, calibrate_slm
+from calibration_routines.optics.beads import (
+    BeadCalibration,
+    BeadFiles,
+    BeadSlides,
+    calibrate_beads,
+    mean_images,
+    psf_lines,
+    save_beads,
+)
+from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, routines
+from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
+from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.cli.app import App, BenchOption, examples, open_and_say
-from instrument.cli.numbers import finite, positive
-from instrument.cli.sweeping import say_and_take
+from instrument.cli.options import Given
+from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError
+from instrument.files.images import read_image
+from instrument.runs.runner import RunStatus
+from recon.types import Geometry
 
-app = App("Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.")
-
-ZMin = Annotated[
-    float, typer.Option("--z-min", metavar="MM", callback=finite, help="Nearest plane, from the diffuser.")
-]
-Planes = Annotated[
-    int | None,
-    typer.Option(help="Number of planes, evenly spaced in 1/z; left out: as many as the optics need."),
-]
-Average = Annotated[int, typer.Option(help="Frames a PSF.")]
-DarkFrames = Annotated[int, typer.Option(help="Dark frames at the shortest and longest exposure each.")]
-X = Annotated[
-    float,
-    typer.Option(metavar="MM", callback=finite, help="Lateral place of the source, or the grid's centre."),
-]
-Target = Annotated[
-    float,
-    typer.Option(callback=finite, help="Level of each PSF's 99.9th percentile, as a fraction of full scale."),
-]
-Dct = Annotated[
-    int,
-    typer.Option(metavar="N", help="Remove the N x N lowest DCT coefficients (stray light); 0: none."),
-]
-BinningText = Annotated[
-    str,
-    typer.Option(
-        "--binning",
-        metavar="N|auto",
-        help="Software binning, on top of the camera's; auto: as far as the PSF's finest structure allows.",
-    ),
-]
-Every = Annotated[
-    int,
-    typer.Option(
-        "--reference-every", metavar="N", help="PSFs between two visits to the reference point; 0: none."
-    ),
-]
-Lenslet = Annotated[
-    float | None,
-    typer.Option(
-        "--lenslet", metavar="UM", callback=positive, help="Lenslet diameter, for the number of planes."
-    ),
-]
-Wavelength = Annotated[
-    float | None,
-    typer.Option("--wavelength", metavar="NM", callback=positive, help="For --lenslet; default: [geometry]."),
-]
-Out = Annotated[
+RunFolder = Annotated[
     Path | None,
-    typer.Option(metavar="FOLDER", help="Where the run's folder goes; left out: the bench's data folder."),
+    typer.Option(
+        "--out", metavar="FOLDER", help="Where the run's folder goes; left out: the bench's data folder."
+    ),
 ]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only say what would be done, and why; nothing moves.")
 ]
-HalfField = Annotated[
-    float | None,
-    typer.Option(
-        metavar="MM",
-        callback=finite,
-        help="Half the grid's width (height); left out: what a reconstruction shows.",
-    ),
-]
-Spacing = Annotated[
-    float | None,
-    typer.Option(
-        "--spacing",
-        metavar="MM",
-        callback=positive,
-        help="Of the points; left out: by Nyquist of the fall-off.",
-    ),
-]
-FallOffDeg = Annotated[
-    float | None,
-    typer.Option(
-        "--fall-off-deg",
-        metavar="DEG",
-        callback=positive,
-        help="Standard deviation of a Gaussian angular response.",
-    ),
-]
-ResponseFile = Annotated[
-    Path | None,
-    typer.Option("--response", metavar="FILE", help="Angular response, from calibrate angular."),
-]
+_HELP = {
+    "calibrate": "Measure PSFs, the sensor's angular response, the diffuser, or how an SLM answers.",
+    "align": "Align the holographic display.",
+}
+BEADS = "beads"
+_LABELS = {".png": "Picture", ".tif": "Photograph"}
 
 
-@app.callback()
-def calibrate() -> None:
-    """Measure what the reconstruction needs to know about the bench."""
+def __getattr__(name: str) -> App:
+    """Give ``app`` and ``align_app`` with what is registered when they are asked for."""
+    if name in ("app", "align_app"):
+        return app_of("align" if name == "align_app" else "calibrate")
+    raise AttributeError(name)
 
 
-app.command(epilog=calibrate_slm.EPILOG)(calibrate_slm.slm)
-app.command(epilog=calibrate_angular.EPILOG)(calibrate_angular.angular)
-app.command(epilog=calibrate_dpc.EPILOG)(calibrate_dpc.dpc)
-app.command(epilog=calibrate_beads.EPILOG)(calibrate_beads.beads)
+def app_of(command: str) -> App:
+    """Return the application of a command with a subcommand for each of its routines."""
+    app = App(_HELP[command])
+
+    @app.callback()
+    def begin() -> None:
+        pass
+
+    begin.__doc__ = _HELP[command]
+    for routine in routines.values():
+        if routine.command == command:
+            made = _beads if routine.name == BEADS else _function(routine)
+            app.command(routine.name, epilog=examples(*routine.examples), help=_help(routine))(made)
+    return app
 
 
-@app.command(
-    epilog=examples(
-        "diffuserbench calibrate axial --z-min 100 --z-max 300 --planes 12",
-        "diffuserbench calibrate axial --z-min 300          one PSF, 300 mm in front of the diffuser",
-        "diffuserbench calibrate axial --z-min 100 --z-max 300 --dry-run",
-    )
-)
-def axial(
-    z_min: ZMin,
-    z_max: Annotated[
-        float | None,
-        typer.Option(
-            "--z-max", metavar="MM", callback=finite, help="Farthest plane; left out: one PSF at --z-min."
-        ),
+def _help(routine: Routine) -> str:
+    return f"{routine.help}\n\n{routine.details}".rstrip()
+
+
+def _function(routine: Routine) -> Callable[..., None]:
+    """Return the function of a command: the routine's options, and where it takes place."""
+
+    def with_file(options: Any, dry_run: DryRun = False, bench: BenchOption = None) -> None:
+        if options.out is None:
+            options = replace(options, out=Path(routine.file))
+        carry_out(routine, options, bench, dry_run=dry_run)
+
+    def with_run(
+        options: Any, dry_run: DryRun = False, out: RunFolder = None, bench: BenchOption = None
+    ) -> None:
+        carry_out(routine, options, bench, out, dry_run=dry_run)
+
+    function: Callable[..., None] = with_file if routine.file else with_run
+    function.__annotations__["options"] = routine.options
+    return function
+
+
+def carry_out(
+    routine: Routine, options: Any, bench: Path | None, folder: Path | None = None, *, dry_run: bool = False
+) -> None:
+    """Say what a routine will do and why, then do it and say how good it is; a dry run ends before that."""
+    console = Console()
+    procedure = routine.procedure(options)
+    with open_and_say(bench) as opened:
+        outlook = procedure.outlook(opened, folder)
+        print_lines(console, outlook.reasons)
+        if dry_run:
+            print_lines(console, outlook.plan_lines or _plan_lines(outlook))
+            console.print("Dry run: nothing moved, no frame was taken.")
+            return
+        if not outlook.plan_lines:  # else said when the exposures are known
+            print_lines(console, _plan_lines(outlook))
+        with Told(console) as told:
+            done = procedure.carry_out(opened, folder, listener=told)
+        print_outcome(console, done)
+
+
+def _plan_lines(outlook: Outlook) -> list[str]:
+    if outlook.cost is None:
+        return []
+    return [f"Plan: {outlook.cost.frames} frames, {outlook.cost.seconds:.0f} s of exposure and motion."]
+
+
+def print_outcome(console: Console, done: Outcome) -> None:
+    """Print what was measured, how good it is, and where everything lies."""
+    print_lines(console, done.verdict)
+    written = [("Run", run) for run in done.runs[:1]]
+    written += [("Calibration", done.calibration)] if done.calibration is not None else []
+    written += [(_LABELS.get(file.suffix, "Result"), file) for file in done.files]
+    for label, path in written:
+        console.print(f"{label:<13}{escape(str(path))}", soft_wrap=True)
+
+
+class Told(Listener):
+    """Shows a bar for each step of a procedure, and prints what is found before frames are taken.
+
+    A context, which takes away the last bar.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console()
+        self._open = ExitStack()
+        self._bar: tuple[Progress, TaskID] | None = None
+        self._words = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pause()
+
+    def step(self, words: str) -> None:
+        """Begin a bar of its own."""
+        self.pause()
+        self._words = words
+        if words.startswith("homing"):
+            typer.echo("Homing the stage.", err=True)
+        bar = self._open.enter_context(progress_bar())
+        self._bar = bar, bar.add_task(words[:1].upper() + words[1:], total=None, note="")
+
+    def pause(self) -> None:
+        """Take the bar away, for lines to be printed."""
+        self._open.close()
+        self._bar = None
+
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        """Advance the bar."""
+        if self._bar is not None:
+            bar, task = self._bar
+            scale = 100 if total == 1 else 1  # a fraction is shown in parts of a hundred
+            bar.update(task, completed=round(scale * done), total=scale * total)
+            if at_most:
+                bar.update(task, note="at most")
+
+    def exposures(self, found: SweepExposures) -> None:
+        """Print them."""
+        self._print(exposure_lines(found))
+
+    def planned(self, lines: Sequence[str]) -> None:
+        """Print what will be taken."""
+        self._print(lines)
+
+    def _print(self, lines: Sequence[str]) -> None:
+        words, self._words = self._words, ""
+        self.pause()
+        print_lines(self._console, lines)
+        if words:
+            self.step(words)
+
+    def frame(self, status: RunStatus) -> None:
+        """Advance the bar."""
+        self.share(status.done, status.total)
+
+    def event(self, event: SweepEvent) -> None:
+        """Show the newest PSF's figures beside the bar, and print what is wrong above it."""
+        if self._bar is not None:
+            bar, task = self._bar
+            bar.update(task, note=event_note(event))
+            print_lines(bar.console, event_lines(event))
+
+
+def print_lines(console: Console, lines: Sequence[str]) -> None:
+    """Print sentences, one a line, as they are."""
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
+
+
+# Bead slides from files --------------------------------------------------------------------------------
+def _beads(
+    options: BeadSlides,
+    photographed: BeadFiles,
+    given: Given,
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[IMAGE]...", help="Photographs of beads; left out: taken on the bench."),
     ] = None,
-    planes: Planes = None,
-    average: Average = 4,
-    dark_frames: DarkFrames = 4,
-    x: X = 0.0,
-    y: X = 0.0,
-    target: Target = 0.7,
-    dct: Dct = 0,
-    binning: BinningText = "1",
-    reference_every: Every = 16,
-    lenslet: Lenslet = None,
-    wavelength: Wavelength = None,
-    by_hand: Annotated[
-        bool, typer.Option("--by-hand", help="The source was placed by hand at --z-min; nothing moves.")
-    ] = False,
     dry_run: DryRun = False,
-    out: Out = None,
     bench: BenchOption = None,
 ) -> None:
-    """Move the point source along the axis and measure one PSF a plane.
-
-    Finds the exposures without saturating, takes dark frames, sweeps, judges every PSF in words, takes bad
-    planes again, and saves the calibration in the run's folder. Ends with the light off.
-    """
-    with open_and_say(bench) as opened:
-        request = AxialRequest(
-            z_min_um=1e3 * z_min,
-            z_max_um=_micrometres(z_max),
-            planes=planes,
-            lenslet_um=lenslet,
-            wavelength_nm=wavelength,
-            x_um=1e3 * x,
-            y_um=1e3 * y,
-            average=average,
-            dark_frames=dark_frames,
-            target=target,
-            dct_order=dct,
-            binning=_binning(binning),
-            by_hand=by_hand,
-            reference_every=reference_every,
+    routine = routines[BEADS]
+    out = options.out or Path(routine.file)
+    options = replace(options, out=out)
+    useless = given.flags(*(field.name for field in fields(photographed)))
+    if useless and not files:
+        raise BenchError(
+            f"{' and '.join(useless)} go with image files; on the bench dark frames are taken and the "
+            "geometry is that of bench.toml. Leave them out, or name the files."
         )
-        say_and_take(Console(), opened, request, out, dry_run=dry_run)
+    if not files:
+        carry_out(routine, options, bench, dry_run=dry_run)
+        return
+    options.refuse_existing()
+    if options.binning > 1:
+        raise BenchError("--binning is for photographs taken on the bench: bin the files beforehand.")
+    read = [read_image(path) for path in files]
+    taken = mean_images([image.pixels for image in read]) - np.float32(photographed.dark)
+    facts = {"files": [str(path) for path in files], "simulated": any(i.is_simulated for i in read)}
+    geometry = Geometry(pixel_pitch_um=photographed.pixel_um, diffuser_distance_mm=photographed.distance_mm)
+    slides = replace(options, images=max(len(files), 2))
+    if dry_run:
+        print_lines(
+            Console(),
+            [f"{len(files)} files, read and found alike", *psf_lines(slides, geometry, taken.shape[1:])],
+        )
+        typer.echo("Dry run: nothing was solved.")
+        return
+    done = _solved(taken, slides, geometry, facts)
+    print_outcome(Console(), save_beads(done, slides, out))
 
 
-@app.command(
-    epilog=examples(
-        "diffuserbench calibrate lateral --z 300 --dry-run          the grid, and why",
-        "diffuserbench calibrate lateral --z 1.7 --fall-off-deg 13 --half-field-x 1.2 --half-field-y 0.8",
-        "diffuserbench calibrate lateral --z 300 --spacing 40",
-    )
-)
-def lateral(
-    z: Annotated[
-        float,
-        typer.Option("--z", metavar="MM", callback=positive, help="Depth of the grid, from the diffuser."),
-    ],
-    half_field_x: HalfField = None,
-    half_field_y: HalfField = None,
-    spacing: Spacing = None,
-    response: ResponseFile = None,
-    fall_off_deg: FallOffDeg = None,
-    average: Average = 4,
-    dark_frames: DarkFrames = 4,
-    x: X = 0.0,
-    y: X = 0.0,
-    target: Target = 0.7,
-    dct: Dct = 0,
-    binning: BinningText = "1",
-    reference_every: Every = 10,
-    dry_run: DryRun = False,
-    out: Out = None,
-    bench: BenchOption = None,
-) -> None:
-    """Move the point source over a grid at one depth and measure a PSF at each point.
+def _solved(
+    taken: npt.NDArray[np.float32], slides: BeadSlides, geometry: Geometry, facts: dict[str, object]
+) -> BeadCalibration:
+    quiet = not sys.stderr.isatty()
+    before = ""
 
-    For a camera whose PSF changes over the field: reconstruct --volume CALIBRATION --model local, lowrank or
-    auto. Each pattern's shift is measured and held against the stage; a reference point is visited again and
-    again to tell whether the source drifts.
-    """
-    request = LateralRequest(
-        z_um=1e3 * z,
-        half_field_x_um=_micrometres(half_field_x),
-        half_field_y_um=_micrometres(half_field_y),
-        spacing_um=_micrometres(spacing),
-        response=response,
-        fall_off_deg=fall_off_deg,
-        x_um=1e3 * x,
-        y_um=1e3 * y,
-        average=average,
-        dark_frames=dark_frames,
-        target=target,
-        dct_order=dct,
-        binning=_binning(binning),
-        reference_every=reference_every,
-    )
-    with open_and_say(bench) as opened:
-        say_and_take(Console(), opened, request, out, dry_run=dry_run)
+    with progress_bar() as bar:
+        task = bar.add_task("Blind deconvolution", total=100, note="")
 
+        def progress(what: str, share: float) -> None:
+            nonlocal before
+            bar.update(task, completed=round(100 * share), note=what)
+            if quiet and what != before:  # a log has no bar, but should show that something goes on
+                typer.echo(f"{share:4.0%} {what}", err=True)
+                before = what
 
-@app.command(
-    epilog=examples(
-        "diffuserbench calibrate volume --z-min 100 --z-max 300 --dry-run",
-        "diffuserbench calibrate volume --z-min 1.7 --z-max 3 --lenslet 250 --wavelength 520 "
-        "--fall-off-deg 13",
-    )
-)
-def volume(
-    z_min: ZMin,
-    z_max: Annotated[float, typer.Option("--z-max", metavar="MM", callback=finite, help="Farthest plane.")],
-    planes: Planes = None,
-    half_field_x: HalfField = None,
-    half_field_y: HalfField = None,
-    spacing: Spacing = None,
-    response: ResponseFile = None,
-    fall_off_deg: FallOffDeg = None,
-    lenslet: Lenslet = None,
-    wavelength: Wavelength = None,
-    average: Average = 4,
-    dark_frames: DarkFrames = 4,
-    x: X = 0.0,
-    y: X = 0.0,
-    target: Target = 0.7,
-    dct: Dct = 0,
-    binning: BinningText = "1",
-    reference_every: Every = 10,
-    dry_run: DryRun = False,
-    out: Out = None,
-    bench: BenchOption = None,
-) -> None:
-    """Move the point source over a grid at each of several depths, evenly spaced in 1/z.
-
-    As lateral, plane after plane. The number of planes and of points follows from the optics unless given.
-    """
-    request = VolumeRequest(
-        z_min_um=1e3 * z_min,
-        z_max_um=1e3 * z_max,
-        planes=planes,
-        lenslet_um=lenslet,
-        wavelength_nm=wavelength,
-        half_field_x_um=_micrometres(half_field_x),
-        half_field_y_um=_micrometres(half_field_y),
-        spacing_um=_micrometres(spacing),
-        response=response,
-        fall_off_deg=fall_off_deg,
-        x_um=1e3 * x,
-        y_um=1e3 * y,
-        average=average,
-        dark_frames=dark_frames,
-        target=target,
-        dct_order=dct,
-        binning=_binning(binning),
-        reference_every=reference_every,
-    )
-    with open_and_say(bench) as opened:
-        say_and_take(Console(), opened, request, out, dry_run=dry_run)
-
-
-def _micrometres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else 1e3 * length_mm
-
-
-def _binning(text: str) -> int:
-    """Return the software binning; 0 stands for automatic."""
-    if text == "auto":
-        return 0
-    if not text.isdecimal() or int(text) < 1:
-        raise BenchError(f"--binning takes a whole number from 1, or auto; not {text!r}.")
-    return int(text)
+        return calibrate_beads(taken, slides, geometry, provenance=facts, progress=progress)

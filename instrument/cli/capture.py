@@ -13,10 +13,15 @@ from instrument.bench.photograph import Snapshot
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.formatting import duration, size
-from instrument.runs.recorder import RecordingStatus
-from instrument.runs.recording import prepare_recording
+from instrument.runs.recorder import RecordingStatus, prepare_recording
 from instrument.runs.run import Run
-from instrument.runs.snapshot import Light, check_target, photograph_name, switch_light, write_snapshot
+from instrument.runs.snapshot import (
+    LightState,
+    check_photograph_file,
+    photograph_name,
+    switch_light,
+    write_snapshot,
+)
 from recon.base.declare import option
 
 snap_app, record_app = App(), App()
@@ -50,7 +55,7 @@ class CaptureOptions:
         group=_LIGHT,
     )
 
-    def light(self) -> Light:
+    def light(self) -> LightState:
         """Return the light asked for.
 
         Raises
@@ -58,13 +63,13 @@ class CaptureOptions:
         typer.BadParameter
             When more than one is.
         """
-        flags = {Light.SCENE: self.scene, Light.SOURCE: self.source, Light.DARK: self.dark}
+        flags = {LightState.SCENE: self.scene, LightState.SOURCE: self.source, LightState.DARK: self.dark}
         chosen = [name for name, is_set in flags.items() if is_set]
         if len(chosen) > 1:
             raise typer.BadParameter(f"choose one of --{', --'.join(chosen)}.")
         if chosen:
             return chosen[0]
-        return Light.AS_IS if self.as_is else Light.SCENE
+        return LightState.AS_IS if self.as_is else LightState.SCENE
 
     def set_camera(self, bench: Bench) -> None:
         """Give the camera what was asked for."""
@@ -139,7 +144,7 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     """
     light = options.light()
     target = options.out or Path(photograph_name())
-    check_target(target, options.average, force=options.force)
+    check_photograph_file(target, options.average, force=options.force)
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)
@@ -154,7 +159,7 @@ def _photograph(bench: Bench, average: int) -> Snapshot:
         return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))
 
 
-def _report(target: Path, taken: Snapshot, light: Light) -> None:
+def _report(target: Path, taken: Snapshot, light: LightState) -> None:
     height, width = taken.image.shape[:2]
     metadata = taken.metadata
     frames = "1 frame" if taken.average == 1 else f"mean of {taken.average} frames"
@@ -166,7 +171,7 @@ def _report(target: Path, taken: Snapshot, light: Light) -> None:
         f"Counts {float(taken.image.min()):g} to {float(taken.image.max()):g}, "
         f"mean {float(np.mean(taken.image, dtype=np.float64)):.1f}, of {taken.full_scale}."
     )
-    if light is not Light.DARK and taken.image.max() < DIM * taken.full_scale:
+    if light is not LightState.DARK and taken.image.max() < DIM * taken.full_scale:
         typer.echo(
             f"Note: the brightest pixel is below {DIM:.0%} of full scale; lengthen --exposure-ms.",
             err=True,

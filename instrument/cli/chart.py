@@ -14,7 +14,7 @@ from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_
 from instrument.cli.options import Given, Only
 from instrument.cli.progress import progress_bar
 from instrument.files.errors import BenchError
-from instrument.reconstruction.inputs import InputOptions, SourceOptions
+from instrument.reconstruction.options import InputOptions, SourceOptions
 from recon.base.declare import option
 from recon.base.option_text import size as size_of
 
@@ -333,7 +333,7 @@ def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float
 
 def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
     """Say what the held-out pixels cannot tell from the best setting."""
-    from recon.evaluation.even import SETTLED_ITERATIONS
+    from recon.evaluation.scored import SETTLED_ITERATIONS
 
     best, others = even[0], sorted({p.setting for p in even[1:]} - {even[0].setting})
     when = f"after {SETTLED_ITERATIONS} iterations or more" if on_the_way else group
@@ -350,7 +350,7 @@ def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
 
 
 def _told(point: Point) -> str:
-    from instrument.evaluation.chart_words import in_words
+    from instrument.evaluation.chart_data import in_words
 
     # Pixel by pixel, as settings were compared; points are drawn by blocks, which every binning has.
     error = (sum(point.held_out_parts) / len(point.held_out_parts)) ** 0.5

@@ -72,7 +72,7 @@ COMMANDS: Mapping[str, Command] = {
     "stability": Command(ANALYSIS, "map where methods fail, against pairs of stresses", "stability"),
     "refocus": Command(ANALYSIS, "bring a calibrated PSF to another depth", "calibrations:refocus_app"),
     "hologram": Command(DISPLAY, "compute the SLM phase that shows a picture through the mask", "hologram"),
-    "align": Command(DISPLAY, "find the scattering mask and bring it to its place", "display:align_app"),
+    "align": Command(DISPLAY, "find the scattering mask and bring it to its place", "calibrate:align_app"),
     "table7.1": Command(
         DISPLAY,
         "the dissertation's comparison of methods, also without aliasing",

@@ -14,24 +14,21 @@ from rich.markup import escape
 from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
 from calibration_routines.demo.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.psf.sweep_procedure import exposure_lines, quality_lines
+from calibration_routines.psf.sweep_procedure import exposure_lines, plan_lines, quality_lines
 from instrument.bench.bench import Bench
 from instrument.cli.app import App, examples
+from instrument.cli.calibrate import print_lines
 from instrument.cli.progress import one_task
-from instrument.cli.sweeping import describe_plan, print_lines
 
 app = App()
 
 
 @app.command(epilog=examples("diffuserbench demo", "diffuserbench demo --out /tmp/demos"))
 def demo(
+    options: DemoSettings,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="FOLDER", help="Where the demo's folder is made.")
     ] = Path("runs"),
-    reconstruction_s: Annotated[
-        float, typer.Option("--reconstruction-s", metavar="S", min=0.1, help="Time for the reconstruction.")
-    ] = DemoSettings().reconstruction_s,
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulated diffuser, sensor and noise.")] = 0,
 ) -> None:
     """Calibrate a SIMULATED lensless camera, photograph a scene with it, reconstruct and judge the picture.
 
@@ -40,7 +37,7 @@ def demo(
     ground truth, and writes everything into one folder. Ctrl-C stops it at any moment, the bench safe.
     """
     audience = _Terminal(Console(highlight=False))
-    result = run_demo(out, audience, DemoSettings(reconstruction_s=reconstruction_s, seed=seed))
+    result = run_demo(out, audience, options)
     audience.verdict(result)
 
 
@@ -62,7 +59,7 @@ class _Terminal:
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
         print_lines(self._console, exposure_lines(exposures))
         plan = sweep_plan(settings.sweep, exposures.exposures_ms)
-        describe_plan(self._console, bench, settings.sweep, plan, None)
+        print_lines(self._console, plan_lines(bench, settings.sweep, plan, None))
 
     def on_sweep(self, done: SweepCalibration) -> None:
         print_lines(self._console, quality_lines(done))

@@ -1,4 +1,4 @@
-"""The holographic display: ``align`` its mask, ``etendue``, and the dissertation's ``table7.1``."""
+"""Holographic displays in figures: ``etendue``, and the dissertation's ``table7.1``."""
 
 from __future__ import annotations
 
@@ -11,19 +11,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from calibration_routines.display.alignment_session import AlignmentSettings
-from calibration_routines.display.display_procedures import AlignmentProcedure, refuse_existing
-from instrument.cli.app import App, BenchOption, examples, open_and_say, require_new, saying_what_is_left
+from instrument.cli.app import App, examples, require_new, saying_what_is_left
 from instrument.cli.progress import progress_bar
-from instrument.cli.sweeping import Told
-from instrument.display.table71_figure import rows, write_chart, write_csv
+from instrument.display.figures import rows, write_chart, write_csv
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
 from recon.holography.table71 import GRIDS, METHODS, Cell, run_table
 
-align_app, etendue_app, table_app = App("Align the holographic display."), App(), App()
+etendue_app, table_app = App(), App()
 
 
 def _pictures(typed: str) -> tuple[str, ...]:
@@ -37,20 +34,6 @@ def _square(typed: str) -> int:
     if typed.isdecimal() and int(typed) > 0 and round(int(typed) ** 0.5) ** 2 == int(typed):
         return int(typed)
     raise ValueError("expansions are squares (4, 16, 36).")
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignmentFiles:
-    """What an alignment reads and writes."""
-
-    out: Path = option(
-        Path("alignment.json"),
-        help="The alignment (.json); a .png goes beside it.",
-        flags=("--out", "-o"),
-        group="Files",
-    )
-    slm_calibration: Path | None = option(None, help="From calibrate slm.", group="Files")
-    force: bool = option(False, help="Overwrite files that exist.", group="Files")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,49 +91,6 @@ class TableOptions:
         Path("table71"), help="Writes NAME.csv and NAME.png.", metavar="NAME", flags=("--out", "-o")
     )
     force: bool = option(False, help="Overwrite files that exist.")
-
-
-@align_app.callback()
-def align() -> None:
-    """Align the holographic display."""
-
-
-@align_app.command(
-    epilog=examples(
-        "diffuserbench align mask --bench display.toml",
-        "diffuserbench align mask --reach 30 --depth-um 300 --moves 0",
-    )
-)
-def mask(settings: AlignmentSettings, files: AlignmentFiles, bench: BenchOption = None) -> None:
-    """Find the mask's pose by spots on the camera, move the stage, and store what is left as an alignment.
-
-    The camera must see the whole field of view. The search moves nothing. Then a small move and back tells
-    which way the stage's axes go and how well it comes back (it is homed before); it takes out shift,
-    distance, rotation and clear tilts until a move promises less than that. What stays is measured section
-    by section. Give the file to hologram --alignment.
-    """
-    procedure = AlignmentProcedure(
-        settings=settings, slm_calibration=files.slm_calibration, out=files.out, overwrite=files.force
-    )
-    figure = files.out.with_suffix(".png")
-    for file in (files.out, figure):
-        refuse_existing(file, overwrite=files.force)
-    with open_and_say(bench) as opened:
-        procedure.outlook(opened)
-        with _AlignmentTold() as told:
-            done = procedure.carry_out(opened, listener=told)
-    for line in (*done.verdict, f"Wrote {files.out}, {figure}"):
-        typer.echo(line)
-
-
-class _AlignmentTold(Told):
-    """Says on stderr that the stage is homed, which takes a while and moves it."""
-
-    def step(self, words: str) -> None:
-        """Begin a bar of its own."""
-        if words.startswith("homing"):
-            typer.echo("Homing the stage.", err=True)
-        super().step(words)
 
 
 @etendue_app.command(

@@ -24,7 +24,9 @@ from recon.base.option_text import help_text, metavar, read
 from recon.errors import InputError
 
 _MAIN = "Options"
-_WIDEST_FLAG = 34
+_WIDEST_FLAG = 30
+_MANY = 30
+"""Options, above which help does without empty lines between the groups."""
 
 
 @dataclass(frozen=True)
@@ -71,32 +73,41 @@ class GroupedCommand(TyperCommand):
     """A command whose help shows the options under their groups' headings, what is rare last."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options, a definition list a group."""
+        """Write arguments and options, a definition list a group; close together where there are many."""
         declared: Mapping[str, Option] = getattr(self.callback, "declared", {})
         arguments: list[tuple[str, str]] = []
         groups: dict[str, list[tuple[str, str]]] = {}
         for param in self.get_params(ctx):
             o = declared.get(param.name)
-            row = param.get_help_record(ctx) if o is None else (_left(o), help_text(o))
+            row = param.get_help_record(ctx) if o is None else _row(o)
             if row is None:
                 continue
             if param.param_type_name == "argument":
                 arguments.append(row)
             else:
-                heading = (o.declaration.group if o is not None else "") or _MAIN
-                groups.setdefault(heading, []).append(row)
+                groups.setdefault((o.declaration.group if o is not None else "") or _MAIN, []).append(row)
         groups = {name: groups[name] for name in sorted(groups, key=lambda name: name == RARE)}
-        for heading, rows in ({"Arguments": arguments} | groups).items():
-            if rows:
-                with formatter.section(heading):
-                    formatter.write_dl(rows, col_max=_WIDEST_FLAG)
+        if len(groups) > 1 and len(groups[_MAIN]) == 1:  # --help alone
+            alone = groups.pop(_MAIN)
+            groups[next(name for name in reversed(groups) if name != RARE)] += alone
+        shown = [(heading, rows) for heading, rows in [("Arguments", arguments), *groups.items()] if rows]
+        for number, (heading, rows) in enumerate(shown):
+            if len(declared) <= _MANY or number == 0:
+                formatter.write_paragraph()
+            formatter.write_heading(heading)
+            with formatter.indentation():
+                formatter.write_dl(rows, col_max=_WIDEST_FLAG)
 
 
-def _left(o: Option) -> str:
-    """Return the flags shown in help: the short ones and the first long one; the others are old names."""
+def _row(o: Option) -> tuple[str, str]:
+    """Return flags and help; of the long flags the first is shown, the others are old names."""
     short = [flag for flag in o.flags if not flag.startswith("--")]
     names = ", ".join([*short, next(flag for flag in o.flags if flag.startswith("--"))])
-    return names if bool in o.kinds else f"{names} {metavar(o)}"
+    if bool in o.kinds:
+        return names, help_text(o)
+    if len(left := f"{names} {metavar(o)}") <= _WIDEST_FLAG or o.declaration.metavar:
+        return left, help_text(o)
+    return f"{names} NAME", help_text(o, choices=True)
 
 
 def flat(function: Callable[..., None]) -> Callable[..., None]:
@@ -161,7 +172,7 @@ def _parameter(key: str, o: Option) -> inspect.Parameter:
     kind: Any = str
     if bool in o.kinds:
         kind = bool
-    elif o.item is not None:
+    elif o.item is not None or o.declaration.parse_all is not None:
         kind = list[str]
     else:
         in_one = o.declaration.parse is not None or "," in o.declaration.metavar

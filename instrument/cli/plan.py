@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +16,52 @@ from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.formatting import duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
-from instrument.plan.drawing import draw_path
 from instrument.plan.file import load_plan, save_plan
 from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
-from instrument.plan.patterns import PATTERNS, led_shape, pattern_help, shape_from_text
+from instrument.plan.patterns import LED_PATTERNS, led_shape, pattern_help, shape_from_text
 from instrument.runs.acquire import abilities_of
+
+Point = tuple[float, float]
+WIDTH, HEIGHT = 56, 14
+
+
+def draw_path(points: Sequence[Point], x_name: str, y_name: str = "") -> str:
+    """Return a drawing of points in order: ``S`` the first, ``E`` the last, ``o`` others, dots between.
+
+    Without ``y_name`` the path is a line, and drawn in one.
+    """
+    xs, ys = [p[0] for p in points], [p[1] for p in points]
+    rows = HEIGHT if y_name else 1
+    grid = [[" "] * WIDTH for _ in range(rows)]
+
+    def cell(point: Point) -> tuple[int, int]:
+        return (
+            _scaled(point[1], min(ys), max(ys), rows - 1),
+            _scaled(point[0], min(xs), max(xs), WIDTH - 1),
+        )
+
+    cells = [cell(point) for point in points]
+    for start, end in pairwise(cells):
+        length = max(abs(end[0] - start[0]), abs(end[1] - start[1]), 1)
+        for i in range(length + 1):
+            row = round(start[0] + (end[0] - start[0]) * i / length)
+            column = round(start[1] + (end[1] - start[1]) * i / length)
+            grid[row][column] = "."
+    for row, column in cells:
+        grid[row][column] = "o"
+    grid[cells[-1][0]][cells[-1][1]] = "E"
+    grid[cells[0][0]][cells[0][1]] = "S"
+    frame = "+" + "-" * WIDTH + "+"
+    drawn = "\n".join("|" + "".join(row) + "|" for row in grid)
+    caption = f"{x_name} {min(xs):g} to {max(xs):g}"
+    if y_name:
+        caption += f" (across), {y_name} {min(ys):g} to {max(ys):g} (down)"
+    return f"{frame}\n{drawn}\n{frame}\n{caption}"
+
+
+def _scaled(value: float, low: float, high: float, last: int) -> int:
+    return last // 2 if high == low else round((value - low) / (high - low) * last)
+
 
 app = App("Look at a plan before anything moves, or write one to start from.")
 
@@ -93,7 +136,7 @@ def illumination(
         typer.Option(
             "--pattern",
             metavar="NAME",
-            help=f"A named pattern and all that belong to it: {', '.join(PATTERNS)}. With options: "
+            help=f"A named pattern and all that belong to it: {', '.join(LED_PATTERNS)}. With options: "
             "'half na=0.3'. diffuserbench plan patterns lists them.",
             show_default=False,
         ),

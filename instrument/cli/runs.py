@@ -15,8 +15,7 @@ from instrument.bench.config_file import load_config
 from instrument.cli.app import App, BenchOption, examples
 from instrument.cli.progress import one_task, progress_bar
 from instrument.files.errors import BenchError, FileError
-from instrument.files.plane_steps import uneven_steps
-from instrument.files.volume_zarr import is_zarr_name
+from instrument.files.volume_zarr import is_zarr_name, uneven_steps
 from instrument.reconstruction.result_export import export_result
 from instrument.reconstruction.stored_result import open_result
 from instrument.runs.catalogue import run_paths, summary

@@ -5,32 +5,20 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from calibration_routines.display.display_io import DisplayBench, bring_mask
-from calibration_routines.display.hologram_photograph import (
-    display_of_pattern,
-    envelope_of_pattern,
-    photograph_hologram,
-    write_capture,
-    write_refined,
-)
+from calibration_routines.display.hologram_photograph import CaptureOptions
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.options import Given
-from instrument.display.hologram_job import prepare_target
-from instrument.files.alignment_file import load_alignment
 from instrument.files.errors import BenchError, FileError
-from instrument.files.formatting import size
-from instrument.files.images import read_image
-from instrument.files.slm_correction import load_slm_correction
-from instrument.files.slm_image import levels_phase, read_slm_image
-from instrument.runs.run import Run
-from instrument.runs.run_picture import contact_sheet
 from recon.base.declare import option
-from recon.holography import Display, HologramOptions
+
+if TYPE_CHECKING:
+    from calibration_routines.display.display_io import DisplayBench
+    from instrument.files.alignment_file import Alignment
+    from instrument.runs.run import Run
 
 app = App()
 
@@ -39,8 +27,8 @@ _PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photograph
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowOptions:
-    """How a hologram is shown and photographed, or where the picture of a run goes."""
+class _Shown:
+    """How a hologram is shown."""
 
     slm_calibration: Path | None = option(None, help="From calibrate slm.", applies=_PATTERN, group=_SHOWN)
     alignment: Path | None = option(
@@ -63,14 +51,12 @@ class ShowOptions:
         None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=_PHOTOGRAPHED
     )
     target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=_PHOTOGRAPHED)
-    average: int = option(4, help="Photographs a frame.", least=1, applies=_PATTERN, group=_PHOTOGRAPHED)
-    refine: int = option(
-        0,
-        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
-        least=0,
-        applies=_PATTERN,
-        group=_PHOTOGRAPHED,
-    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowOptions(CaptureOptions, _Shown):
+    """How a hologram is shown and photographed, or where the picture of a run goes."""
+
     as_is: bool = option(
         False,
         help="Ask nobody; the laser stays on, and the background is estimated.",
@@ -140,6 +126,17 @@ def show(
         return
     given.refuse("a hologram", "hologram")
     options.check(len(what))
+    _show_hologram(what, options, bench)
+
+
+def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -> None:
+    """Put patterns on the SLM; hold them, or photograph what they show."""
+    import numpy as np
+
+    from calibration_routines.display.display_io import DisplayBench, bring_mask
+    from instrument.files.alignment_file import load_alignment
+    from instrument.files.slm_image import levels_phase, load_slm_correction, read_slm_image
+
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
     place = load_alignment(options.alignment) if options.alignment else None
     read = [read_slm_image(path) for path in what]
@@ -155,16 +152,8 @@ def show(
         fields = [np.exp(1j * levels_phase(levels, binning)) for levels, _ in read]
         if options.capture is None:
             _hold(io, fields, options.seconds)
-            return
-        slm = opened.slm.shape, opened.slm.pixel_pitch_um
-        _capture(
-            io,
-            fields,
-            display_of_pattern(opened.config, slm, read[0][1], place),
-            read[0][1],
-            what[0],
-            options,
-        )
+        else:
+            _capture(io, fields, read[0][1], what[0], options, place)
 
 
 def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
@@ -186,23 +175,36 @@ def _hold(io: DisplayBench, fields: list[Any], seconds: float | None) -> None:
 def _capture(
     io: DisplayBench,
     fields: list[Any],
-    display: Display,
     facts: dict[str, Any],
     pattern: Path,
     options: ShowOptions,
+    place: Alignment | None,
 ) -> None:
     """Photograph, say how good it is, write."""
+    from calibration_routines.display.hologram_photograph import (
+        display_of_pattern,
+        envelope_of_pattern,
+        photograph_hologram,
+        write_capture,
+        write_refined,
+    )
+    from instrument.display.hologram_job import prepare_target
+    from instrument.files.images import read_image
+    from recon.holography import HologramOptions
+
     assert options.capture is not None
     assert options.target is not None
+    opened = io.bench
+    assert opened.slm is not None
+    slm = opened.slm.shape, opened.slm.pixel_pitch_um
+    display = display_of_pattern(opened.config, slm, facts, place)
+    wanted = HologramOptions(envelope=envelope_of_pattern(facts))
     found = photograph_hologram(
         io,
         fields,
         display,
-        prepare_target(
-            read_image(options.target).pixels, display, HologramOptions(envelope=envelope_of_pattern(facts))
-        ),
-        average=options.average,
-        refine=options.refine,
+        prepare_target(read_image(options.target).pixels, display, wanted),
+        options,
         progress=lambda n, psnr: typer.echo(f"round {n}: {psnr:.2f} dB", err=True),
     )
     mark = " (SIMULATED)" if found.simulated else ""
@@ -227,6 +229,9 @@ def _capture(
 
 def _show_run(run: Path, picture: Path | None) -> None:
     """Say how a run ended, what it holds, with which bench and software; draw a sheet of its frames."""
+    from instrument.runs.catalogue import contact_sheet
+    from instrument.runs.run import Run
+
     found = Run.open(run)
     for name, value in _facts(found):
         typer.echo(f"{name + ':':<14}{value}")
@@ -238,6 +243,8 @@ def _show_run(run: Path, picture: Path | None) -> None:
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:
+    from instrument.files.formatting import size
+
     origin = run.provenance
     facts = [
         ("run", run.path.name + ("  SIMULATED" if run.is_simulated else "")),

@@ -60,8 +60,7 @@ def stability(
     For each map a PNG, and stability.json with all of them. Ctrl-C keeps what is done; the same command goes
     on from there. What counts as failure, and what each map says, is in docs/stability.md.
     """
-    from recon.evaluation.catalogue import MAPS, map_named
-    from recon.evaluation.stability_run import cells_of, run_map
+    from recon.evaluation.maps import MAPS, cells_of, map_named, run_map
 
     chosen = [map_named(name) for name in names] if names else list(MAPS.values())
     if options.list_maps:

@@ -64,7 +64,7 @@ class HologramFiles:
 
     def write(self, number: int, channel: int, result: HologramResult) -> None:
         """Write one hologram's patterns and its preview."""
-        from instrument.display.hologram_figure import (
+        from instrument.display.figures import (
             write_hologram_figure,  # matplotlib, only where it is drawn
         )
 

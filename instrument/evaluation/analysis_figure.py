@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.analysis import Analysis
 from recon.analysis.condition import ConditionCurve
-from recon.analysis.points import Trial
+from recon.analysis.points import PointTrial
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -195,7 +195,7 @@ def _mm(um: float) -> str:
     return f"{um / 1e3:.3g} mm" if um < 1e6 else f"{um / 1e6:.3g} m"
 
 
-def _shown(trials: Sequence[Trial]) -> Trial | None:
+def _shown(trials: Sequence[PointTrial]) -> PointTrial | None:
     """Return the smallest resolved trial, or the last."""
     return next((t for t in trials if t.resolved), trials[-1] if trials else None)
 
@@ -318,7 +318,7 @@ def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
     axes.tick_params(which="minor", labelsize=9, colors=_INK, length=2)
 
 
-def _profile(axes: Axes, trial: Trial, title: str, unit: str, axis: int) -> None:
+def _profile(axes: Axes, trial: PointTrial, title: str, unit: str, axis: int) -> None:
     profile = trial.map.sum(axis=axis)
     separation = trial.separation_planes if axis else trial.separation_px
     at = np.arange(len(profile)) - len(profile) // 2
@@ -329,7 +329,7 @@ def _profile(axes: Axes, trial: Trial, title: str, unit: str, axis: int) -> None
     _style(axes, f"{title}: {separation:.3g} {unit}, {verdict}", unit, "brightness found")
 
 
-def _sixteen(axes: Axes, trial: Trial, a: Analysis) -> None:
+def _sixteen(axes: Axes, trial: PointTrial, a: Analysis) -> None:
     n_z, width = trial.map.shape
     axes.imshow(
         trial.map,

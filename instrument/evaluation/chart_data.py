@@ -1,15 +1,106 @@
-"""What a chart holds, as JSON and as a table."""
+"""What a chart holds: as JSON, as a table, in words; and read again."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
-from recon.evaluation.even import SETTLED_ITERATIONS, even_with_best
-from recon.evaluation.scored import KINDS, Kind, KindName, Point, fronts, is_known
+from instrument.files.errors import FileError
+from recon.evaluation.scored import (
+    KINDS,
+    SETTLED_ITERATIONS,
+    Kind,
+    KindName,
+    Point,
+    even_with_best,
+    fronts,
+    is_known,
+)
+
+COLOURS = ("#00798c", "#d1495b", "#d98e04", "#4f8a5b", "#5b6ee1", "#b04fc4", "#7a5c3e", "#e0559a")
+"""Told apart on white and on black."""
+
+
+def colours_of(data: ChartData) -> dict[str, str]:
+    """Give every family of settings a colour."""
+    names = sorted({p.family for p in data.points})
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+
+
+def in_words(point: Point) -> str:
+    """Return a setting, and how often it was iterated where that was counted."""
+    return f"{point.setting}, {point.iterations} it." if point.iterations else point.setting
+
+
+def title_of(data: ChartData) -> str:
+    """Return what was charted, of what."""
+    what = {
+        "reconstruction": "Reconstructions, speed against accuracy",
+        "hologram": "Holograms, time against quality",
+        "calibration": "Calibrations, photographs against the error of what is reconstructed",
+    }[data.kind_name]
+    pixels = " x ".join(str(n) for n in data.about.get("pixels", ()))
+    return f"{what}: {subject_of(data.kind_name, data.about)}, {pixels} pixels"
+
+
+def subject_of(kind: str, about: Mapping[str, Any]) -> str:
+    """Return the scene, picture, photograph or bench that was charted."""
+    if kind == "hologram":
+        return ", ".join(Path(str(p)).name for p in about.get("pictures", ())) + " on the SLM"
+    inputs = about.get("inputs") or {}
+    if kind == "calibration" and not inputs:
+        return "the simulated microscope"
+    return Path(str(about.get("scene") or (inputs.get("image") or {}).get("path", "photograph"))).name
+
+
+_MAKE = "Make it with diffuserbench chart."
+
+
+def read_chart(path: Path) -> dict[str, Any]:
+    """Read what ``diffuserbench chart`` wrote.
+
+    Returns
+    -------
+    dict
+        ``kind`` (of :data:`recon.evaluation.scored.KINDS`), ``about`` (what was charted), ``points`` (the
+        fields of :class:`recon.evaluation.scored.Point`; None where one is not known), ``failed`` (settings
+        and why), ``missing`` (settings without time).
+
+    Raises
+    ------
+    FileError
+        When it is no such file, or of another version.
+    """
+    try:
+        record = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be read as JSON: {error}.", _MAKE) from error
+    if not is_chart(record):
+        raise FileError(path, "holds no chart.", _MAKE)
+    if record["schema"] != SCHEMA:
+        raise FileError(
+            path, f"has version {record['schema']}; this program reads {SCHEMA}.", "Make it again."
+        )
+    if record.get("kind") not in KINDS:
+        raise FileError(path, f"charts {record.get('kind')!r}; known are {', '.join(KINDS)}.", _MAKE)
+    found: dict[str, Any] = record
+    return found
+
+
+def is_chart(record: Any) -> bool:
+    """Whether a JSON object is a chart of any version."""
+    if not isinstance(record, dict) or not {"schema", "about", "points"} <= record.keys():
+        return False
+    points = record["points"]
+    return isinstance(points, list) and all(
+        isinstance(p, dict) and {"setting", "iterations", "seconds"} <= p.keys() for p in points
+    )
+
 
 SCHEMA = 2
 

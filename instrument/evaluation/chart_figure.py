@@ -1,4 +1,4 @@
-"""A chart of cost against accuracy as a picture."""
+"""A chart of cost against accuracy as a picture, and as a page that answers the mouse."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from instrument.evaluation.chart_data import ChartData
-from instrument.evaluation.chart_page import chart_page
-from instrument.evaluation.chart_words import colours_of, in_words, title_of
+from instrument.evaluation.chart_data import ChartData, colours_of, in_words, title_of
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.figures import save_figure
 from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
@@ -16,6 +14,129 @@ from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+import html
+import json
+from dataclasses import asdict
+
+
+def chart_page(data: ChartData) -> str:
+    """Return a page: points to hover over, families to switch off, axes to choose; the front by name."""
+    known = [k for k in data.kind.scores if any(getattr(p, k.key) == getattr(p, k.key) for p in data.points)]
+    payload = json.dumps(
+        {
+            "points": [p.to_json() for p in data.points],
+            "colours": colours_of(data),
+            "costs": [asdict(axis) for axis in data.kind.costs],
+            "scores": [asdict(axis) for axis in known],
+            "groups": list(dict.fromkeys(p.group for p in data.points)),
+        }
+    ).replace("</", "<\\/")  # "</" inside a script would end it
+    kind = "SIMULATED. " if data.about.get("simulated") else ""
+    title = html.escape(f"{kind}{title_of(data)}")
+    return _PAGE.replace("@TITLE@", title).replace("@DATA@", payload)
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>@TITLE@</title><style>
+:root{color-scheme:light dark;--ink:#22303c;--ground:#fff;--line:#ddd}
+@media(prefers-color-scheme:dark){:root{--ink:#dfe6ec;--ground:#14191e;--line:#36404a}}
+body{font:14px system-ui,sans-serif;margin:1.5em;color:var(--ink);background:var(--ground)}
+h1{font-size:1.2em}label{margin-right:1em}svg text{fill:var(--ink)}svg .grid{stroke:var(--line)}
+#tip{position:absolute;background:var(--ground);border:1px solid #8496a5;padding:.4em .6em;
+font-size:12px;white-space:pre;pointer-events:none;display:none}.front{stroke:var(--ink);stroke-width:1.5}
+polyline{fill:none}
+</style></head><body><h1>@TITLE@</h1>
+<p><span id="which">of: <select id="group"></select></span> x: <select id="x"></select>
+y: <select id="y"></select> <span id="keys"></span></p>
+<svg id="plot" width="900" height="520"></svg><div id="tip"></div>
+<p>On the front (nothing is both cheaper and better):</p><ol id="named"></ol>
+<script>
+const data = @DATA@, plot = document.getElementById("plot"), tip = document.getElementById("tip");
+const xs = document.getElementById("x"), ys = document.getElementById("y"), off = new Set();
+const group = document.getElementById("group"), named = document.getElementById("named");
+for (const axis of data.costs) xs.add(new Option(axis.words, axis.key));
+for (const axis of data.scores) ys.add(new Option(axis.words, axis.key));
+for (const name of data.groups) group.add(new Option(name, name));
+if (data.groups.length < 2) document.getElementById("which").hidden = true;
+for (const [name, colour] of Object.entries(data.colours)) {
+  const label = document.createElement("label"), box = document.createElement("input");
+  box.type = "checkbox"; box.checked = true; label.style.color = colour;
+  box.onchange = () => { box.checked ? off.delete(name) : off.add(name); draw(); };
+  label.append(box, " " + name); document.getElementById("keys").append(label);
+}
+function node(kind, attributes, text) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", kind);
+  for (const [k, v] of Object.entries(attributes)) made.setAttribute(k, v);
+  if (text !== undefined) made.textContent = text;
+  plot.append(made); return made;
+}
+const short = v => String(Number(Number(v).toPrecision(3)));
+function scale(values, logarithmic, from, to) {
+  const f = v => logarithmic ? Math.log10(Math.max(v, 1e-4)) : v;
+  const all = values.map(f); let low = Math.min(...all), high = Math.max(...all);
+  const rim = (high - low || 1) * 0.05; low -= rim; high += rim;
+  const place = v => from + (f(v) - low) / (high - low) * (to - from);
+  let ticks = [];
+  if (logarithmic) {
+    const steps = high - low > 3 ? [1] : [1, 2, 5];
+    for (let e = Math.floor(low); e <= high; e++) for (const s of steps) ticks.push(s * 10 ** e);
+    ticks = ticks.filter(v => f(v) >= low && f(v) <= high);
+  } else for (let i = 0; i <= 5; i++) ticks.push(low + (high - low) * i / 5);
+  return [place, ticks];
+}
+function draw() {
+  plot.replaceChildren(); named.replaceChildren();
+  const x = data.costs.find(a => a.key === xs.value), y = data.scores.find(a => a.key === ys.value);
+  const left = 60, right = 880, top = 15, bottom = 470;
+  const seen = data.points.filter(p => p.group === group.value && !off.has(p.family) &&
+    p[x.key] !== null && p[y.key] !== null);
+  if (!seen.length) { node("text", {x: left, y: 40}, "nothing to show"); return; }
+  const [px, tx] = scale(seen.map(p => p[x.key]), x.logarithmic, left, right);
+  const [py, ty] = scale(seen.map(p => p[y.key]), y.logarithmic, bottom, top);
+  for (const v of tx) {
+    node("line", {x1: px(v), x2: px(v), y1: top, y2: bottom, class: "grid"});
+    node("text", {x: px(v), y: bottom + 18, "font-size": 12, "text-anchor": "middle"}, short(v));
+  }
+  for (const v of ty) {
+    node("line", {x1: left, x2: right, y1: py(v), y2: py(v), class: "grid"});
+    node("text", {x: left - 6, y: py(v) + 4, "font-size": 12, "text-anchor": "end"}, short(v));
+  }
+  node("text", {x: (left + right) / 2, y: bottom + 40, "font-size": 13, "text-anchor": "middle"}, x.words);
+  const sign = y.more_is_better ? 1 : -1, front = [];
+  for (const p of [...seen].sort((a, b) => a[x.key] - b[x.key] || sign * (b[y.key] - a[y.key])))
+    if (!front.length || sign * p[y.key] > sign * front[front.length - 1][y.key]) front.push(p);
+  const runs = new Map();
+  for (const p of seen) runs.set(p.setting, [...(runs.get(p.setting) || []), p]);
+  const line = (ps, attributes) => node("polyline", {...attributes,
+    points: ps.map(p => px(p[x.key]) + "," + py(p[y.key])).join(" ")});
+  for (const ps of runs.values()) line(ps, {stroke: data.colours[ps[0].family], "stroke-opacity": 0.3});
+  node("polyline", {class: "front", points: front.map((p, i) => (i ? px(p[x.key]) + "," +
+    py(front[i - 1][y.key]) + " " : "") + px(p[x.key]) + "," + py(p[y.key])).join(" ")});
+  const words = p => p.setting + (p.iterations ? ", " + p.iterations + " iterations" : "");
+  for (const p of front) {
+    const item = document.createElement("li");
+    item.textContent = words(p) + ": " + x.words + " " + short(p[x.key]) + ", " + y.words + " " +
+      short(p[y.key]);
+    named.append(item);
+  }
+  for (const p of seen) {
+    const on = front.includes(p);
+    const dot = node("circle", {cx: px(p[x.key]), cy: py(p[y.key]), r: on ? 6 : 4,
+      fill: data.colours[p.family], "fill-opacity": 0.7, class: on ? "front" : ""});
+    dot.onmousemove = event => {
+      tip.style.display = "block";
+      tip.style.left = event.pageX + 12 + "px"; tip.style.top = event.pageY + "px";
+      tip.textContent = words(p) + (on ? "\\non the front" : "") + [...data.costs, ...data.scores]
+        .filter(a => p[a.key] !== null)
+        .map(a => "\\n" + a.words + ": " + Number(p[a.key]).toPrecision(4)).join("");
+    };
+    dot.onmouseleave = () => { tip.style.display = "none"; };
+  }
+}
+group.onchange = xs.onchange = ys.onchange = draw; draw();
+</script></body></html>
+"""
+
 
 _LEAST = {"seconds": 1e-4, "peak_mib": 0.1}
 """Smaller ones are drawn here: what costs next to nothing has no place on a logarithmic axis."""

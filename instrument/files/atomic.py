@@ -1,4 +1,4 @@
-"""Writing files whole or not at all: to a temporary name beside the target, synced, then renamed."""
+"""Files and folders written whole or not at all: under a temporary name beside the target, synced, moved."""
 
 from __future__ import annotations
 
@@ -47,6 +47,42 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Give a new folder beside ``path``; it takes its place, synced, when the block ends.
+
+    A folder that was there is removed once the new one stands. When the block raises, the new one is removed
+    and ``path`` stays as it was.
+
+    Raises
+    ------
+    OSError
+        When writing fails.
+    """
+    mark = secrets.token_hex(4)
+    draft, old = path.with_name(f".{path.name}.{mark}.partial"), path.with_name(f".{path.name}.{mark}.old")
+    draft.mkdir()
+    try:
+        yield draft
+        for place, _, files in os.walk(draft, topdown=False):
+            for name in files:
+                with (Path(place) / name).open("rb") as written:
+                    os.fsync(written.fileno())
+            sync_folder(Path(place))
+        if path.exists():
+            path.rename(old)
+        try:
+            draft.rename(path)
+        except OSError:
+            if old.exists():
+                old.rename(path)
+            raise
+        sync_folder(path.parent)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -15,9 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
-import secrets
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +22,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from instrument.files.atomic import whole_folder
 from instrument.files.errors import FileError
+from instrument.files.ome import ome_attributes
 from instrument.files.record import RecordFormat
 from recon.types import Calibration, Geometry
 
@@ -78,19 +77,15 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
         raise CalibrationFileError(target, "exists and is no calibration.", "It is not overwritten.")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-        partial.mkdir()
     except OSError as error:
         raise CalibrationFileError(target, f"cannot be written: {error.strerror or error}.") from error
     try:
-        _write(calibration, partial)
-        _replace(partial, target)
+        with whole_folder(target) as draft:
+            _write(calibration, draft)
     except OSError as error:
         raise CalibrationFileError(
             target, f"could not be written: {error.strerror or error}.", "Nothing was left half written."
         ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return target
 
 
@@ -167,10 +162,6 @@ def _write(calibration: Calibration, folder: Path) -> None:
         "sha256": {name: _sha256(array) for name, array in arrays.items()},
     }
     (folder / _JSON).write_text(CALIBRATION.text(record, indent=2), encoding="utf-8")
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
 
 
 def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch_um: float | None) -> None:
@@ -182,21 +173,7 @@ def _write_ome_zarr(array: npt.NDArray[np.float32], path: Path, axes: str, pitch
         "0", shape=array.shape, chunks=chunks, dtype="float32", dimension_names=list(axes)
     )
     stored[...] = array
-    kinds = {"c": {"type": "channel"}, "z": {"type": "space"}, "y": {"type": "space"}, "x": {"type": "space"}}
-    if pitch_um is not None:
-        for axis in "yx":
-            kinds[axis]["unit"] = "micrometer"
-    scale = [pitch_um if axis in "yx" and pitch_um is not None else 1.0 for axis in axes]
-    group.attrs["ome"] = {
-        "version": "0.5",
-        "multiscales": [
-            {
-                "name": path.name.removesuffix(".ome.zarr"),
-                "axes": [{"name": axis, **kinds[axis]} for axis in axes],
-                "datasets": [{"path": "0", "coordinateTransformations": [{"type": "scale", "scale": scale}]}],
-            }
-        ],
-    }
+    group.attrs["ome"] = ome_attributes(path.name, axes, {"y": pitch_um, "x": pitch_um})
 
 
 def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.NDArray[np.float32]:
@@ -215,21 +192,6 @@ def _read_array(folder: Path, name: str, checksums: Mapping[str, str]) -> npt.ND
             _RESTORE,
         )
     return array.astype(np.float32, copy=False)
-
-
-def _replace(partial: Path, target: Path) -> None:
-    """Put ``partial`` in the place of ``target``; what was there goes only after the new one stands."""
-    if not target.exists():
-        partial.rename(target)
-        return
-    old = target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
-    target.rename(old)
-    try:
-        partial.rename(target)
-    except OSError:
-        old.rename(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _sha256(array: npt.NDArray[Any]) -> str:

@@ -5,21 +5,69 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.common.stream import FrameStream
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
 from instrument.files.calibration_file import load_calibration
 from instrument.reconstruction.job import find_calibration
+from instrument.reconstruction.preparation import bin_image
+from recon import Measurement, reconstruct
+from recon.errors import InputError
+from recon.reconstruction.result import Reconstruction
+from recon.solvers.stopping import IterationRecord
 from recon.streams.live import LivePicture, LiveReconstructor
 from recon.types import Calibration
+
+
+def full_picture(
+    image: npt.NDArray[Any],
+    calibration: Calibration,
+    *,
+    z_um: float | None = None,
+    callback: Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], None] | None = None,
+    cancel: threading.Event | None = None,
+) -> Reconstruction:
+    """Reconstruct a frame with the default solver, at the calibration's pixels.
+
+    Parameters
+    ----------
+    image : ndarray, (height, width) or (height, width, n_channels)
+        Counts, of the calibration's pixels or a whole multiple of them, which is then binned to them.
+    calibration : Calibration
+        Its background is subtracted.
+    z_um, callback, cancel
+        As of :func:`recon.reconstruct`.
+
+    Raises
+    ------
+    InputError
+        When frame and calibration do not fit each other.
+    """
+    height, width = calibration.psfs.shape[-2:]
+    factor = max(1, image.shape[0] // height)
+    if (image.shape[0] // factor, image.shape[1] // factor) != (height, width):
+        raise InputError(
+            f"The frame is {image.shape[0]} x {image.shape[1]} pixels, the calibration {height} x {width}: "
+            "a whole multiple is expected. Set the camera's region and binning as for the calibration."
+        )
+    background = None if calibration.background is None else np.moveaxis(calibration.background, 0, -1)
+    return reconstruct(
+        Measurement(bin_image(image, factor), background=background),
+        calibration,
+        z_um=z_um,
+        on_progress=None if callback is None else lambda record, now: callback(record, lambda: now()[0]),
+        cancel=cancel,
+    )
+
 
 _POLL_S = 0.25
 _KEPT = 300

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from drivers.led_array import LedPattern, Rgb
 from recon.base.declare import option
 
-Mask = npt.NDArray[np.bool_]
+LitLeds = npt.NDArray[np.bool_]
 WHITE: Rgb = (255, 255, 255)
 
 
@@ -46,7 +46,7 @@ class LedShape:
     help: ClassVar[str]
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs of an array are lit, ``(n_leds,)``."""
         raise NotImplementedError
 
@@ -83,7 +83,7 @@ class BrightField(LedShape):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"Bright field": {}}
     na: float = _na()
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         return _radius(array) <= self.na
 
@@ -102,7 +102,7 @@ class DarkField(LedShape):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"Dark field": {}}
     na: float = _na()
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         return _radius(array) > self.na
 
@@ -125,10 +125,10 @@ class HalfCircle(LedShape):
     side: str = option("left", help="Which half.", choices=SIDES)
     na: float = _na()
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         x, y = array.led_na[:, 0], array.led_na[:, 1]
-        half: Mask = {"left": x < 0, "right": x > 0, "top": y > 0, "bottom": y < 0}[self.side]
+        half: LitLeds = {"left": x < 0, "right": x > 0, "top": y > 0, "bottom": y < 0}[self.side]
         return half & (_radius(array) <= self.na)
 
     def series(self, array: LedPlaces) -> Sequence[Self]:
@@ -151,7 +151,7 @@ class Annulus(LedShape):
     na: float = _na()
     inner: float = option(0.8, help="Inner aperture as a share of the outer one.", least=0.0, below=1.0)
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         radius = _radius(array)
         return (radius <= self.na) & (radius > self.inner * self.na)
@@ -170,7 +170,7 @@ class Single(LedShape):
     help = "One LED, by its number"
     led: int = option(0, help="Its number.", label="LED", least=0)
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         return np.asarray(np.arange(len(array.led_na)) == self.led)
 
@@ -185,7 +185,7 @@ class Single(LedShape):
 
 
 @dataclass(frozen=True)
-class Grid(LedShape):
+class GridCell(LedShape):
     """One of ``side`` x ``side`` square cells of the array, by place."""
 
     name = "grid"
@@ -193,7 +193,7 @@ class Grid(LedShape):
     side: int = option(3, help="Cells along each axis.", least=1)
     cell: int = option(0, help="Which one, row by row from the smallest x and y.", least=0)
 
-    def lit(self, array: LedPlaces) -> Mask:
+    def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         across = np.asarray(array.led_positions_mm, float)[:, :2]
         low, high = across.min(axis=0), across.max(axis=0)

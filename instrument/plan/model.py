@@ -21,7 +21,7 @@ from pydantic import (
 from drivers.led_array import LedPattern
 from instrument.plan.errors import PlanError, plan_problems
 from instrument.plan.led_shapes import WHITE, LedPlaces, LedShape
-from instrument.plan.patterns import PATTERNS, led_shape, shape_from_text, shape_text
+from instrument.plan.patterns import LED_PATTERNS, led_shape, shape_from_text, shape_text
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
 from recon.base.declare import changed
 
@@ -71,8 +71,8 @@ class Light(PlanData):
             raise ValueError('leds belong to kind = "pattern", which needs at least one')
         if self.kind in _WITHOUT_SHAPE and (self.options or self.rgb is not None):
             raise ValueError(f'kind = "{self.kind}" has no options and no rgb')
-        if self.is_named and self.kind not in PATTERNS:
-            known = ", ".join((*_WITHOUT_SHAPE, *PATTERNS))
+        if self.is_named and self.kind not in LED_PATTERNS:
+            known = ", ".join((*_WITHOUT_SHAPE, *LED_PATTERNS))
             raise ValueError(f"light {self.kind!r} is not known; there are {known}")
         if self.is_named:
             led_shape(self.kind, self.options)

@@ -11,17 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from instrument.plan.led_shapes import Annulus, BrightField, DarkField, Grid, HalfCircle, LedShape, Single
+from instrument.plan.led_shapes import Annulus, BrightField, DarkField, GridCell, HalfCircle, LedShape, Single
 from recon.base.declare import changed, options_of, require, with_overrides
 from recon.base.registry import Registry
 from recon.errors import InputError
 
 
 def _own() -> list[type[LedShape]]:
-    return [BrightField, DarkField, HalfCircle, Annulus, Single, Grid]
+    return [BrightField, DarkField, HalfCircle, Annulus, Single, GridCell]
 
 
-PATTERNS: Registry[type[LedShape]] = Registry("LED pattern", "diffuserbench.led_patterns", _own)
+LED_PATTERNS: Registry[type[LedShape]] = Registry("LED pattern", "diffuserbench.led_patterns", _own)
 
 
 def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
@@ -32,7 +32,7 @@ def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
     InputError
         When nothing has the name, or an option is not known or out of its limits.
     """
-    shape = with_overrides(PATTERNS.named(name)(), options or {})
+    shape = with_overrides(LED_PATTERNS.named(name)(), options or {})
     require(shape)
     return shape
 
@@ -69,7 +69,7 @@ def shape_buttons() -> dict[str, LedShape]:
     """
     return {
         words: led_shape(shape.name, options)
-        for shape in PATTERNS.values()
+        for shape in LED_PATTERNS.values()
         for words, options in (shape.presets or {shape.name.replace("-", " ").capitalize(): {}}).items()
     }
 
@@ -77,7 +77,7 @@ def shape_buttons() -> dict[str, LedShape]:
 def pattern_help() -> str:
     """Return the patterns that there are with their options, one a line."""
     lines = []
-    for shape in PATTERNS.values():
+    for shape in LED_PATTERNS.values():
         options = ", ".join(f"{o.name} ({o.default})" for o in options_of(shape))
         lines.append(f"{shape.name}: {shape.help}. {options}.")
     return "\n".join(lines)

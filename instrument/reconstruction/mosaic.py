@@ -12,6 +12,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.preparation import Crop, FloatImage, reduce
 from recon.camera.bayer import PATTERNS, Pattern, interpolate_bayer, split_bayer
+from recon.errors import InputError
 from recon.types import Calibration
 
 MosaicChoice = Pattern | Literal["auto"] | None
@@ -21,11 +22,11 @@ _GENICAM: dict[str, Pattern] = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": 
 
 
 def mosaic_named(text: str) -> MosaicChoice:
-    """Return the pattern that ``--bayer`` names; None for ``none``.
+    """Return the pattern of that name; None for ``none``.
 
     Raises
     ------
-    BenchError
+    InputError
     """
     if text == "none":
         return None
@@ -33,9 +34,8 @@ def mosaic_named(text: str) -> MosaicChoice:
         return "auto"
     found = next((p for p in get_args(Pattern) if p == text.upper()), None)
     if found is None:
-        raise BenchError(
-            f"--bayer {text!r} is not known; choose one of {', '.join(PATTERNS)}, auto (by what the "
-            "photograph's metadata say) or none."
+        raise InputError(
+            f"choose one of {', '.join(PATTERNS)}, auto (by what the photograph's metadata say) or none."
         )
     pattern: Pattern = found
     return pattern

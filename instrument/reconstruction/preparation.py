@@ -15,6 +15,7 @@ import numpy.typing as npt
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
 from recon.base.blocks import block_mean
+from recon.errors import InputError
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -46,19 +47,19 @@ class Crop:
 
         Raises
         ------
-        BenchError
+        InputError
         """
         if match := re.fullmatch(r"\s*(\d+)\s*[x×]\s*(\d+)\s*", text):
             window = cls(None, None, int(match[1]), int(match[2]))
         elif match := re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*,\s*(\d+)\s*", text):
             window = cls(int(match[1]), int(match[2]), int(match[3]), int(match[4]))
         else:
-            raise BenchError(
-                f"--crop {text!r} is not understood; write TOP,LEFT,HEIGHT,WIDTH in pixels, "
-                "e.g. 100,200,600,800, or HEIGHTxWIDTH for a centred window, e.g. 600x800."
+            raise InputError(
+                "write TOP,LEFT,HEIGHT,WIDTH in pixels, e.g. 100,200,600,800, or HEIGHTxWIDTH for a centred "
+                "window, e.g. 600x800."
             )
         if window.height == 0 or window.width == 0:
-            raise BenchError(f"--crop {text!r} is an empty window.")
+            raise InputError("this is an empty window.")
         return window
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:

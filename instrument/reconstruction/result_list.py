@@ -40,7 +40,7 @@ def _is_record(path: Path) -> bool:
     )
 
 
-def free_name(folder: Path, stem: str, suffix: str) -> Path:
+def free_result(folder: Path, stem: str, suffix: str) -> Path:
     """Return a name in a folder under which nothing is written yet: ``stem``, else ``stem-2`` and so on."""
     for number in itertools.count(1):
         name = stem if number == 1 else f"{stem}-{number}"

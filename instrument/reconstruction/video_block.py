@@ -14,7 +14,7 @@ from instrument.reconstruction.video_job import VideoJob
 from instrument.reconstruction.video_output import VideoPictures
 from instrument.reconstruction.video_source import has_light
 from instrument.runs.frame_array import FrameArray
-from instrument.runs.layout import FRAMES
+from instrument.runs.run import FRAMES
 from recon.base.threads import set_threads
 from recon.streams.joint import solve_together
 from recon.streams.video import Floats, VideoSolver

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from instrument.files.ome import ome_attributes
+
 if TYPE_CHECKING:
     import zarr
 
@@ -51,22 +53,7 @@ def create_output(
         fill_value=np.nan,
         dimension_names=names,
     )
-    time_axis = {"name": "t", "type": "time"} | ({"unit": "second"} if period_s else {})
-    unit = {"unit": "micrometer"} if pitch_um else {}
-    space = [{"name": n, "type": "space", **unit} for n in ("y", "x")]
-    axes = [time_axis, *([{"name": "c", "type": "channel"}] if colour else []), *space]
-    pitch = pitch_um or 1.0
-    scale = [period_s or 1.0, *([1.0] if colour else []), pitch, pitch]
-    group.attrs["ome"] = {
-        "version": "0.5",
-        "multiscales": [
-            {
-                "name": path.name.removesuffix(".zarr").removesuffix(".ome"),
-                "axes": axes,
-                "datasets": [{"path": "0", "coordinateTransformations": [{"type": "scale", "scale": scale}]}],
-            }
-        ],
-    }
+    group.attrs["ome"] = ome_attributes(path.name, names, {"t": period_s, "y": pitch_um, "x": pitch_um})
     group.attrs["diffuserbench"] = attributes
 
 

@@ -12,7 +12,7 @@ from instrument.reconstruction.erasures import Choice
 from instrument.reconstruction.job import DarkChoice, Job, job_from_calibration, job_with
 from instrument.reconstruction.mosaic import MosaicChoice
 from instrument.reconstruction.preparation import Crop, darkest_block
-from instrument.runs.layout import STATE
+from instrument.runs.run import STATE
 from recon.types import Calibration
 
 

@@ -1,15 +1,109 @@
-"""The one way out of every acquisition."""
+"""The one way out of every acquisition, and Ctrl-C that cannot get lost nor break it off."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
+from typing import Any, Self
 
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError, try_all
-from instrument.files.interrupt import interrupts_held
-from instrument.runs.layout import FinishReason
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run
 from instrument.runs.writer import RunWriter
+
+HELD_SIGNALS = 2
+"""Signals that are held; the next one goes through, for the case that a device hangs."""
+
+
+class CtrlC:
+    """While its context lasts, remembers that Ctrl-C was pressed.
+
+    Python raises KeyboardInterrupt wherever the main thread happens to be. Inside a callback from foreign
+    code (a kernel being compiled, a library's clean-up) the exception is printed and dropped there, and the
+    program goes on as if nothing had been pressed. ``check``, called between steps, raises it again.
+
+    Does nothing outside the main thread, where no signal arrives.
+    """
+
+    def __init__(self) -> None:
+        self.pressed = False
+        self._previous: Any = None
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = signal.getsignal(signal.SIGINT)
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._previous is not None:
+            signal.signal(signal.SIGINT, self._previous)
+        if exc is None:
+            self.check()
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed."""
+        if self.pressed:
+            raise KeyboardInterrupt
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.pressed = True
+        if callable(self._previous):
+            self._previous(number, frame)
+
+
+class Held:
+    """What came while signals were held."""
+
+    def __init__(self) -> None:
+        self.before: dict[int, Callable[[int, FrameType | None], Any]] = {}
+        self.signals: list[tuple[int, FrameType | None]] = []
+
+    def answer(self) -> None:
+        """Answer the first signal that was held, as it would have been: with an exception."""
+        if self.signals:
+            number, frame = self.signals[0]
+            self.before[number](number, frame)
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[Held]:
+    """Hold Ctrl-C, SIGTERM and SIGHUP back until the block has ended; the caller may answer them then.
+
+    For the last steps of an acquisition, which an impatient second Ctrl-C must not skip. Where a device hangs
+    in one of them all the same, the third signal goes through.
+
+    Does nothing outside the main thread, where no signal arrives.
+    """
+    held = Held()
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        held.signals.append((number, frame))
+        if len(held.signals) > HELD_SIGNALS:
+            held.before[number](number, frame)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            # What kills the process or is ignored stays as it is.
+            if number is not None and callable(handler := signal.getsignal(number)):
+                held.before[number] = handler
+                signal.signal(number, hold)
+    try:
+        yield held
+    finally:
+        for number, handler in held.before.items():
+            signal.signal(number, handler)
+
 
 _log = logging.getLogger(__name__)
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from instrument.files.atomic import write_bytes
 from instrument.plan import Plan
 from instrument.runs.durable import make_folder
-from instrument.runs.layout import LOCK, SLM_IMAGES
-from instrument.runs.run import RunError
+from instrument.runs.run import LOCK, SLM_IMAGES, RunError
 
 
 def plan_with_copies(plan: Plan, folder: Path) -> Plan:

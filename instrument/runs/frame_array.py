@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from instrument.files.atomic import sync_folder
 from instrument.files.errors import FileError
+from instrument.files.ome import ome_attributes, ome_axis
 from instrument.runs.durable import SyncPool, make_folder, write_json
 
 Image = npt.NDArray[Any]
@@ -111,7 +112,9 @@ class FrameArray:
         for folder in (draft, draft / _LEVEL, draft / _LEVEL / "c"):
             make_folder(folder)
         write_json(draft / _LEVEL / "zarr.json", _array_metadata(shape, data_type, axes))
-        write_json(draft / "zarr.json", _group_metadata(axes, pixel_pitch_um, name))
+        # A plan's steps have no even spacing in time; a recording gets it at its end.
+        ome = ome_attributes(name, axes, {"y": pixel_pitch_um, "x": pixel_pitch_um})
+        write_json(draft / "zarr.json", {"zarr_format": 3, "node_type": "group", "attributes": {"ome": ome}})
         draft.rename(path)
         sync_folder(path.parent)
         return cls(path)
@@ -192,7 +195,7 @@ class FrameArray:
         if frame_period_s is not None:
             group = json.loads((self.path / "zarr.json").read_text())
             multiscale = group["attributes"]["ome"]["multiscales"][0]
-            multiscale["axes"][0]["unit"] = "second"
+            multiscale["axes"][0] = ome_axis("t", known=True)
             multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0] = frame_period_s
             write_json(self.path / "zarr.json", group)
 
@@ -241,29 +244,4 @@ def _array_metadata(shape: list[int], data_type: str, axes: list[str]) -> dict[s
         ],
         "dimension_names": axes,
         "attributes": {},
-    }
-
-
-def _group_metadata(axes: list[str], pixel_pitch_um: float, name: str) -> dict[str, Any]:
-    kinds: dict[str, dict[str, str]] = {
-        "t": {"type": "time"},  # a plan's steps have no even spacing; a recording gets it at its end
-        "c": {"type": "channel"},
-        "y": {"type": "space", "unit": "micrometer"},
-        "x": {"type": "space", "unit": "micrometer"},
-    }
-    scales = {"t": 1.0, "c": 1.0, "y": pixel_pitch_um, "x": pixel_pitch_um}
-    multiscale = {
-        "name": name,
-        "axes": [{"name": axis, **kinds[axis]} for axis in axes],
-        "datasets": [
-            {
-                "path": _LEVEL,
-                "coordinateTransformations": [{"type": "scale", "scale": [scales[axis] for axis in axes]}],
-            }
-        ],
-    }
-    return {
-        "zarr_format": 3,
-        "node_type": "group",
-        "attributes": {"ome": {"version": "0.5", "multiscales": [multiscale]}},
     }

@@ -10,8 +10,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import restore_camera
 from instrument.plan import check
 from instrument.runs.acquire import abilities_of
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import DamagedFrame, Run, RunError
+from instrument.runs.run import DamagedFrame, Run, RunCondition, RunError
 from instrument.runs.runner import Progress, Runner
 from instrument.runs.writer import RunWriter
 

@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,20 +25,40 @@ from instrument.plan import Plan, Step
 from instrument.runs.durable import read_lines
 from instrument.runs.frame_array import FrameArray, StoredChunk
 from instrument.runs.frame_record import FrameRecord, Gap
-from instrument.runs.layout import (
-    BENCH,
-    FRAMES,
-    LOCK,
-    LOG,
-    PLAN,
-    PROVENANCE,
-    STATE,
-    FinishReason,
-    RunCondition,
-)
 
 if TYPE_CHECKING:
     import zarr
+
+
+PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
+BENCH_TOML, LOG, FRAMES, LOCK = "bench.toml", "log.jsonl", "frames.ome.zarr", "lock"
+SLM_IMAGES = "slm"
+
+
+class FinishReason(StrEnum):
+    """Why a run ended."""
+
+    COMPLETED = "completed"
+    """Every step was done."""
+    ABORTED = "aborted"
+    """Somebody ended it between two steps, or with Ctrl-C or SIGTERM."""
+    STOPPED = "stopped"
+    """STOP was pressed."""
+    FAILED = "failed"
+    """A device, the disk or the program failed."""
+
+
+class RunCondition(StrEnum):
+    """What a run folder is, seen from outside."""
+
+    RUNNING = "running"
+    """A program is writing to it now."""
+    CRASHED = "crashed"
+    """The program that wrote to it ended without finishing it (kill, power cut)."""
+    COMPLETED = "completed"
+    ABORTED = "aborted"
+    STOPPED = "stopped"
+    FAILED = "failed"
 
 
 class RunError(FileError):

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from instrument.bench.bench import Bench
 from instrument.bench.safety import StepsFailedError
 from instrument.files.errors import BenchError
-from instrument.runs.layout import FinishReason
+from instrument.runs.run import FinishReason
 from instrument.runs.runner import Runner
 
 _STOP_REPEAT_S = 0.005

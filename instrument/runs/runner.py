@@ -26,8 +26,7 @@ from instrument.bench.photograph import Snapshot
 from instrument.bench.safety import StepsFailedError
 from instrument.plan import Plan, Step
 from instrument.runs.finish import end_run
-from instrument.runs.layout import FinishReason
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run
 from instrument.runs.step_settings import StepSettings
 from instrument.runs.writer import FrameToStore, RunWriter
 

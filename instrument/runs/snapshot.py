@@ -18,7 +18,7 @@ from instrument.files.images import check_suffix, read_image, side_car, write_im
 from instrument.files.record import plain, value_of
 
 
-class Light(enum.StrEnum):
+class LightState(enum.StrEnum):
     """What is lit while a photograph is taken."""
 
     SCENE = "scene"
@@ -27,7 +27,7 @@ class Light(enum.StrEnum):
     AS_IS = "as-is"
 
 
-def switch_light(bench: Bench, light: Light) -> None:
+def switch_light(bench: Bench, light: LightState) -> None:
     """Light the scene, the point source, or nothing; ``AS_IS`` changes nothing.
 
     Raises
@@ -35,21 +35,21 @@ def switch_light(bench: Bench, light: Light) -> None:
     DeviceError, BenchError
         When a light cannot be switched.
     """
-    if light is Light.AS_IS:
+    if light is LightState.AS_IS:
         return
-    bench.source_on() if light is Light.SOURCE else bench.source_off()
-    bench.scene_on() if light is Light.SCENE else bench.scene_off()
+    bench.source_on() if light is LightState.SOURCE else bench.source_off()
+    bench.scene_on() if light is LightState.SCENE else bench.scene_off()
 
 
-def light_of(bench: Bench) -> Light:
+def light_of(bench: Bench) -> LightState:
     """Return what is lit now, as far as the program knows.
 
     ``AS_IS`` where no other word is true: another LED pattern than the point source, or LEDs and the scene.
     """
     pattern = led_pattern(bench)
     if pattern is None or pattern.is_dark:
-        return Light.SCENE if bench.scene_lit else Light.DARK
-    return Light.SOURCE if bench.source_lit and not bench.scene_lit else Light.AS_IS
+        return LightState.SCENE if bench.scene_lit else LightState.DARK
+    return LightState.SOURCE if bench.source_lit and not bench.scene_lit else LightState.AS_IS
 
 
 def led_pattern(bench: Bench) -> LedPattern | None:
@@ -90,7 +90,7 @@ def photograph_name() -> str:
     return f"photo-{now:%Y%m%dT%H%M%S}{now.microsecond // 1000:03d}Z.tif"
 
 
-def check_target(target: Path, average: int, *, force: bool = False) -> None:
+def check_photograph_file(target: Path, average: int, *, force: bool = False) -> None:
     """Refuse a file that cannot hold the photograph, cannot be written, or is there already.
 
     Raises
@@ -110,14 +110,14 @@ def check_target(target: Path, average: int, *, force: bool = False) -> None:
 
 
 def write_snapshot(
-    bench: Bench, target: Path, taken: Snapshot, light: Light, *, operator_asked: bool = True
+    bench: Bench, target: Path, taken: Snapshot, light: LightState, *, operator_asked: bool = True
 ) -> None:
     """Write a photograph with what is known about it; errors as ``write_image``."""
     facts = {**snapshot_facts(bench, taken, light), "operator_asked": operator_asked}
     write_image(target, taken.image, facts)
 
 
-def snapshot_facts(bench: Bench, taken: Snapshot, light: Light) -> dict[str, Any]:
+def snapshot_facts(bench: Bench, taken: Snapshot, light: LightState) -> dict[str, Any]:
     """Return what is kept beside a photograph."""
     noise = bench.camera.noise  # of a frame, whatever the average
     return {

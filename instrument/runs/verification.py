@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from instrument.runs.layout import FinishReason
-from instrument.runs.run import DamagedFrame, Run
+from instrument.runs.run import DamagedFrame, FinishReason, Run
 
 
 @dataclass(frozen=True, slots=True)

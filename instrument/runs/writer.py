@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
+import socket
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,7 +26,7 @@ from instrument.runs.durable import AppendOnlyLog, write_json
 from instrument.runs.folder import dated_name, disk_remedy, free_name, lock_run, plan_with_copies
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.frame_record import FrameRecord, Gap
-from instrument.runs.layout import (
+from instrument.runs.run import (
     BENCH,
     BENCH_TOML,
     FRAMES,
@@ -29,11 +34,53 @@ from instrument.runs.layout import (
     LOG,
     PLAN,
     PROVENANCE,
+    RUN_STATE,
     STATE,
     FinishReason,
+    Run,
+    RunError,
 )
-from instrument.runs.provenance import provenance
-from instrument.runs.run import RUN_STATE, Run, RunError
+
+_PACKAGES = ("diffuserbench", "numpy", "scipy", "opencv-contrib-python-headless", "pydantic")
+
+
+def provenance() -> dict[str, Any]:
+    """Return what identifies the software and the machine, JSON-compatible."""
+    return {
+        "utc": datetime.now(UTC).isoformat(),
+        "host": socket.gethostname(),
+        "platform": platform.platform(),
+        "python": sys.version.split()[0],
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "git_commit": git_commit(),
+        "command": sys.argv,
+    }
+
+
+def git_commit() -> str | None:
+    """Return the commit of this program's checkout (``-dirty`` when changed), None outside one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--match="],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
 
 _FIRST_CAPACITY = 256
 """Frames that a recording's array is made for at first; it doubles as needed."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.points import Noise, PointImage, Trial, smallest_resolved, try_points
+from recon.analysis.points import Noise, PointGrid, PointImage, PointTrial, smallest_resolved, try_points
 from recon.analysis.window import WindowProblem
 from recon.base import fft
 from recon.camera.refocus import refocus
@@ -38,7 +38,7 @@ class PointTests:
         Two points along the axis: difference in 1/z.
     sixteen_factor : float or None
         By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7.
-    lateral, axial, sixteen : tuple of Trial
+    lateral, axial, sixteen : tuple of PointTrial
         Every trial made.
     notes : tuple of str
     """
@@ -46,9 +46,9 @@ class PointTests:
     lateral_px: float | None
     axial_per_um: float | None
     sixteen_factor: float | None
-    lateral: tuple[Trial, ...]
-    axial: tuple[Trial, ...]
-    sixteen: tuple[Trial, ...]
+    lateral: tuple[PointTrial, ...]
+    axial: tuple[PointTrial, ...]
+    sixteen: tuple[PointTrial, ...]
     notes: tuple[str, ...]
 
 
@@ -105,10 +105,8 @@ def point_tests(
     def on_axis_plane(columns: float, _s: float) -> Array:
         return point(columns, middle)
 
-    def try_lateral(px: float) -> Trial:
-        return try_points(
-            across, on_axis_plane, columns=2, planes=1, separation_px=px, separation_planes=0.0, noise=noise
-        )
+    def try_lateral(px: float) -> PointTrial:
+        return try_points(across, on_axis_plane, PointGrid(2, separation_px=px), noise)
 
     lateral, found = smallest_resolved(try_lateral, [v for v in LATERAL_PX if v >= 0.7 * lateral_px])
     if found is None:
@@ -119,15 +117,13 @@ def point_tests(
         return PointTests(resolved_px, None, None, tuple(lateral), (), (), tuple(notes))
     along = WindowProblem(planes, (4, 4))
     axial, found_z = smallest_resolved(
-        lambda s: try_points(
-            along, point, columns=1, planes=2, separation_px=0.0, separation_planes=s, noise=noise
-        ),
+        lambda s: try_points(along, point, PointGrid(1, 2, separation_planes=s), noise),
         AXIAL_PLANES,
     )
     if found_z is None:
         notes.append("No two points along the axis were resolved at any separation tried.")
     tell(0.5)
-    sixteen: list[Trial] = []
+    sixteen: list[PointTrial] = []
     factor = None
     if found is not None and found_z is not None:
         problem = WindowProblem(planes, HALF_WINDOW)
@@ -154,23 +150,14 @@ def _sixteen(
     planes: float,
     noise: Noise,
     tell: Callable[[float], object],
-) -> tuple[list[Trial], float | None]:
+) -> tuple[list[PointTrial], float | None]:
     """Grow both separations of a 4 x 4 grid until it is resolved; returns the trials and the factor."""
     room = min((problem.n_z - 2) / (3 * planes), (2 * problem.half[1] - 3) / (3 * px))
     factors = [f for f in FACTORS if f <= room]
-    trials: list[Trial] = []
+    trials: list[PointTrial] = []
     for number, factor in enumerate(factors):
         trials.append(
-            try_points(
-                problem,
-                point,
-                columns=4,
-                planes=4,
-                separation_px=factor * px,
-                separation_planes=factor * planes,
-                noise=noise,
-                trials=1,
-            )
+            try_points(problem, point, PointGrid(4, 4, factor * px, factor * planes), noise, trials=1)
         )
         tell(0.5 + 0.5 * (number + 1) / len(factors))
         if trials[-1].resolved:

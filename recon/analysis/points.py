@@ -63,7 +63,7 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class PointTrial:
     """One image of points, reconstructed.
 
     Attributes
@@ -87,38 +87,45 @@ class Trial:
         return self.dip >= DIP
 
 
+@dataclass(frozen=True, slots=True)
+class PointGrid:
+    """Points side by side: how many, and how far from their neighbours, in pixels and planes."""
+
+    columns: int
+    planes: int = 1
+    separation_px: float = 0.0
+    separation_planes: float = 0.0
+
+
 def try_points(
     problem: WindowProblem,
     image: PointImage,
-    *,
-    columns: int,
-    planes: int,
-    separation_px: float,
-    separation_planes: float,
+    grid: PointGrid,
     noise: Noise,
+    *,
     seed: int = 0,
     trials: int = TRIALS,
-) -> Trial:
-    """Reconstruct a grid of ``columns`` x ``planes`` points at one spacing; see :class:`Trial`."""
+) -> PointTrial:
+    """Reconstruct a grid of points; see :class:`PointTrial`."""
     rng = np.random.default_rng(seed)
     worst, seen = np.inf, np.empty(0)
     for _ in range(trials):
         # Where the grid's points lie between voxels differs from draw to draw.
         phase_x, phase_z = rng.uniform(-0.5, 0.5, 2)
-        x = (np.arange(columns) - (columns - 1) / 2) * separation_px + phase_x
-        z = (problem.n_z - 1) / 2 + (np.arange(planes) - (planes - 1) / 2) * separation_planes
+        x = (np.arange(grid.columns) - (grid.columns - 1) / 2) * grid.separation_px + phase_x
+        z = (problem.n_z - 1) / 2 + (np.arange(grid.planes) - (grid.planes - 1) / 2) * grid.separation_planes
         z = z + (phase_z if problem.n_z > 1 else 0.0)
         if max(abs(x)) > problem.half[1] - 1 or z[0] < 0 or z[-1] > problem.n_z - 1:
             raise InputError(
-                f"{columns} x {planes} points {separation_px:.3g} px and {separation_planes:.3g} planes "
-                "apart do not fit the window."
+                f"{grid.columns} x {grid.planes} points {grid.separation_px:.3g} px and "
+                f"{grid.separation_planes:.3g} planes apart do not fit the window."
             )
         light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
         solution = problem.solve(noise.expose(light, rng))
         seen = solution.volume.sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
         worst = min(worst, smallest_dip(seen, places))
-    return Trial(separation_px, separation_planes, float(worst), seen)
+    return PointTrial(grid.separation_px, grid.separation_planes, float(worst), seen)
 
 
 def smallest_dip(seen: Floats, places: Floats) -> float:
@@ -153,18 +160,18 @@ def smallest_dip(seen: Floats, places: Floats) -> float:
 
 
 def smallest_resolved(
-    try_one: Callable[[float], Trial], values: Sequence[float]
-) -> tuple[list[Trial], Trial | None]:
+    try_one: Callable[[float], PointTrial], values: Sequence[float]
+) -> tuple[list[PointTrial], PointTrial | None]:
     """Try growing separations; stop at the first that is resolved with the next one resolved as well.
 
     Returns
     -------
-    list of Trial
+    list of PointTrial
         All that were made, in order.
-    Trial or None
+    PointTrial or None
         The smallest resolved one.
     """
-    trials: list[Trial] = []
+    trials: list[PointTrial] = []
     for value in values:
         trials.append(try_one(value))
         if len(trials) > 1 and trials[-1].resolved and trials[-2].resolved:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from recon.analysis.condition import ConditionCurve, Direction, condition_curve
 from recon.analysis.correlation import INNER_PRODUCT, RESOLUTION_LEVEL, autocorrelate
-from recon.analysis.depth import DepthSimilarity, across_depth
 from recon.analysis.field import (
     FieldOfView,
     FieldPoint,
@@ -24,16 +23,16 @@ from recon.analysis.point_tests import PLANES, PointTests, point_tests
 from recon.analysis.points import Noise
 from recon.analysis.resolution import (
     AxialResolution,
+    DepthSimilarity,
     LateralResolution,
-    axial_resolution,
-    lateral_resolution,
-    support_extent_px,
-)
-from recon.analysis.sampling import (
     VoxelGrid,
+    across_depth,
+    axial_resolution,
     axial_spacing_per_um,
     gaussian_response,
+    lateral_resolution,
     lateral_spacing_um,
+    support_extent_px,
     voxel_grid,
 )
 from recon.base.declare import option

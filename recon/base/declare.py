@@ -61,6 +61,10 @@ class Declaration:
     parse : callable, optional
         Makes the value of the words that people type, where the type does not tell how; raises InputError or
         ValueError with a sentence. Given once for each word of a repeated option.
+    parse_all : callable, optional
+        Makes one value of all the words of an option that may be repeated (``NAME=VALUE``, say).
+    replaced : callable, optional
+        Returns words that it could be once, and what replaces each, as a sentence.
     none_word : str
         What people type for None ("auto", say); empty: None cannot be typed.
     """
@@ -83,6 +87,8 @@ class Declaration:
     recorded: bool = True
     identifies: bool = True
     parse: Callable[[str], Any] | None = None
+    parse_all: Callable[[Sequence[str]], Any] | None = None
+    replaced: Callable[[], Mapping[str, str]] = dict
     none_word: str = ""
 
     def words(self) -> tuple[str, ...]:
@@ -165,15 +171,19 @@ class Option:
         """
         name = self.flag if typed else self.name
         if value is None:
-            return None if self.default is None else f"{name} must be given, not None."
+            may_be = self.default is None or type(None) in typing.get_args(self.type)
+            return None if may_be else f"{name} must be given, not None."
         if self.item is not None and isinstance(value, Sequence) and not isinstance(value, str):
             one = dataclasses.replace(self, type=self.item, default=0)
             return next((wrong for v in value if (wrong := one.mistake(v, typed=typed))), None)
         if (words := self.words) and isinstance(value, str) and value not in words:
+            if instead := self.declaration.replaced().get(value):
+                return f"{name}: {instead}"
             near = difflib.get_close_matches(value, words, 1)
             meant = f"; {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
-        if not {int, float} & set(self.kinds) or isinstance(value, str | Path):
+        others = tuple(k for k in self.kinds if isinstance(k, type) and k not in (int, float, bool))
+        if not {int, float} & set(self.kinds) or isinstance(value, (str, Path, *others)):
             return None
         said = self.declaration
         kind = Integral if self.is_whole else Real

@@ -29,6 +29,11 @@ def read(o: Option, typed: str | Sequence[str]) -> Any:
         one = dataclasses.replace(o, type=o.item)
         return tuple(read(one, word) for word in ([typed] if isinstance(typed, str) else typed))
     said = o.declaration
+    if said.parse_all is not None:
+        try:
+            return said.parse_all([typed] if isinstance(typed, str) else typed)
+        except ValueError as error:
+            raise InputError(f"{o.flag}: {error}") from None
     if isinstance(typed, str) and said.none_word and typed == said.none_word:
         return None
     kinds = next((typing.get_args(kind) for kind in o.kinds if typing.get_origin(kind) is tuple), ())
@@ -126,15 +131,16 @@ def metavar(o: Option) -> str:
     return "|".join(words) or "TEXT"
 
 
-def help_text(o: Option) -> str:
-    """Return its words with the limits that are not obvious and the default."""
+def help_text(o: Option, *, choices: bool = False) -> str:
+    """Return its words with the choices, if wanted, the limits that are not obvious, and the default."""
     obvious = ("0 or more", "1 or more", "above 0")
-    limits = [limit for limit in o.limits(typed=True) if limit not in obvious]
+    notes = [", ".join(o.words)] if choices else []
     if default := default_shown(o):
-        limits.insert(0, f"default: {default}")
+        notes.append(f"default: {default}")
+    notes += [limit for limit in o.limits(typed=True) if limit not in obvious]
     if o.is_required:
-        limits.append("required")
-    return o.declaration.help + (f"  [{'; '.join(limits)}]" if limits else "")
+        notes.append("required")
+    return o.declaration.help + (f"  [{'; '.join(notes)}]" if notes else "")
 
 
 def table(cls: type) -> str:

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.blind.plausible import refuse_what_is_no_beads
 from recon.blind.point_step import Points
-from recon.blind.polish import points_on_grid, polish
-from recon.blind.psf_step import BeadMixer, solve_psfs
-from recon.blind.start import first_psf, offset_of
+from recon.blind.polish import first_psf, offset_of, points_on_grid, polish
+from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
 from recon.camera.interpolation import interpolation_weights
 from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
 from recon.camera.registration import shifted

@@ -18,10 +18,9 @@ import numpy.typing as npt
 
 from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.holography.display import Display
+from recon.holography.display import Display, random_mask
 from recon.holography.judge import compare
 from recon.holography.losses import LOSSES
-from recon.holography.mask import random_mask
 from recon.holography.model import HologramModel
 from recon.holography.optimise import HologramRecord, HologramStop, compute_hologram
 from recon.holography.options import HologramOptions, Method

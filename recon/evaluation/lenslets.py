@@ -149,10 +149,7 @@ def build_camera(
     pitch_um: float = PITCH_UM,
     distance: float = DISTANCE,
     focus: float = 6.0,
-    aberration: float = 0.0,
-    fall_off_deg: float = np.inf,
-    dispersion: float = 0.0,
-    spot_px: float = SPOT_PX,
+    **imperfections: float,
 ) -> LensletCamera:
     """Build a camera whose proportions do not depend on its number of pixels.
 
@@ -166,8 +163,8 @@ def build_camera(
         From the diffuser to the sensor, relative to the sensor's longer side.
     focus : float
         Depth of best focus, relative to that distance.
-    aberration, fall_off_deg, dispersion, spot_px
-        As :class:`LensletCamera`.
+    **imperfections
+        ``aberration``, ``fall_off_deg``, ``dispersion``, ``spot_px`` of :class:`LensletCamera`.
     """
     shape = (size, size) if isinstance(size, int) else size
     rng = np.random.default_rng(seed)
@@ -193,10 +190,7 @@ def build_camera(
         facets=facets,
         facet_um=lens,
         focus_um=focus * distance_um,
-        aberration=aberration,
-        fall_off_deg=fall_off_deg,
-        dispersion=dispersion,
-        spot_px=spot_px,
+        **imperfections,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.condition import condition_number, gram_matrix, group
-from recon.analysis.points import Noise, try_points
+from recon.analysis.points import Noise, PointGrid, try_points
 from recon.analysis.window import WindowProblem
 from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.evaluation.scene import SceneSpec
@@ -76,11 +76,8 @@ def _neighbours(_method: str, x: float, y: float, seed: int, _size: Size) -> Tri
     trial = try_points(
         problem,
         lambda columns, _s: point_image(camera, columns),
-        columns=count,
-        planes=1,
-        separation_px=x,
-        separation_planes=0.0,
-        noise=Noise(10_000.0, 2.0),
+        PointGrid(count, separation_px=x),
+        Noise(10_000.0, 2.0),
         seed=seed,
         trials=2,
     )

@@ -8,12 +8,11 @@ In short::
     print(judge(hologram.slm, display, Target(image)).psnr_db)
 """
 
-from recon.holography.display import DcTerm, Display
+from recon.holography.display import DcTerm, Display, ScatteringMask, random_mask
 from recon.holography.etendue import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
 from recon.holography.judge import Scores, judge
 from recon.holography.losses import LOSSES, Loss
 from recon.holography.lowpass import Grid
-from recon.holography.mask import ScatteringMask, random_mask
 from recon.holography.model import Evaluation, HologramModel
 from recon.holography.optimise import (
     Hologram,

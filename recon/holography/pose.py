@@ -100,9 +100,3 @@ def natural_steps(
     move, edge, depth = 0.4 * factor, 0.7 * factor, 0.7 * depth_um
     tilts = [1e3 * depth / (half * pitch_um) for half in (half_y, half_x)]
     return np.array([move, move, 1e3 * edge / half_x, edge / half_x, 4.0 * factor, depth, *tilts])
-
-
-def corner_error(a: Pose, b: Pose, mask_shape: tuple[int, int]) -> float:
-    """Return the rms distance between the displacement fields of two poses, mask pixels."""
-    difference = a.displacement(mask_shape) - b.displacement(mask_shape)
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.holography.display import Display
+from recon.holography.display import Display, random_mask
 from recon.holography.judge import Scores, judge
 from recon.holography.lowpass import Grid
-from recon.holography.mask import random_mask
 from recon.holography.model import HologramModel
 from recon.holography.optimise import compute_hologram
 from recon.holography.options import HologramOptions

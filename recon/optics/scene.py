@@ -6,15 +6,16 @@ renders the scene. Pictures lie parallel to the sensor, ``x`` along their column
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.optics.fall_off import FallOff
 from recon.optics.grid import FloatArray, overlap_matrix
 
-Image = npt.NDArray[np.float32]
+Weights = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +104,33 @@ class Beads:
             raise ValueError("Beads lie in front of the diffuser: every z is positive.")
 
 
+@dataclass(frozen=True, slots=True)
+class TruthGrid:
+    """A reconstruction's grid, on which a scene is shown free of any optics.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        ``(height, width)``. Pixel ``(height // 2, width // 2)`` looks at the calibration source.
+    pitch_um : float
+        Pixel pitch on the sensor: pixel offset ``p`` looks at ``x = -p pitch z / d`` from there, so the
+        picture stands upside down.
+    distance_um : float
+        From the diffuser to the sensor.
+    source_um : tuple of float
+        ``(x, y, z)`` of the source whose PSF the reconstruction uses.
+    layer_scale, bead_scale : float
+        Brightness of radiance 1 times a square millimetre, and of power 1.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    distance_um: float
+    source_um: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    layer_scale: float = 1.0
+    bead_scale: float = 1.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """Layers and beads that glow together; nothing hides anything else."""
@@ -122,56 +150,44 @@ class Scene:
 
     def true_image(
         self,
-        shape: tuple[int, int],
-        pitch_um: float,
-        distance_um: float,
+        grid: TruthGrid,
         weights: tuple[float, float, float],
         *,
         z_range_um: tuple[float, float] = (0.0, np.inf),
-        source_um: tuple[float, float, float] = (0.0, 0.0, 1.0),
-        layer_scale: float = 1.0,
-        bead_scale: float = 1.0,
     ) -> FloatArray:
         """Return the scene on a reconstruction's grid, free of any optics.
 
         Parameters
         ----------
-        shape : tuple of int
-            ``(height, width)``. Pixel ``(height // 2, width // 2)`` looks at the calibration source.
-        pitch_um : float
-            Pixel pitch on the sensor: pixel offset ``p`` looks at ``x = -p pitch z / d`` from there, so the
-            picture stands upside down.
-        distance_um : float
-            From the diffuser to the sensor.
+        grid : TruthGrid
         weights : tuple of float
             Of the three bands.
         z_range_um : tuple of float
             Only what lies in this range (lower bound included).
-        source_um : tuple of float
-            ``(x, y, z)`` of the source whose PSF the reconstruction uses.
-        layer_scale, bead_scale : float
-            Brightness of radiance 1 times a square millimetre, and of power 1.
 
         Returns
         -------
-        ndarray, float64, ``shape``
+        ndarray, float64, (height, width)
             Brightness in each pixel's cell: radiance times area, and power.
         """
-        image = np.zeros(shape)
-        magnification = distance_um / source_um[2]
+        image = np.zeros(grid.shape)
+        distance_um = grid.distance_um
+        magnification = distance_um / grid.source_um[2]
         low, high = z_range_um
-        height, width = shape
+        height, width = grid.shape
         # Borders on the sensor, descending in the scene.
-        y = _borders(height, pitch_um, -magnification * source_um[1])
-        x = _borders(width, pitch_um, -magnification * source_um[0])
+        y = _borders(height, grid.pitch_um, -magnification * grid.source_um[1])
+        x = _borders(width, grid.pitch_um, -magnification * grid.source_um[0])
         for layer in self.layers:
             if low <= layer.z_um < high:
                 to_scene = -layer.z_um / distance_um
                 flux = layer.flux(weights, (y * to_scene)[::-1], (x * to_scene)[::-1])
-                image += layer_scale * flux[::-1, ::-1]
+                image += grid.layer_scale * flux[::-1, ::-1]
         for place, power, diameter in self.points():
             if low <= place[2] < high:
-                _splat(image, place, power @ np.asarray(weights) * bead_scale, diameter, distance_um, y, x)
+                _splat(
+                    image, place, power @ np.asarray(weights) * grid.bead_scale, diameter, distance_um, y, x
+                )
         return image
 
     def points(self) -> Iterator[tuple[FloatArray, FloatArray, float]]:
@@ -208,3 +224,77 @@ def _splat(
     columns = np.searchsorted(x_edges, -(place[0] + inside[:, 1]) * magnification, side="right") - 1
     kept = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
     np.add.at(image, (rows[kept], columns[kept]), power / len(inside))
+
+
+def true_scene(
+    scene: Scene,
+    grid: TruthGrid,
+    *,
+    z_um: Sequence[float] | None,
+    light: Weights,
+    sensitivity: Weights | None,
+    fall_off: FallOff | None,
+) -> npt.NDArray[np.float32]:
+    """Sample a scene on a reconstruction's grid, for each depth plane and colour.
+
+    Parameters
+    ----------
+    scene : Scene
+    grid : TruthGrid
+    z_um : sequence of float, optional
+        Depth planes; everything goes to the plane nearest in ``1 / z``.
+    light : tuple of float
+        The scene's light in red, green and blue.
+    sensitivity : tuple of float, optional
+        A monochrome sensor's; left out, the bands stay apart.
+    fall_off : FallOff, optional
+        Weigh every direction by what aperture and pixels collect from there, relative to the axis.
+
+    Returns
+    -------
+    ndarray, float32
+        The grid's shape, with the depth planes as first axis and the bands as last one where asked for.
+    """
+    if sensitivity is None:
+        mixes = [(light[0], 0.0, 0.0), (0.0, light[1], 0.0), (0.0, 0.0, light[2])]
+    else:
+        total = sum(sensitivity)
+        red, green, blue = (part * s / total for part, s in zip(light, sensitivity, strict=True))
+        mixes = [(red, green, blue)]
+    tan_y = _tangents(grid.shape[0], grid.pitch_um / grid.distance_um)[:, None]
+    tan_x = _tangents(grid.shape[1], grid.pitch_um / grid.distance_um)
+    cos = 1 / np.sqrt(1 + tan_y**2 + tan_x**2)
+    seen = np.ones(grid.shape) if fall_off is None else fall_off(tan_y, tan_x) * cos**3
+    planes = []
+    for near, far in _ranges(z_um):
+        channels = []
+        for mix in mixes:
+            layers = scene.true_image(replace(grid, bead_scale=0.0), mix, z_range_um=(near, far))
+            beads = scene.true_image(replace(grid, layer_scale=0.0), mix, z_range_um=(near, far))
+            # A surface sends less light sideways, a bead does not.
+            channels.append(seen * (layers * (cos if fall_off is not None else 1.0) + beads))
+        planes.append(channels[0] if sensitivity is not None else np.stack(channels, axis=-1))
+    return np.asarray(planes[0] if z_um is None else np.stack(planes), np.float32)
+
+
+def _tangents(count: int, step: float) -> npt.NDArray[np.float64]:
+    return np.asarray((np.arange(count) - count // 2) * step, np.float64)
+
+
+def _ranges(z_um: Sequence[float] | None) -> list[tuple[float, float]]:
+    """Range of depths that belongs to each plane: borders half way in ``1 / z``."""
+    if z_um is None:
+        return [(0.0, np.inf)]
+    order = np.argsort(z_um)
+    depths = np.asarray(z_um, np.float64)[order]
+    if np.any(depths <= 0) or np.any(np.diff(depths) == 0):
+        raise ValueError(f"Depth planes are positive and different, not {list(z_um)}.")
+    middles = 2 / (1 / depths[1:] + 1 / depths[:-1])
+    lows, highs = np.concatenate([[0.0], middles]), np.concatenate([middles, [np.inf]])
+    ranges = [(0.0, np.inf)] * len(depths)
+    for position, plane in enumerate(order):
+        ranges[plane] = (float(lows[position]), float(highs[position]))
+    return ranges
+
+
+Image = npt.NDArray[np.float32]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from recon.base.declare import option
 from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import MODELS, ModelName
+from recon.errors import InputError
 from recon.priors import PRIORS, Prior
 from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
 
@@ -29,6 +31,23 @@ def _solvers() -> tuple[str, ...]:
     return ("auto", *SOLVERS)
 
 
+def _replaced() -> Mapping[str, str]:
+    from recon.reconstruction.solvers import REPLACED
+
+    return REPLACED
+
+
+def _wishes(words: Sequence[str]) -> Wishes:
+    """Read ``NAME=VALUE`` each."""
+    pairs = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise InputError(f"{word!r} is not understood; write NAME=VALUE, say binning=1.")
+        pairs[name.strip()] = value.strip()
+    return Wishes.parse(pairs)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionOptions:
     """How to reconstruct; the defaults need no tuning. ``Options`` for short in :mod:`recon`."""
@@ -42,7 +61,7 @@ class ReconstructionOptions:
     )
     tau: float | None = option(
         None,
-        help="Weight of the prior, relative to max |A^H b|: the same number works at any exposure and size.",
+        help="Weight of the prior, relative to max |A^H b| (any exposure).",
         default_words="from the noise",
         least=0,
         below=float("inf"),
@@ -59,6 +78,7 @@ class ReconstructionOptions:
         flags=("--z-mm",),
         label="Distance",
         group=_MAIN,
+        applies=("picture", "video", "patterned picture"),
     )
     solver: str = option(
         "auto",
@@ -66,6 +86,8 @@ class ReconstructionOptions:
         choices=_solvers,
         flags=("--solver", "--method", "-m"),
         group=_MAIN,
+        replaced=_replaced,
+        applies=("picture",),
     )
     iterations: int | None = option(
         None,
@@ -75,6 +97,7 @@ class ReconstructionOptions:
         flags=("--iterations", "-n"),
         metavar="N",
         group=_STOP,
+        identifies=False,
     )
     time_s: float | None = option(
         None,
@@ -84,6 +107,8 @@ class ReconstructionOptions:
         flags=("--time",),
         metavar="S",
         group=_STOP,
+        applies=("picture", "volume", "video"),
+        identifies=False,
     )
     tolerance: float | None = option(
         None,
@@ -93,16 +118,22 @@ class ReconstructionOptions:
         least=0,
         metavar="X",
         group=_STOP,
+        applies=("picture", "volume", "video"),
+        identifies=False,
     )
     stop_at_noise: bool = option(
-        False, help="Stop as soon as the residual is down to the expected noise.", group=_STOP
+        False,
+        help="Stop as soon as the residual is down to the expected noise.",
+        group=_STOP,
+        applies=("picture", "volume"),
+        identifies=False,
     )
     model: ModelName = option(
         "auto",
-        help="Camera model; local, lowrank: PSFs from several places of the field. auto: the smallest model, "
-        "depths, field, binning and colours that explain the data.",
+        help="local, lowrank: PSFs that vary over the field; auto: the smallest that explains the data.",
         choices=MODELS,
         group=_CHOICE,
+        applies=("picture", "volume", "video"),
     )
     choose: Wishes | None = option(
         None,
@@ -110,19 +141,23 @@ class ReconstructionOptions:
         "field=all, binning=N, channels=all|merged, background=on|off, precision=float32|float64.",
         metavar="NAME=VALUE",
         group=_CHOICE,
+        parse_all=_wishes,
+        applies=("picture", "volume"),
     )
     estimate_background: bool | None = option(
         None,
-        help="Estimate a smooth background as well.",
-        default_words="auto decides; other models: for volumes",
+        help="Smooth background, too.",
+        default_words="auto decides; else for volumes",
         flags=("--background/--no-background",),
         label="Smooth background",
         group=_CHOICE,
+        applies=("volume",),
     )
     positive_background: bool = option(
         False,
         help="A background that is nowhere negative; up to three more runs.",
         group=_RARE,
+        applies=("volume",),
     )
     axis_weights: npt.ArrayLike | None = option(
         None,
@@ -144,13 +179,15 @@ class ReconstructionOptions:
         flags=("",),
         group=_RARE,
     )
-    device: Device = option("cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE)
+    device: Device = option(
+        "cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE, applies=("volume",)
+    )
     precision: Literal["auto"] | Precision = option(
         "auto",
-        help="Of the arithmetic. auto: float32, unless the model auto finds that it would show. float64 "
-        "takes twice the memory and up to twice the time.",
+        help="auto: float32, unless that would show. float64: twice the memory, up to twice the time.",
         choices=("auto", *PRECISIONS),
         group=_COMPUTE,
+        applies=("picture", "volume"),
     )
     memory_gib: float | None = option(
         None,
@@ -162,6 +199,7 @@ class ReconstructionOptions:
         metavar="GIB",
         group=_COMPUTE,
         recorded=False,
+        applies=("volume",),
     )
     scratch: Path | None = option(
         None,
@@ -169,6 +207,7 @@ class ReconstructionOptions:
         metavar="FOLDER",
         group=_COMPUTE,
         recorded=False,
+        applies=("volume",),
     )
     judged: bool = option(
         True,

@@ -198,14 +198,3 @@ def _misplaced(fails: npt.NDArray[np.bool_], k: int) -> int:
     return int(np.count_nonzero(fails[: k + 1] != fails[k])) + int(
         np.count_nonzero(fails[k + 1 :] != fails[k + 1])
     )
-
-
-def as_text(
-    x: Axis, y: Axis, values: tuple[tuple[float, ...], tuple[float, ...]], severity: npt.NDArray[np.float64]
-) -> str:
-    """Draw a map in text: severities, failing ones marked with ``#``; the largest ``y`` on top."""
-    lines = [f"{y.label} ({y.unit}) up, {x.label} ({x.unit}) to the right; # fails (severity >= 1)"]
-    for value, row in reversed(list(zip(values[1], severity, strict=True))):
-        lines.append(f"{value:>9.4g} | " + " ".join(f"{s:6.2f}{'#' if s >= 1 else ' '}" for s in row))
-    lines.append(" " * 10 + "  " + " ".join(f"{v:>6.4g} " for v in values[0]))
-    return "\n".join(lines)

@@ -12,18 +12,17 @@ import pytest
 
 from calibration_routines import CalibrationError
 from calibration_routines.errors import RunEndedError
-from calibration_routines.optics.optics_procedures import AngularProcedure
+from calibration_routines.optics.angular import AngularProcedure, AngularSweep
 from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
 from calibration_routines.procedure import Listener, Outcome
 from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from calibration_routines.psf.sweep_request import AxialRequest, LateralRequest, VolumeRequest
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import SettingsError
 from instrument.plan import Part, Plan, PlanError
-from instrument.runs.layout import FinishReason, RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
 
@@ -42,7 +41,7 @@ control = "simulated"
 preset = "tiny"
 time_scale = {time_scale}
 """
-AXIAL = SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=150e3, planes=4, average=2, dark_frames=2))
+AXIAL = SweepProcedure(AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=4, average=2, dark_frames=2))
 
 
 @pytest.fixture
@@ -94,25 +93,25 @@ def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Benc
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: AxialRequest(z_min_um=-1.0), "z_min_um"),
-        (lambda: AxialRequest(z_min_um=2e5, z_max_um=1e5), "z_max_um"),
-        (lambda: AxialRequest(z_min_um=1e5, average=0), "average"),
-        (lambda: AxialRequest(z_min_um=1e5, x_um=np.inf), "x_um"),
-        (lambda: AxialRequest(z_min_um=1e5, binning=500), "binning"),
-        (lambda: AxialRequest(z_min_um=50.0, z_max_um=15e4), "planes"),
-        (lambda: LateralRequest(z_um=0.0), "z_um"),
-        (lambda: LateralRequest(z_um=1e5, target=2.0), "target"),
-        (lambda: LateralRequest(z_um=1e5, half_field_x_um=1.0), "half_field_y_um"),
-        (lambda: LateralRequest(z_um=1e5, spacing_um=0.0), "spacing_um"),
-        (lambda: LateralRequest(z_um=1e5, fall_off_deg=95.0), "fall_off_deg"),
-        (lambda: LateralRequest(z_um=1e5, fall_off_deg=9.0, response=Path("x.json")), "fall_off_deg"),
-        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=9e4), "z_max_um"),
-        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=2e5, planes=1), "planes"),
-        (lambda: VolumeRequest(z_min_um=1e5, z_max_um=2e5, reference_every=-1), "reference_every"),
+        (lambda: AxialSweep(z_min_um=-1.0), "z_min_um"),
+        (lambda: AxialSweep(z_min_um=2e5, z_max_um=1e5), "z_max_um"),
+        (lambda: AxialSweep(z_min_um=1e5, average=0), "average"),
+        (lambda: AxialSweep(z_min_um=1e5, x_um=np.inf), "x_um"),
+        (lambda: AxialSweep(z_min_um=1e5, binning=500), "binning"),
+        (lambda: AxialSweep(z_min_um=50.0, z_max_um=15e4), "planes"),
+        (lambda: LateralSweep(z_um=0.0), "z_um"),
+        (lambda: LateralSweep(z_um=1e5, target=2.0), "target"),
+        (lambda: LateralSweep(z_um=1e5, half_field_x_um=1.0), "half_field_y_um"),
+        (lambda: LateralSweep(z_um=1e5, spacing_um=0.0), "spacing_um"),
+        (lambda: LateralSweep(z_um=1e5, fall_off_deg=95.0), "fall_off_deg"),
+        (lambda: LateralSweep(z_um=1e5, fall_off_deg=9.0, response=Path("x.json")), "fall_off_deg"),
+        (lambda: VolumeSweep(z_min_um=1e5, z_max_um=9e4), "z_max_um"),
+        (lambda: VolumeSweep(z_min_um=1e5, z_max_um=2e5, planes=1), "planes"),
+        (lambda: VolumeSweep(z_min_um=1e5, z_max_um=2e5, reference_every=-1), "reference_every"),
     ],
 )
 def test_a_mistake_names_its_setting(
-    bench: Bench, make: Callable[[], AxialRequest | LateralRequest | VolumeRequest], field: str
+    bench: Bench, make: Callable[[], AxialSweep | LateralSweep | VolumeSweep], field: str
 ) -> None:
     with pytest.raises(SettingsError) as refused:
         SweepProcedure(make()).outlook(bench)
@@ -121,11 +120,11 @@ def test_a_mistake_names_its_setting(
 
 def test_what_leaves_the_stage_is_refused(bench: Bench) -> None:
     with pytest.raises(SettingsError, match="z = 900 mm is outside the stage's limits") as refused:
-        SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=9e5, planes=3)).outlook(bench)
+        SweepProcedure(AxialSweep(z_min_um=60e3, z_max_um=9e5, planes=3)).outlook(bench)
     assert [name for name, _ in refused.value.problems] == ["z_max_um"]
     with pytest.raises(PlanError, match="outside the stage's limits"):
         SweepProcedure(
-            LateralRequest(z_um=1e5, half_field_x_um=1e6, half_field_y_um=0, spacing_um=5e5)
+            LateralSweep(z_um=1e5, half_field_x_um=1e6, half_field_y_um=0, spacing_um=5e5)
         ).outlook(bench)
 
 
@@ -227,11 +226,11 @@ def test_a_plan_is_carried_out_with_the_stage_homed(bench: Bench, tmp_path: Path
 
 
 def test_the_angular_procedure_fills_in_the_distance(bench: Bench, tmp_path: Path) -> None:
-    procedure = AngularProcedure(largest_deg=20.0, step_deg=10.0)
+    procedure = AngularProcedure(AngularSweep(largest_deg=20.0, step_deg=10.0))
     outlook = procedure.outlook(bench, tmp_path)
     assert "the farthest from which the stage spans the angles" in outlook.reasons[0]
     with pytest.raises(SettingsError):
-        AngularProcedure(average=0)
+        AngularSweep(average=0)
     with pytest.raises(CalibrationError):  # four angles an axis, most of which leave the tiny sensor
         procedure.carry_out(bench, tmp_path)
     assert bench.led_array is not None

@@ -17,7 +17,7 @@ from PySide6.QtGui import QCloseEvent, QGuiApplication, QImage, QKeyEvent, QWind
 
 from drivers.errors import DeviceError
 from drivers.second_display.in_process import WindowHere
-from drivers.second_display.options import SecondDisplayOptions
+from drivers.second_display.outputs import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
 
 OPTIONS = SecondDisplayOptions(

@@ -15,7 +15,6 @@ from pydantic import ValidationError
 
 from drivers.apt import stage as apt_stage
 from drivers.apt.actuators import CONTROLLERS, SPEED_SCALE
-from drivers.apt.options import AptOptions
 from drivers.apt.protocol import (
     HW_GET_INFO,
     MOT_GET_DCSTATUSUPDATE,
@@ -26,7 +25,7 @@ from drivers.apt.protocol import (
     long,
     short,
 )
-from drivers.apt.stage import AptStage
+from drivers.apt.stage import AptOptions, AptStage
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.registry.discovery import FoundDevice
 from drivers.testing.stage import StageContract

@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.grbl.options import GrblOptions
+from drivers.grbl.settings import GrblOptions
 from drivers.grbl.stage import GrblStage
 from tests.mocks.grbl_controller import GrblController
 from tests.mocks.pty_device import Answer

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.common.framing import LineFramer, Verdict
+from drivers.common.framing import Belongs, LineFramer
 from drivers.errors import DeviceError
 from drivers.grbl.protocol import (
     Report,
@@ -90,7 +90,7 @@ def test_a_report_that_lost_bytes_is_none_or_as_long(places: list[float], data: 
 )
 def test_reports_that_are_none(line: bytes) -> None:
     assert parse_report(line) is None
-    assert report_matcher(line) is Verdict.OTHER
+    assert report_matcher(line) is Belongs.OTHER
 
 
 def test_the_reports_of_the_manuals() -> None:
@@ -107,11 +107,11 @@ def test_an_old_ok_does_not_end_the_probe() -> None:
     judge = modes_matcher()
     lines = (b"ok", b"error:9", b"[GC:G0 G54]", b"ok", b"ok")
     assert [judge(line) for line in lines] == [
-        Verdict.OTHER,
-        Verdict.OTHER,
-        Verdict.PART,
-        Verdict.END,
-        Verdict.OTHER,
+        Belongs.OTHER,
+        Belongs.OTHER,
+        Belongs.PART,
+        Belongs.END,
+        Belongs.OTHER,
     ]
 
 

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.common.framing import LineFramer, Verdict
+from drivers.common.framing import Belongs, LineFramer
 from drivers.errors import DeviceError
-from drivers.illuminate.dialect import Firmware1, Firmware2, dialect_of
 from drivers.illuminate.geometry import read_geometry
-from drivers.illuminate.link import Link
+from drivers.illuminate.link import Firmware1, Firmware2, Link, dialect_of
 from drivers.illuminate.protocol import (
     Version,
     parse_properties,
@@ -36,7 +35,7 @@ def test_arbitrary_bytes_never_raise(chunks: list[bytes]) -> None:
     lines = [line for chunk in chunks for line in framer.feed(chunk)]
     judge = version_matcher()
     for line in lines:
-        assert reply_matcher(line) is not Verdict.OTHER
+        assert reply_matcher(line) is not Belongs.OTHER
         judge(line)
     parse_version(lines)
     parse_properties(lines)
@@ -88,20 +87,20 @@ def test_refusals_of_both_firmwares() -> None:
     )
     assert refusal([b"ERROR (LedArray::setColor): Invalid color value ", b"-==-"]) is not None
     assert refusal([b"CO.1.2.3", b"-==-"]) is None
-    assert reply_matcher(b"ERROR[16]: Invalid command.") is Verdict.END
-    assert reply_matcher(b"ERROR (LedArray): text") is Verdict.PART  # its terminator follows
-    assert reply_matcher(b"}-==-") is Verdict.END
+    assert reply_matcher(b"ERROR[16]: Invalid command.") is Belongs.END
+    assert reply_matcher(b"ERROR (LedArray): text") is Belongs.PART  # its terminator follows
+    assert reply_matcher(b"}-==-") is Belongs.END
     assert payload([b'{"a": 1', b"}-==-"]) == [b'{"a": 1', b"}"]
 
 
 def test_an_old_terminator_does_not_end_the_reply_to_version() -> None:
     judge = version_matcher()
     assert [judge(line) for line in (b"-==-", b"CO.1.2.3", b"2.32", b"-==-", b"-==-")] == [
-        Verdict.OTHER,
-        Verdict.OTHER,
-        Verdict.PART,
-        Verdict.END,
-        Verdict.OTHER,
+        Belongs.OTHER,
+        Belongs.OTHER,
+        Belongs.PART,
+        Belongs.END,
+        Belongs.OTHER,
     ]
 
 

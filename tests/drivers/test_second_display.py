@@ -21,8 +21,7 @@ from pydantic import ValidationError
 from drivers.device import Device
 from drivers.errors import DeviceError
 from drivers.second_display import slm as slm_module
-from drivers.second_display.options import SecondDisplayOptions
-from drivers.second_display.outputs import Output, choose
+from drivers.second_display.outputs import Output, SecondDisplayOptions, choose
 from drivers.second_display.process import WindowProcess
 from drivers.second_display.slm import SecondDisplaySlm
 from drivers.testing.slm import SlmContract

@@ -24,7 +24,7 @@ import pytest
 
 from drivers.errors import DeviceError
 from drivers.second_display import slm as slm_module
-from drivers.second_display.options import SecondDisplayOptions
+from drivers.second_display.outputs import SecondDisplayOptions
 from drivers.second_display.slm import SecondDisplaySlm
 
 pytest.importorskip("PySide6.QtGui", reason="Qt cannot be loaded here", exc_type=ImportError)

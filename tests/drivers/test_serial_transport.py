@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.common.framing import LineFramer, Verdict, reply_line, reply_until
+from drivers.common.framing import Belongs, LineFramer, reply_line, reply_until
 from drivers.common.serial_transport import SerialTransport
 from drivers.device import port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, StoppedError
@@ -345,10 +345,10 @@ def test_a_line_without_end_is_dropped_whole() -> None:
 def test_replies_of_many_lines() -> None:
     matcher = reply_until(rb"ok|error:\d+", rb"\[.*\]")
     assert [matcher(m) for m in (b"[VER]", b"<Idle>", b"ok", b"error:9")] == [
-        Verdict.PART,
-        Verdict.OTHER,
-        Verdict.END,
-        Verdict.END,
+        Belongs.PART,
+        Belongs.OTHER,
+        Belongs.END,
+        Belongs.END,
     ]
 
 

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from drivers.device import Device
 from drivers.simulated.camera_settings import CameraOptions
-from drivers.simulated.display import DisplayCamera, DisplaySlm, DisplayStage, DisplayStageOptions
-from drivers.simulated.display_world import DisplayOptions, DisplayWorld
+from drivers.simulated.display import (
+    DisplayCamera,
+    DisplayOptions,
+    DisplaySlm,
+    DisplayStage,
+    DisplayStageOptions,
+    DisplayWorld,
+)
 from drivers.simulated.slm import SlmOptions
 from drivers.testing.camera import CameraContract
 from drivers.testing.slm import SlmContract

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.common.ring import BufferPool
-from drivers.common.stream import FrameStream
+from drivers.common.stream import BufferPool, FrameStream
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.frame import Frame
 from tests.mocks.free_running import FreeRunningCamera

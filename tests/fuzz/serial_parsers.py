@@ -23,7 +23,7 @@ with atheris.instrument_imports(
         "drivers.common.framing",
     ]
 ):
-    from drivers.common.framing import LineFramer, Verdict
+    from drivers.common.framing import Belongs, LineFramer
     from drivers.grbl import protocol as grbl
     from drivers.illuminate import protocol as illuminate
     from drivers.zaber import protocol as zaber
@@ -39,7 +39,7 @@ def test_one_input(data: bytes) -> None:
     for line in lines:
         report = grbl.parse_report(line)
         assert report is None or all(map(math.isfinite, report.places))
-        assert (report is not None) == (grbl.report_matcher(line) is Verdict.END)
+        assert (report is not None) == (grbl.report_matcher(line) is Belongs.END)
         for judge in grbl_judges:
             judge(line)
         grbl.parse_error(line)

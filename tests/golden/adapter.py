@@ -318,8 +318,7 @@ def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts:
 
 def stability_map(name: str, methods: Sequence[str]) -> Result:
     """Make a map of where methods fail; times are left out."""
-    from recon.evaluation.catalogue import map_named
-    from recon.evaluation.stability_run import run_map
+    from recon.evaluation.maps import map_named, run_map
 
     cells = [c.as_json() for c in run_map(map_named(name), "quick", methods=list(methods))]
     cells.sort(key=lambda c: (c["method"], c["ix"], c["iy"]))

@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.panels.charts import ChartsPanel
 from gui.widgets.chart_view import describe
-from instrument.evaluation.chart_reader import read_chart
+from instrument.evaluation.chart_data import read_chart
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.stability_file import read_stability

@@ -19,8 +19,7 @@ from gui.panels.stage import StagePanel
 from gui.widgets.dialogues import Question
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
-from instrument.files.slm_correction import SlmCorrection, load_slm_correction
-from instrument.files.slm_image import write_slm_image
+from instrument.files.slm_image import SlmCorrection, load_slm_correction, write_slm_image
 from instrument.plan.patterns import shape_buttons
 
 WAIT_MS = 60_000

@@ -8,52 +8,45 @@ from typing import Any
 
 import pytest
 
-from calibration_routines.display.display_procedures import AlignmentProcedure
-from calibration_routines.optics.optics_procedures import BeadProcedure
+from calibration_routines.display.mask_alignment import AlignmentProcedure
+from calibration_routines.optics.beads import BeadProcedure
+from calibration_routines.options import Size
 from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from calibration_routines.psf.sweep_request import AxialRequest
-from gui.forms.alignment import ALIGNMENT
-from gui.forms.as_python import script
-from gui.forms.routines import (
-    ANGULAR,
-    AXIAL,
-    BEADS,
-    DPC,
-    LATERAL,
-    PHOTOGRAPH,
-    PLAN,
-    ROUTINES,
-    SLM,
-    VOLUME,
-)
+from gui.forms.routines import PLAN, forms
+from gui.procedure_run import script
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, led_microscope_text
 from instrument.files.errors import BenchError, SettingsError
 
-Z = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3}
+ROUTINES = {form.name: form for form in (*forms(), *forms("align"))}
+AXIAL, LATERAL, VOLUME, PHOTOGRAPH, ANGULAR, DPC, BEADS, SLM, ALIGNMENT = ROUTINES.values()
+STARTS = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3, "objective_na": 0.1, "magnification": 4.0}
 
 
 def values_of(form: Any, **changed: Any) -> dict[str, Any]:
     values = form.defaults()
-    return {name: Z.get(name, value) if value is None else value for name, value in values.items()} | changed
+    return {
+        name: STARTS.get(name, value) if value is None else value for name, value in values.items()
+    } | changed
 
 
-@pytest.mark.parametrize("form", [*ROUTINES, ALIGNMENT], ids=lambda form: form.name)
+@pytest.mark.parametrize("form", [*ROUTINES.values(), PLAN], ids=lambda form: form.name)
 def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
     procedure = form.make(values_of(form))
     assert procedure == form.make(values_of(form))
     for field in form.fields:
         assert field.label
         assert field.declaration.help
-        assert field.default not in (None, MISSING) or field.declaration.default_words or field.name in Z
+        assert field.default not in (None, MISSING) or field.declaration.default_words or field.name in STARTS
     compile(script(procedure, None), form.name, "exec")
 
 
 def test_settings_reach_the_request_in_its_units() -> None:
     procedure = AXIAL.make(values_of(AXIAL, planes=3, average=2))
-    assert procedure == SweepProcedure(AxialRequest(z_min_um=60e3, z_max_um=150e3, planes=3, average=2))
+    assert procedure == SweepProcedure(AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=3, average=2))
 
 
 @pytest.mark.parametrize(
@@ -148,8 +141,8 @@ def test_the_python_of_a_form_runs(
 @pytest.mark.parametrize(
     ("form", "kind", "changed"),
     [
-        (ALIGNMENT, AlignmentProcedure, {"reach": 6.0, "rows": 2, "columns": 3, "moves": 0}),
-        (BEADS, BeadProcedure, {"images": 2, "rows": 1, "columns": 2, "rank": 1}),
+        (ALIGNMENT, AlignmentProcedure, {"reach": 6.0, "division": Size(2, 3), "moves": 0}),
+        (BEADS, BeadProcedure, {"images": 2, "grid": Size(1, 2), "rank": 1}),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )

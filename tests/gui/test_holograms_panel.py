@@ -25,6 +25,8 @@ from instrument.bench.display_setup import bench_display, depth_limit_mm
 from instrument.files.images import read_image, write_image
 from instrument.files.slm_image import levels_phase, read_slm_image
 from recon.errors import InputError
+from recon.holography import LOSSES
+from recon.holography.losses import LowPassed
 
 WAIT_MS = 60_000
 
@@ -73,11 +75,17 @@ def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path
     panel.resize(1000, 700)
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
     panel.show()
-    panel.picture.setText(str(tmp_path / "picture.png"))
-    qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+    panel.form.widgets["picture"].setText(str(tmp_path / "picture.png"))
+    qtbot.keyClick(panel.form.widgets["picture"], Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: panel.target.image is not None, timeout=WAIT_MS)
-    panel.iterations.setText("12")
+    panel.form.widgets["iterations"].setText("12")
     return panel
+
+
+def type_in(qtbot: QtBot, entry, text: str) -> None:
+    entry.selectAll()
+    qtbot.keyClicks(entry, text)
+    qtbot.keyClick(entry, Qt.Key.Key_Return)
 
 
 def click(qtbot: QtBot, button) -> None:
@@ -98,7 +106,7 @@ def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> Non
     pattern = session.runs_folder / "holograms" / "picture.png"
     levels, facts = read_slm_image(pattern)
     assert facts["iterations"] == 12
-    assert panel.out.text().endswith("picture-2.png")
+    assert panel.form.widgets["out"].text().endswith("picture-2.png")
     click(qtbot, panel.show_button)
     with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
         pass
@@ -111,15 +119,15 @@ def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> Non
     seen = json.loads(pattern.with_name("picture-seen.json").read_text())
     assert seen["simulated"]
     assert seen["metrics"]["psnr_db"] > 12
-    text = panel.metrics.toPlainText()
+    text = panel.views.metrics.toPlainText()
     assert "SIMULATED" in text
     assert f"{seen['metrics']['psnr_db']:.2f} dB" in text
-    assert panel.captured.image is not None
+    assert panel.views.captured.image is not None
 
 
 def test_a_preview_writes_nothing(qtbot: QtBot, panel: HologramsPanel) -> None:
     computed(qtbot, panel, panel.preview_button)
-    assert panel.seen.image is not None
+    assert panel.views.seen.image is not None
     assert not (panel.session.runs_folder / "holograms").exists()
 
 
@@ -137,16 +145,16 @@ def test_photographs_of_a_preview_each_have_a_name_of_their_own(qtbot: QtBot, pa
 def test_what_is_wrong_is_told_before_the_bench_is_touched(
     qtbot: QtBot, panel: HologramsPanel, tmp_path: Path
 ) -> None:
-    panel.out.setText(str(tmp_path / "nowhere" / "pattern.png"))
+    panel.form.widgets["out"].setText(str(tmp_path / "nowhere" / "pattern.png"))
     computed(qtbot, panel, panel.preview_button)
     before = panel.job
     for button in (panel.show_button, panel.capture_button):
-        panel.correction.setText("absent.json")
+        panel.form.widgets["correction"].setText("absent.json")
         click(qtbot, button)
-        assert panel.correction.property("refused")
+        assert panel.form.widgets["correction"].property("refused")
         assert "no such file" in panel._note.toolTip()
         assert panel.job is before
-    panel.correction.setText("")
+    panel.form.widgets["correction"].setText("")
     click(qtbot, panel.capture_button)
     with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
         pass
@@ -155,7 +163,7 @@ def test_what_is_wrong_is_told_before_the_bench_is_touched(
 
 
 def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: HologramsPanel) -> None:
-    panel.weights_mode.setCurrentText("a fovea, dragged")
+    panel.form.widgets["counts"].setCurrentText("a fovea, dragged")
     before = panel.target.weights()
     view = panel.target.graphics
     middle = view.mapFromScene(
@@ -175,7 +183,7 @@ def test_the_fovea_dragged_is_the_weights_computed_with(qtbot: QtBot, panel: Hol
 
 
 def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:
-    panel.weights_mode.setCurrentText("painted")
+    panel.form.widgets["counts"].setCurrentText("painted")
     target = panel.target
     port = target.graphics.viewport()
 
@@ -201,7 +209,7 @@ def test_painting_and_rubbing_out(qtbot: QtBot, panel: HologramsPanel) -> None:
 def test_fovea_and_brush_by_keys_alone(qtbot: QtBot, panel: HologramsPanel) -> None:
     target = panel.target
     picture = target.graphics
-    panel.weights_mode.setCurrentText("a fovea, dragged")
+    panel.form.widgets["counts"].setCurrentText("a fovea, dragged")
     (y, x), radius = target.centre, target.radius
     shift, alt = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.AltModifier
     qtbot.keyClick(picture, Qt.Key.Key_Down)
@@ -209,7 +217,7 @@ def test_fovea_and_brush_by_keys_alone(qtbot: QtBot, panel: HologramsPanel) -> N
     qtbot.keyClick(picture, Qt.Key.Key_Up, alt)
     assert target.centre == pytest.approx((y + 0.02, x - 0.2), abs=2e-3)
     assert target.radius == pytest.approx(radius + 0.02, abs=2e-3)
-    panel.weights_mode.setCurrentText("painted")
+    panel.form.widgets["counts"].setCurrentText("painted")
     picture.setFocus()
     for _ in range(3):
         qtbot.keyClick(picture, Qt.Key.Key_Right)
@@ -229,26 +237,26 @@ def test_planes_are_computed_together_shown_one_by_one_and_copied(
 ) -> None:
     far = tmp_path / "far.png"
     write_image(far, np.tile(np.linspace(0, 255, 64).astype(np.uint8), (64, 1)))
-    panel.further.setText(f"{far} @ wide")
+    panel.form.widgets["further"].setText(f"{far} @ wide")
     click(qtbot, panel.preview_button)
-    assert panel.further.property("refused")
+    assert panel.form.widgets["further"].property("refused")
     assert panel.job is None
-    panel.further.setText(f"{far} @ 40 mm")
-    panel.iterations.setText("3")
+    panel.form.widgets["further"].setText(f"{far} @ 40 mm")
+    panel.form.widgets["iterations"].setText("3")
     computed(qtbot, panel, panel.compute_button)
     assert panel.computed is not None
     result = panel.computed.result
     assert len(result.seen) == 2
-    assert panel.plane.isVisible()
-    assert [panel.plane.itemText(i) for i in range(2)] == ["seen at 0 mm", "seen at 40 mm"]
-    np.testing.assert_array_equal(panel.seen.image, np.maximum(result.seen[0], 0))
-    panel.plane.setFocus()
-    qtbot.keyClick(panel.plane, Qt.Key.Key_Down)
-    np.testing.assert_array_equal(panel.seen.image, np.maximum(result.seen[1], 0))
-    assert "at 40 mm" in panel.metrics.toPlainText()
+    assert panel.views.plane.isVisible()
+    assert [panel.views.plane.itemText(i) for i in range(2)] == ["seen at 0 mm", "seen at 40 mm"]
+    np.testing.assert_array_equal(panel.views.seen.image, np.maximum(result.seen[0], 0))
+    panel.views.plane.setFocus()
+    qtbot.keyClick(panel.views.plane, Qt.Key.Key_Down)
+    np.testing.assert_array_equal(panel.views.seen.image, np.maximum(result.seen[1], 0))
+    assert "at 40 mm" in panel.views.metrics.toPlainText()
     by_window, facts = read_slm_image(panel.computed.patterns[0])
     assert len(facts["metrics"]) == 2
-    panel.out.setText(str(tmp_path / "by-script.png"))
+    panel.form.widgets["out"].setText(str(tmp_path / "by-script.png"))
     exec(panel.as_python(), {})
     by_script, _ = read_slm_image(tmp_path / "by-script.png")
     difference = np.angle(np.exp(1j * (levels_phase(by_script) - levels_phase(by_window))))
@@ -259,17 +267,17 @@ def test_planes_are_computed_together_shown_one_by_one_and_copied(
 def test_the_copied_lines_make_the_same_pattern(
     qtbot: QtBot, panel: HologramsPanel, tmp_path: Path, counts: str
 ) -> None:
-    panel.weights_mode.setCurrentText(counts)
+    panel.form.widgets["counts"].setCurrentText(counts)
     panel.target.set_fovea((0.4, 0.55), 0.2)
     panel.target.strokes = [(0.4, 0.5, 0.2, 1.0), (0.5, 0.5, 0.1, 0.5)]
-    panel.iterations.setText("4")
-    panel.out.setText(str(tmp_path / "script.png"))
+    panel.form.widgets["iterations"].setText("4")
+    panel.form.widgets["out"].setText(str(tmp_path / "script.png"))
     click(qtbot, panel.copy_button)
     code = QApplication.clipboard().text()
     panel.session.bench.close()  # a script opens the bench for itself
     exec(code, {})
     panel.session._states["slm"] = type(panel.session._states["slm"])("open")
-    panel.out.setText(str(tmp_path / "mouse.png"))
+    panel.form.widgets["out"].setText(str(tmp_path / "mouse.png"))
     computed(qtbot, panel, panel.compute_button)
     script, mouse = (levels_phase(read_slm_image(tmp_path / f"{n}.png")[0]) for n in ("script", "mouse"))
     assert np.abs(np.angle(np.exp(1j * (script - mouse)))).mean() < 0.05
@@ -280,8 +288,10 @@ def test_the_copied_lines_make_the_same_pattern(
     [
         ("picture", "absent.png", "no such file"),
         ("z_mm", "far", "no number of mm"),
-        ("frames", "0", "above 0"),
-        ("periphery", "2", "0 to 1"),
+        ("frames", "0", "1 or more"),
+        ("periphery", "2", "0 or more, 1 or less"),
+        ("brush", "0", "above 0"),
+        ("expansion", "5", "square"),
         ("out", "slm.jpg", ".png"),
         ("alignment", "absent.json", "no such file"),
     ],
@@ -289,9 +299,9 @@ def test_the_copied_lines_make_the_same_pattern(
 def test_a_wrong_entry_is_refused_at_its_field(
     qtbot: QtBot, panel: HologramsPanel, field, text, reason
 ) -> None:
-    entry = getattr(panel, field)
-    entry.setText(text)
-    qtbot.keyClick(entry, Qt.Key.Key_Return)
+    panel.form.widgets["counts"].setCurrentText("painted")
+    entry = panel.form.widgets[field]
+    type_in(qtbot, entry, text)
     assert entry.property("refused")
     assert reason in entry.toolTip()
     click(qtbot, panel.compute_button)
@@ -299,7 +309,7 @@ def test_a_wrong_entry_is_refused_at_its_field(
 
 
 def test_an_expansion_that_is_no_square_is_told(qtbot: QtBot, panel: HologramsPanel) -> None:
-    panel.expansion.setText("5")
+    panel.form.widgets["expansion"].setText("5")
     click(qtbot, panel.compute_button)
     qtbot.waitUntil(lambda: "square" in panel._note.toolTip(), timeout=WAIT_MS)
 
@@ -315,7 +325,7 @@ def test_the_target_is_shown_as_it_fills_the_field(
 ) -> None:
     picture = read_image(tmp_path / "picture.png").pixels / 255
     np.testing.assert_allclose(panel.target.image, picture[:, 20:100])
-    panel.fit.setCurrentText("stretch")
+    panel.form.widgets["fit"].setCurrentText("stretch")
     qtbot.waitUntil(lambda: panel.target.image.shape == picture.shape, timeout=WAIT_MS)
     np.testing.assert_allclose(panel.target.image, picture)
 
@@ -379,15 +389,15 @@ def test_a_picture_is_read_once_and_not_in_the_windows_thread(
     monkeypatch.setattr(holograms, "read_image", read)
     write_image(tmp_path / "other.png", np.eye(50, dtype=np.uint8))
     (tmp_path / "words.png").write_text("no picture")
-    panel.picture.setText(str(tmp_path / "other.png"))
+    panel.form.widgets["picture"].setText(str(tmp_path / "other.png"))
     for _ in range(2):
-        qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
+        qtbot.keyClick(panel.form.widgets["picture"], Qt.Key.Key_Return)
     qtbot.waitUntil(lambda: panel.target.image.shape == (50, 50), timeout=WAIT_MS)
     assert len(threads) == 1
     assert threads[0] is not threading.main_thread()
-    panel.picture.setText(str(tmp_path / "words.png"))
-    qtbot.keyClick(panel.picture, Qt.Key.Key_Return)
-    qtbot.waitUntil(lambda: bool(panel.picture.property("refused")), timeout=WAIT_MS)
+    panel.form.widgets["picture"].setText(str(tmp_path / "words.png"))
+    qtbot.keyClick(panel.form.widgets["picture"], Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: bool(panel.form.widgets["picture"].property("refused")), timeout=WAIT_MS)
 
 
 def test_a_depth_out_of_reach_is_refused_at_its_field(
@@ -396,25 +406,22 @@ def test_a_depth_out_of_reach_is_refused_at_its_field(
     slm = panel.session.bench.slm
     limit_mm = depth_limit_mm(panel.session.config, (slm.shape, slm.pixel_pitch_um))
     for depth, field in (
-        (f"{1.02 * limit_mm:.6g}", panel.z_mm),
-        (f"{tmp_path / 'picture.png'} @ {-1.02 * limit_mm:.6g} mm", panel.further),
+        (f"{1.02 * limit_mm:.6g}", panel.form.widgets["z_mm"]),
+        (f"{tmp_path / 'picture.png'} @ {-1.02 * limit_mm:.6g} mm", panel.form.widgets["further"]),
     ):
-        field.setText(depth)
-        qtbot.keyClick(field, Qt.Key.Key_Return)
+        type_in(qtbot, field, depth)
         assert field.property("refused")
         assert "too far for this display" in field.toolTip()
-    panel.further.setText("")
-    panel.z_mm.setText(f"{0.9 * limit_mm:.6g}")
-    qtbot.keyClick(panel.z_mm, Qt.Key.Key_Return)
-    assert not panel.z_mm.property("refused")
-    panel.expansion.setText("16")  # finer mask pixels reach farther
-    qtbot.keyClick(panel.expansion, Qt.Key.Key_Return)
+    z_mm, expansion = (panel.form.widgets[name] for name in ("z_mm", "expansion"))
+    panel.form.widgets["further"].setText("")
+    type_in(qtbot, z_mm, f"{0.9 * limit_mm:.6g}")
+    assert not z_mm.property("refused")
+    type_in(qtbot, expansion, "16")  # finer mask pixels reach farther
     wide_mm = depth_limit_mm(panel.session.config, (slm.shape, slm.pixel_pitch_um), expansion=16)
-    panel.z_mm.setText(f"{0.98 * wide_mm:.6g}")
-    assert panel.z_mm.check() == (wide_mm > 0)
-    panel.expansion.setText("4")
-    qtbot.keyClick(panel.expansion, Qt.Key.Key_Return)
-    assert bool(panel.z_mm.property("refused")) == (0.98 * wide_mm > limit_mm)
+    type_in(qtbot, z_mm, f"{0.98 * wide_mm:.6g}")
+    assert bool(z_mm.property("refused")) == (wide_mm <= 0)
+    type_in(qtbot, expansion, "4")
+    assert bool(z_mm.property("refused")) == (0.98 * wide_mm > limit_mm)
 
 
 def test_the_depth_limit_is_that_of_the_display_itself() -> None:
@@ -425,3 +432,16 @@ def test_the_depth_limit_is_that_of_the_display_itself() -> None:
     display.defocus(0.999 * limit_mm)
     with pytest.raises(InputError, match="too far for this display"):
         display.defocus(-1.001 * limit_mm)
+
+
+def test_a_registered_loss_can_be_chosen(qtbot: QtBot, make_session, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Own(LowPassed):
+        name = "own"
+        help = "As the low-passed one."
+
+    monkeypatch.setattr(LOSSES, "_foreign", dict(LOSSES._foreign))
+    LOSSES.register(Own())
+    panel = HologramsPanel(make_session())
+    qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
+    assert panel.loss.findText("own") >= 0
+    assert panel.loss.currentText() == "frequency"

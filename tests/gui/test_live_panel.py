@@ -17,7 +17,7 @@ from gui.widgets.image_view import ImageView
 from instrument.files.images import read_image
 from instrument.plan.led_shapes import BrightField
 from instrument.runs.run import Run
-from instrument.runs.snapshot import Light
+from instrument.runs.snapshot import LightState
 
 WAIT_MS = 60_000
 
@@ -213,10 +213,10 @@ def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: Live
     assert bench.led_array is not None
     bench.source_on()
     bench.scene_off()
-    assert live.light is Light.SOURCE
+    assert live.light is LightState.SOURCE
     bench.led_array.set_pattern(BrightField(0.25).on(bench.led_array))
     assert not bench.source_lit
-    assert live.light is Light.AS_IS
+    assert live.light is LightState.AS_IS
     live._show_light()
     assert not any(button.isChecked() for button in live.light_buttons.buttons())
     live.snap()

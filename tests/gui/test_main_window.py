@@ -18,7 +18,7 @@ from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES
 from gui.widgets.dialogues import TextWindow, choose_path
-from instrument.runs.snapshot import Light
+from instrument.runs.snapshot import LightState
 
 WAIT_MS = 60_000
 
@@ -269,7 +269,7 @@ def test_nobody_is_asked_to_close_what_was_only_just_opened(
     gate = threading.Event()
     monkeypatch.setattr("gui.session.switch_light", lambda *_: gate.wait(WAIT_MS / 1000))
     live = window.panel("live")
-    monkeypatch.setattr(type(live), "light", Light.DARK)
+    monkeypatch.setattr(type(live), "light", LightState.DARK)
     live._light_the_scene()  # type: ignore[attr-defined]
     qtbot.waitUntil(lambda: session.jobs.is_busy("light"), timeout=WAIT_MS)
     window.close()

@@ -76,7 +76,7 @@ def test_the_diffusers_surface(qtbot: QtBot, window: MainWindow) -> None:
 def test_bead_slides(qtbot: QtBot, window: MainWindow) -> None:
     panel = carry_out(
         qtbot, window, "beads",
-        images="2", average="1", binning="16", rows="1", columns="1", rank="1", iterations="3",
+        images="2", average="1", binning="16", grid="1x1", rank="1", iterations="3",
     )  # fmt: skip
     assert "Misfit by rank" in panel.verdict.toPlainText()
     (folder,) = (path.parent for path in window.session.runs_folder.glob("*/calibration.json"))

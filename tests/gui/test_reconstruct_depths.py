@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -59,23 +60,24 @@ def test_the_depth_is_asked_for_at_its_field_and_one_is_chosen_by_keys(
     calibration = _calibration(runs / "a-sweep" / "calibration", (80e3, 22e3, 38.9381e3))
     panel.take(photograph)
     form = panel.form
-    qtbot.waitUntil(lambda: "which one" in form.z_mm.placeholderText(), timeout=WAIT_MS)
-    assert form.psfs.text() == str(calibration)
+    z_mm = form.widgets["z_um"]
+    qtbot.waitUntil(lambda: "which one" in z_mm.placeholderText(), timeout=WAIT_MS)
+    assert form.text("calibration") == str(calibration)
     qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
     assert panel.job is None
-    assert form.z_mm.property("refused")
-    assert "22, 38.938, 80 mm" in form.z_mm.toolTip()
-    assert "z_um" not in form.z_mm.toolTip()
-    completer = form.z_mm.completer()
-    form.z_mm.setFocus()
+    assert z_mm.property("refused")
+    assert "22, 38.938, 80 mm" in z_mm.toolTip()
+    assert "z_um" not in z_mm.toolTip()
+    completer = z_mm.completer()
+    z_mm.setFocus()
     completer.complete()
     popup = completer.popup()
     qtbot.keyClick(popup, Qt.Key.Key_Down)
     qtbot.keyClick(popup, Qt.Key.Key_Down)
     qtbot.keyClick(popup, Qt.Key.Key_Return)
-    assert form.z_mm.text() == "38.938"
-    form.z_mm.check()
-    assert not form.z_mm.property("refused")
+    assert z_mm.text() == "38.938"
+    z_mm.submit()
+    assert not z_mm.property("refused")
     assert form.request().z_um == pytest.approx(38938)
 
 
@@ -87,29 +89,30 @@ def test_with_one_depth_nothing_is_asked_and_a_calibration_that_was_named_stays(
     panel.take(mine)
     panel.take(photograph)
     qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
-    assert panel.form.psfs.text() == str(mine)
+    assert panel.form.text("calibration") == str(mine)
     assert panel.form.request().z_um is None
-    panel.form.psfs.setText("/nowhere")
-    panel.form.psfs.editingFinished.emit()  # no calibration: no depths, and no mistake of their own
+    panel.form.options.set_values(
+        {"calibration": Path("/nowhere")}
+    )  # no calibration: no depths, and no mistake of their own
     qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
-    assert "which one" not in panel.form.z_mm.placeholderText()
+    assert "which one" not in panel.form.widgets["z_um"].placeholderText()
 
 
 def test_the_depths_are_those_of_the_calibration_that_was_chosen_in_the_dialogue(
     qtbot: QtBot, panel: ReconstructionsPanel, photograph: Path, tmp_path: Path
 ) -> None:
-    form = panel.form
+    form, z_mm = panel.form, panel.form.widgets["z_um"]
     panel.take(photograph)
     panel.take(_calibration(tmp_path / "several", (22e3, 80e3)))
-    qtbot.waitUntil(lambda: "which one" in form.z_mm.placeholderText(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "which one" in z_mm.placeholderText(), timeout=WAIT_MS)
     one = _calibration(tmp_path / "one", (50e3,))
-    row = form.psfs.parent()
+    row = form.widgets["calibration"].parent()
     assert isinstance(row, PathEntry)
     qtbot.mouseClick(row.button, Qt.MouseButton.LeftButton)
     (dialogue,) = row.findChildren(QFileDialog)
     dialogue.fileSelected.emit(str(one))
     dialogue.close()
-    qtbot.waitUntil(lambda: "which one" not in form.z_mm.placeholderText(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "which one" not in z_mm.placeholderText(), timeout=WAIT_MS)
     assert form.request().z_um is None
 
 
@@ -122,6 +125,7 @@ def test_depths_of_a_calibration(tmp_path: Path) -> None:
         Calibration(np.ones((1, 1, 8, 8), np.float32), np.full((1, 3), np.nan)), tmp_path / "unknown"
     )
     assert calibrated_depths_um(unknown) == ()
-    (path / "calibration.json").write_text('{"source_positions_um": 3}')
-    with pytest.raises(CalibrationFileError, match="tells no source positions"):
+    record = json.loads((path / "calibration.json").read_text()) | {"source_positions_um": 3}
+    (path / "calibration.json").write_text(json.dumps(record))
+    with pytest.raises(CalibrationFileError, match="damaged calibration"):
         calibrated_depths_um(path)

@@ -13,12 +13,13 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QFileDialog
 from pytestqt.qtbot import QtBot
 
+from gui.forms.reconstruct import PSF, VOLUME
 from gui.jobs import JobState
 from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.dialogues import Question
-from gui.widgets.reconstruct_form import PSF, VOLUME
+from gui.widgets.number_edit import NumberEdit
 from instrument.files.images import read_image, write_image
 from instrument.files.volume_source import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
@@ -62,17 +63,27 @@ def panel(qtbot: QtBot, make_session) -> ReconstructionsPanel:
 
 
 def fill(panel: ReconstructionsPanel, kind: str, files: Path, psfs: str) -> None:
-    form = panel.form
-    panel.tabs.setCurrentWidget(form)
-    form.kind.setCurrentText(kind)
-    for field, text in (
-        (form.image, files / "photo.tif"),
-        (form.psfs, files / psfs),
-        (form.iterations, "5"),
-        (form.dark, "100"),
+    panel.tabs.setCurrentWidget(panel.form)
+    panel.form.options.set_values({"kind": kind})
+    for name, text in (
+        ("image", files / "photo.tif"),
+        (panel.form.source, files / psfs),
+        ("iterations", "5"),
+        ("dark", "100"),
     ):
-        field.setText(str(text))
-        field.editingFinished.emit()
+        put(panel, name, text)
+
+
+def put(panel: ReconstructionsPanel, name: str, text: object) -> None:
+    """Write into a field and leave it."""
+    field = panel.form.widgets[name]
+    field.setText(str(text))
+    field.setModified(True)
+    field.submit() if isinstance(field, NumberEdit) else field.check()
+
+
+def choose(panel: ReconstructionsPanel, **values: object) -> None:
+    panel.form.options.set_values(values)
 
 
 def run(qtbot: QtBot, panel: ReconstructionsPanel) -> None:
@@ -94,12 +105,12 @@ def test_a_picture_by_mouse_is_written_and_shown(qtbot: QtBot, panel: Reconstruc
     assert "change" in panel.convergence.curves
     qtbot.waitUntil(lambda: panel.list.count() == 1, timeout=WAIT_MS)
     # The next one does not fall on top of it.
-    assert panel.form.out.text().endswith("photo-2.tif")
+    assert panel.form.text("out").endswith("photo-2.tif")
 
 
 def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
     fill(panel, VOLUME, files, "psfs")
-    panel.form.prior.setCurrentText("l1")
+    choose(panel, prior="l1")
     run(qtbot, panel)
     view = panel.volume
     assert panel.viewers.currentWidget() is view
@@ -142,9 +153,7 @@ def test_explain_says_what_would_be_chosen_and_reconstructs_nothing(
 
 def test_stopping_keeps_what_there_is(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
     fill(panel, PSF, files, "psf.tif")
-    panel.form.iterations.setText("1000000")
-    panel.form.prior.setCurrentText("tv-haar")
-    panel.form.method.setCurrentText("fista")
+    choose(panel, iterations=1_000_000, prior="tv-haar", solver="fista")
     qtbot.mouseClick(panel.form.start, Qt.MouseButton.LeftButton)
     with qtbot.waitSignal(panel.job.progressed, timeout=WAIT_MS):
         pass
@@ -159,12 +168,12 @@ def test_stopping_keeps_what_there_is(qtbot: QtBot, panel: ReconstructionsPanel,
     ("field", "text", "reason"),
     [
         ("image", "absent.tif", "no such file"),
-        ("iterations", "0", "above 0"),
+        ("iterations", "0", "1 or more"),
         ("iterations", "2.5", "whole number"),
         ("tau", "-1", "0 or more"),
-        ("binning", "many", "--bin"),
-        ("crop", "12", "--crop"),
-        ("noise", "loud", "--noise"),
+        ("binning", "many", "no number"),
+        ("crop", "12", "Crop '12': write TOP"),
+        ("noise", "loud", "Noise 'loud': write a standard deviation"),
         ("dark", "nan", "finite"),
         ("out", "result.jpg", ".tif"),
     ],
@@ -173,7 +182,7 @@ def test_a_wrong_entry_is_refused_at_its_field(
     qtbot: QtBot, panel: ReconstructionsPanel, files, field, text, reason
 ) -> None:
     fill(panel, PSF, files, "psf.tif")
-    entry = getattr(panel.form, field)
+    entry = panel.form.widgets[field]
     entry.setFocus()
     entry.clear()
     qtbot.keyClicks(entry, text)
@@ -198,12 +207,12 @@ def test_the_copied_lines_make_the_same_result(
     qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path, kind
 ) -> None:
     fill(panel, kind, files, "psf.tif" if kind == PSF else "psfs")
-    panel.form.crop.setText("28x30")
-    panel.form.noise.setText("2,0.5")
-    panel.form.out.setText(str(tmp_path / "by-script.tif"))
+    put(panel, "crop", "28x30")
+    put(panel, "noise", "2,0.5")
+    put(panel, "out", tmp_path / "by-script.tif")
     qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
     exec(QApplication.clipboard().text(), {})
-    panel.form.out.setText(str(tmp_path / "by-mouse.tif"))
+    put(panel, "out", tmp_path / "by-mouse.tif")
     run(qtbot, panel)
     np.testing.assert_allclose(
         tifffile.imread(tmp_path / "by-script.tif"), tifffile.imread(tmp_path / "by-mouse.tif"), rtol=1e-4
@@ -219,66 +228,81 @@ def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
     qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path
 ) -> None:
     fill(panel, PSF, files, "psf.tif")
-    form, advanced = panel.form, panel.form.advanced
-    assert not advanced.mosaic.isVisible()
-    advanced.fold.setFocus()
-    qtbot.keyClick(advanced.fold, Qt.Key.Key_Space)
-    assert advanced.mosaic.isVisible()
-    assert not advanced.positive.isVisible()  # of volumes
-    advanced.mosaic.setCurrentText("none")
-    advanced.turn.setCurrentText("by 90°")
-    advanced.tolerance.setText("1e-9")
-    qtbot.keyClick(advanced.saturated, Qt.Key.Key_Space)
-    advanced.checkpoint.setText(str(tmp_path / "kept"))
-    form.out.setText(str(tmp_path / "plain.tif"))
+    form, widgets = panel.form, panel.form.widgets
+    more = form.options.more
+    assert not widgets["allow_saturated"].isVisible()
+    more.setFocus()
+    qtbot.keyClick(more, Qt.Key.Key_Space)
+    assert widgets["allow_saturated"].isVisible()
+    assert not widgets["positive_background"].isVisible()  # of volumes
+    assert "bit depth" in widgets["allow_mixed_depth"].toolTip()
+    choose(panel, mosaic=None, rotate_deg="90", precision="float64")
+    put(panel, "tolerance", "1e-9")
+    qtbot.keyClick(widgets["allow_saturated"], Qt.Key.Key_Space)
+    put(panel, "checkpoint", tmp_path / "kept")
+    put(panel, "out", tmp_path / "plain.tif")
     request = form.request()
     assert request.allow_saturated
     assert request.settings.mosaic is None
     assert request.settings.tolerance == 1e-9
+    assert request.settings.precision == "float64"
     run(qtbot, panel)
     assert list((tmp_path / "kept").iterdir())  # five iterations are not its end
-    advanced.checkpoint.setText(str(tmp_path / "kept-by-script"))
-    form.out.setText(str(tmp_path / "by-script.tif"))
+    put(panel, "checkpoint", tmp_path / "kept-by-script")
+    put(panel, "out", tmp_path / "by-script.tif")
     qtbot.mouseClick(panel.copy_button, Qt.MouseButton.LeftButton)
     exec(QApplication.clipboard().text(), {})
     by_script, by_window = (tifffile.imread(tmp_path / f"{name}.tif") for name in ("by-script", "plain"))
     np.testing.assert_allclose(by_script, by_window, rtol=1e-4)
-    advanced.turn.setCurrentText("as on the sensor")
-    advanced.checkpoint.clear()
-    form.out.setText(str(tmp_path / "not-turned.tif"))
+    choose(panel, rotate_deg="0")
+    put(panel, "checkpoint", "")
+    put(panel, "out", tmp_path / "not-turned.tif")
     exec(form.as_python(), {})
     np.testing.assert_allclose(
         np.rot90(tifffile.imread(tmp_path / "not-turned.tif")), by_window, rtol=1e-3, atol=1e-3
     )
 
 
+def test_zero_is_a_tolerance_and_what_is_one_shot_has_none(panel: ReconstructionsPanel, files) -> None:
+    fill(panel, PSF, files, "psf.tif")
+    put(panel, "tolerance", "0")
+    assert panel.form.request().settings.tolerance == 0
+    choose(panel, solver="wiener")
+    assert not panel.form.widgets["tolerance"].isEnabled()
+    assert "one shot" in panel.form.widgets["tolerance"].toolTip()
+    settings = panel.form.request().settings
+    assert (settings.tolerance, settings.iterations) == (None, None)
+
+
 def test_choices_of_a_volume_are_those_of_the_command_line(
     qtbot: QtBot, panel: ReconstructionsPanel, files, tmp_path
 ) -> None:
     fill(panel, VOLUME, files, "psfs")
-    form, advanced = panel.form, panel.form.advanced
-    advanced.fold.click()
-    advanced.choose.setText("binning=1 planes=all")
-    advanced.positive.click()
-    advanced.at_noise.click()
+    form = panel.form
+    put(panel, "choose", "binning=1 planes=0-1,3")
+    form.options.more.click()
+    form.widgets["positive_background"].click()
+    form.widgets["stop_at_noise"].click()
     request = form.request()
     assert isinstance(request, VolumeRequest)
-    assert request.settings.wishes == Wishes(binning=1, planes="all")
+    assert request.settings.wishes == Wishes(binning=1, planes=(0, 1, 3))
     assert request.positive_background
     assert request.settings.stop_at_noise
     names: dict = {}
     exec(form.as_python().split("job = ")[0], names)
     assert names["request"] == request
-    advanced.checkpoint.setText(str(tmp_path / "kept"))
+    put(panel, "checkpoint", tmp_path / "kept")
     qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
     assert panel.job is None
     assert "--checkpoint" in panel._note.toolTip()
-    advanced.fold.click()
-    advanced.choose.setText("size=3")
+    form.widgets["choose"].setText("size=3")
     qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
     assert panel.job is None
     assert "no choice 'size'" in panel._note.toolTip()
-    assert advanced.choose.isVisible()  # where it was refused
+    put(panel, "memory_gib", "-1")
+    form.options.more.setChecked(False)
+    qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
+    assert form.widgets["choose"].property("refused")
 
 
 def test_export_writes_values_and_views(qtbot: QtBot, panel: ReconstructionsPanel, tmp_path) -> None:

@@ -15,8 +15,7 @@ from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.main_window import MainWindow
 from gui.panels.runs import RunsPanel
 from gui.panels.sweeps import SweepsPanel
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 60_000
@@ -104,8 +103,8 @@ WRONG = [
     ("z_max_um", "900", "outside the stage's limits", "150"),
     ("z_max_um", "20", "nearest first", "150"),
     ("average", "1.5", "whole number", "1"),
-    ("average", "0", "at least 1", "1"),
-    ("target", "3", "between 0.05 and 0.9", "0.7"),
+    ("average", "0", "1 or more", "1"),
+    ("target", "3", "0.05 or more", "0.7"),
     ("binning", "999", "choose 15 at most", "1"),
 ]
 
@@ -336,8 +335,8 @@ def test_a_run_is_read_outside_the_windows_thread_and_a_damaged_one_told(
 def test_what_was_said_of_other_values_does_not_stay_while_a_check_takes_its_time(
     qtbot: QtBot, panel: SweepsPanel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="0")
-    assert "number of planes is 0" in panel.verdict.toPlainText()
+    enter(qtbot, panel, z_min_um="60", z_max_um="150", planes="1")
+    assert "number of planes is 1" in panel.verdict.toPlainText()
     gate = threading.Event()
     real = SweepProcedure.outlook
 

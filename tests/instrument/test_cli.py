@@ -328,3 +328,22 @@ def test_a_pattern_is_shown_without_anybody_asked_for_light(
     write_slm_image(here / "slm.png", levels, {})
     assert main(["show", "slm.png", "--seconds", "0"]) == 0
     assert "Please" not in capsys.readouterr().err
+
+
+HEAVY = ("numba", "matplotlib", "zarr", "scipy", "dask", "PySide6")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["new", "check", "devices", "snap", "run", "list", "export", "reconstruct", "chart", "hologram"],
+)
+def test_a_commands_help_imports_no_heavy_library(name: str) -> None:
+    code = (
+        f"import sys; from instrument.cli import main; main(['{name}', '--help']); "
+        f"print([m for m in {HEAVY} if m in sys.modules])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    shown = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60, env=environment
+    )
+    assert shown.stdout.endswith("[]\n")

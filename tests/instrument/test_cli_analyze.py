@@ -14,7 +14,7 @@ from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
-from recon.analysis.sampling import gaussian_response, lateral_spacing_um
+from recon.analysis.resolution import gaussian_response, lateral_spacing_um
 from recon.types import Calibration, Geometry
 
 

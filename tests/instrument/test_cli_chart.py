@@ -155,8 +155,8 @@ def test_mistakes_are_named(arguments, said, tmp_path):
 
 
 def test_a_setting_runs_in_a_process_of_its_own():
+    from instrument.evaluation.chart_job import in_own_process
     from instrument.evaluation.chart_problems import problem_of_scene
-    from instrument.evaluation.chart_process import in_own_process
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     found = in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
@@ -171,7 +171,7 @@ def test_memory_taken_aside_does_not_count():
     # In a process of its own: what this one has freed before would be taken again, and not count as taken.
     program = """
 import numpy as np
-from instrument.evaluation.chart_process import MemoryMeter
+from instrument.evaluation.chart_job import MemoryMeter
 meter = MemoryMeter()
 own = np.ones(6 << 20)  # 48 MiB
 with meter.aside():
@@ -215,7 +215,7 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
 def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
     import multiprocessing
 
-    from instrument.evaluation import chart_process as process
+    from instrument.evaluation import chart_job as process
 
     ended = []
     waited = SimpleNamespace(join=lambda: ended.append("parent is gone"))
@@ -228,7 +228,7 @@ def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
 def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
     import signal
 
-    from instrument.evaluation import chart_process as process
+    from instrument.evaluation import chart_job as process
 
     masks = []
     blocked = lambda: masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))  # noqa: E731
@@ -326,8 +326,8 @@ def test_photographs_that_do_not_fit_together_are_refused(few, tmp_path):
 
 
 def test_what_ends_a_setting_is_told_in_its_row():
+    from instrument.evaluation.chart_job import in_own_process
     from instrument.evaluation.chart_problems import problem_of_scene
-    from instrument.evaluation.chart_process import in_own_process
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
     broken = replace(problem, measurement=None)

@@ -20,7 +20,6 @@ import tifffile
 from scipy.signal import convolve2d
 
 from instrument.cli import main
-from instrument.cli.reconstruct_options import Method, PriorName
 from instrument.files.calibration_file import save_calibration
 from instrument.files.images import read_image, write_image
 from recon.priors import PRIORS
@@ -246,7 +245,7 @@ BAD = {
     "black image": (["--image", "zero.tif"], "zero.tif: the image is constant"),
     "crop": (["--crop", "100x100"], "--crop asks for 100 x 100"),
     "crop text": (["--crop", "middle"], "TOP,LEFT,HEIGHT,WIDTH"),
-    "bin": (["--bin", "0"], "--bin '0'"),
+    "bin": (["--bin", "0"], "--bin must be auto or a whole number, 1 or more, not 0"),
     "bin too large": (["--bin", "100"], "--bin 100"),
     "dark": (["--dark", "absent.tif"], "absent.tif: there is no such file"),
     "dark shape": (["--dark", "small.tif"], "the dark frame is 10 x 10"),
@@ -401,9 +400,33 @@ def count_runs(line: npt.NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(lengths >= 3))
 
 
-def test_every_method_and_prior_is_on_offer() -> None:
-    assert [m.value for m in Method if m is not Method.ADMM_GPU] == list(SOLVERS)
-    assert [p.value for p in PriorName] == list(PRIORS)
+def test_every_solver_and_prior_is_on_offer(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct", "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"[auto, {', '.join(SOLVERS)}; default: auto]" in shown
+    assert f"[{', '.join(PRIORS)}; default" in shown
+
+
+def test_the_help_fits_on_two_screens_with_what_is_rare_at_the_end(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("COLUMNS", "TERMINAL_WIDTH"):
+        monkeypatch.setenv(name, "110")
+    assert main(["reconstruct", "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 80
+    headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
+    assert headings[-1] == "Rarely needed:"
+    assert len(headings) > 6
+
+
+@pytest.mark.parametrize("words", [("--mixed-depth",), ("--allow-saturated",)])
+def test_what_is_about_psf_images_is_refused_with_a_calibration(
+    words: tuple[str, ...], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--calibration", str(here), "--image", "raw.tif", "--out", "out.tif"]
+    assert main(["reconstruct", *arguments, *words]) == 2
+    assert f"{words[0]}: for a PSF image" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")
@@ -416,7 +439,7 @@ def test_a_psf_image_is_said_not_to_be_refocused(capsys: pytest.CaptureFixture[s
     assert "refocused" not in capsys.readouterr().out
     for z_mm in ("-4", "0", "nan", "inf"):
         assert main([*words, "--force", "--z-mm", z_mm]) == 2
-        assert "distance must be above 0 mm" in capsys.readouterr().err
+        assert "--z-mm must be a number, above 0 (mm), not" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("here")

@@ -13,8 +13,8 @@ from instrument.cli.stability import app
 from instrument.evaluation.stability_figure import ticks_of
 from instrument.files.errors import BenchError, FileError
 from instrument.files.stability_file import CellLog, read_stability
-from recon.evaluation import catalogue
-from recon.evaluation.stability_run import run_map
+from recon.evaluation import maps
+from recon.evaluation.maps import run_map
 from recon.verdict.failure import Failure
 from recon.verdict.map import Axis, StressMap, Trial
 
@@ -38,7 +38,7 @@ AXES = (
 def one_map(monkeypatch: pytest.MonkeyPatch) -> None:
     CALLS.clear()
     stress = StressMap("easy", "Easy", "Is it easy?", *AXES, ("first", "stops"), trial)
-    monkeypatch.setattr(catalogue, "MAPS", {"easy": stress})
+    monkeypatch.setattr(maps, "MAPS", {"easy": stress})
 
 
 def run(*arguments: str) -> str:
@@ -75,7 +75,7 @@ def test_an_interrupted_map_goes_on_where_it_was(tmp_path: Path) -> None:
 def test_cells_of_another_program_or_scene_are_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stress = replace(catalogue.MAPS["easy"], methods=("first",), base="ten points")
+    stress = replace(maps.MAPS["easy"], methods=("first",), base="ten points")
     (cell, *_) = run_map(stress, "quick")
     CellLog(tmp_path).add(stress, "quick", cell)
     assert CellLog(tmp_path).of(stress, "quick") == [cell]
@@ -127,7 +127,7 @@ def test_the_list_names_maps_and_methods() -> None:
 def test_an_axis_may_name_its_values_in_other_units(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named = replace(AXES[0], named=lambda value, size: f"{value:g} e in {size}")
     stress = StressMap("easy", "Easy", "Is it easy?", named, AXES[1], ("first",), trial)
-    monkeypatch.setattr(catalogue, "MAPS", {"easy": stress})
+    monkeypatch.setattr(maps, "MAPS", {"easy": stress})
     run("easy", "--out", str(tmp_path))
     record = read_stability(tmp_path / "stability.json")["maps"]["easy"]
     assert record["x"]["ticks"] == ["1 e in quick", "10 e in quick"]

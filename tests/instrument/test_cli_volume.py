@@ -80,11 +80,11 @@ def test_voxel_sizes_of_a_calibration_reach_the_file(files, tmp_path, run):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--model", "exact"], "--model 'exact' is not known"),
+        (["--model", "exact"], "--model must be one of auto, convolution"),
         (["--model", "local"], "several places of the field"),
         (["--prior", "tv-haar"], "not for volumes"),
         (["--z-mm", "3"], "do not apply"),
-        (["--noise", "loud"], "--noise 'loud' is not understood"),
+        (["--noise", "loud"], "--noise 'loud': write a standard deviation"),
         (["--noise", "1,2,3"], "read noise in counts"),
         (["--noise=-1"], "standard deviation in counts"),
         (["--memory", "0.00001"], "Bin the images or take fewer depths"),
@@ -99,16 +99,16 @@ def test_refuses_in_words(files, arguments, words, run):
 
 
 @pytest.mark.parametrize(
-    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--method", "admm-sensor")]
+    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--solver", "admm-sensor")]
 )
 def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     folder, image, out = files
     code, output = run("--volume", folder, "--image", image, "--out", out, *options)
     assert code == 2
-    assert f"With --volume these do not apply: {options[0]}." in output
+    assert f"With --volume these do not apply: {options[0]} (for a picture" in output
     code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, "--no-background")
     assert code == 2
-    assert "is for volumes" in output
+    assert "do not apply: --no-background (for a volume)" in output
     assert not out.exists()
 
 
@@ -126,7 +126,7 @@ def test_memory_is_a_matter_of_volumes(files, run, option):
     folder, image, out = files
     code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, *option)
     assert code == 2
-    assert f"{option[0]} is for volumes" in output
+    assert f"do not apply: {option[0]} (for a volume)" in output
 
 
 def test_a_picture_with_the_local_model(tmp_path, run):

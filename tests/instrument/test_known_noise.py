@@ -9,7 +9,6 @@ from instrument.cli import main
 from instrument.files.images import ImageFile, read_image, write_image
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.record import noise_of
-from instrument.reconstruction.words import parse_noise
 from recon import Calibration, NoiseModel
 
 FACTS = {"noise": {"read_noise_counts": 3.0, "counts_per_electron": 0.2}}
@@ -44,7 +43,7 @@ def test_what_is_given_goes_before_what_is_known():
     job = Job(image, calibration, {}, provenance={"binning": 2}, known_noise=NoiseModel(3.0, 0.2))
     assert job.binned_noise(None) == NoiseModel(1.5, 0.05)
     assert job.binned_noise(5.0) == 2.5
-    assert job.binned_noise(parse_noise("estimate")) is None
+    assert job.binned_noise("estimate") is None
     mosaic = Job(
         image, calibration, {}, provenance={"binning": 2, "mosaic": "RGGB"}, known_noise=NoiseModel(3.0, 0.2)
     )

@@ -13,6 +13,7 @@ from instrument.files.images import ImageFile, write_image
 from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
 from instrument.reconstruction.preparation import Crop
 from recon.camera.bayer import PATTERNS
+from recon.errors import InputError
 
 HEIGHT, WIDTH = 36, 48
 COLOURS = np.array([1.0, 0.5, 0.2])
@@ -43,7 +44,7 @@ def test_every_colour_is_the_mean_of_its_own_pixels(pattern, crop, binning):
 def test_an_odd_binning_and_a_colour_file_are_refused():
     with pytest.raises(BenchError, match="take an even number"):
         reduce_mosaic(np.zeros((6, 6), np.float32), "RGGB", None, 3)
-    with pytest.raises(BenchError, match="'RGBG' is not known"):
+    with pytest.raises(InputError, match="choose one of RGGB"):
         mosaic_named("RGBG")
     with pytest.raises(FileError, match="a raw RGGB frame is grey"):
         require_mosaic(ImageFile("x.tif", np.zeros((4, 4, 3), np.uint8)), "RGGB")

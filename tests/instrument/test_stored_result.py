@@ -13,7 +13,7 @@ from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.files.volume_source import open_volume, volume_in_memory
 from instrument.files.volume_zarr import write_volume_zarr
-from instrument.reconstruction.result_list import find_results, free_name
+from instrument.reconstruction.result_list import find_results, free_result
 from instrument.reconstruction.stored_result import open_result, record_file
 from instrument.reconstruction.volume_views import in_colour_of_depth, project
 from recon.reconstruction.result import Grid
@@ -218,5 +218,5 @@ def test_results_of_a_folder_are_listed_newest_first(tmp_path):
     (tmp_path / "gone.json").write_text((tmp_path / "a" / "r.json").read_text())
     assert find_results(tmp_path) == [tmp_path / "runs/b/r.json", tmp_path / "a/r.json"]
     assert find_results(tmp_path / "absent") == []
-    assert free_name(tmp_path / "a", "r", ".tif").name == "r-2.tif"
-    assert free_name(tmp_path / "a", "new", ".tif").name == "new.tif"
+    assert free_result(tmp_path / "a", "r", ".tif").name == "r-2.tif"
+    assert free_result(tmp_path / "a", "new", ".tif").name == "new.tif"

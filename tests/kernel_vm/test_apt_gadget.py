@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.apt.options import AptOptions
-from drivers.apt.stage import AptStage
+from drivers.apt.stage import AptOptions, AptStage
 from drivers.errors import DeviceError
 from drivers.registry.discovery import FoundDevice
 from tests.mocks.apt_controller import AptController, split_messages

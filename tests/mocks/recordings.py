@@ -11,7 +11,7 @@ import numpy as np
 from drivers.frame import FrameMetadata
 from instrument.plan import Plan
 from instrument.runs.frame_record import Gap
-from instrument.runs.layout import FinishReason
+from instrument.runs.run import FinishReason
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 
 BENCH = BenchRecord(

@@ -11,6 +11,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from recon.verdict.map import Axis
+
 DrawnMap = Callable[[str, Sequence[float], str, Mapping[object, Sequence[float]]], str]
 
 FINE = 3
@@ -91,11 +93,10 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
     def draw(x_name: str, x: Sequence[float], y_name: str, rows: Mapping[object, Sequence[float]]) -> str:
         from instrument.evaluation.stability_figure import map_figure
         from instrument.files.figures import save_figure
-        from recon.verdict.map import Axis, as_text
 
         axes = Axis(x_name, x_name, "", tuple(x), ()), Axis(y_name, y_name, "", tuple(range(len(rows))), ())
         grid = np.array(list(rows.values()), float)
-        text = as_text(*axes, (axes[0].values, axes[1].values), grid)
+        text = _as_text(*axes, grid)
         shown = {
             "title": f"{x_name} and {y_name}",
             "error": "severity",
@@ -108,3 +109,12 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
         return f"{text}\n{names}\nThe map: {picture}"
 
     return draw
+
+
+def _as_text(x: Axis, y: Axis, severity: np.ndarray) -> str:
+    """Draw a map in text: severities, failing ones marked with ``#``; the largest ``y`` on top."""
+    lines = [f"{y.label} up, {x.label} to the right; # fails (severity >= 1)"]
+    for value, row in reversed(list(zip(y.values, severity, strict=True))):
+        lines.append(f"{value:>9.4g} | " + " ".join(f"{s:6.2f}{'#' if s >= 1 else ' '}" for s in row))
+    lines.append(" " * 10 + "  " + " ".join(f"{v:>6.4g} " for v in x.values))
+    return "\n".join(lines)

@@ -7,8 +7,8 @@ import recon
 from recon.camera.camera_model import Depths, sort_by_depth
 from recon.camera.light import LEAST_GAIN, levelled
 from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 
 
 def depths_of(gains: list[float]) -> Depths:

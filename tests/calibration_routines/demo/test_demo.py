@@ -26,8 +26,7 @@ from instrument.bench.bench import Bench
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import FileError
-from instrument.runs.layout import RunCondition
-from instrument.runs.run import Run
+from instrument.runs.run import Run, RunCondition
 
 SMALL = DemoSettings(
     preset="tiny",

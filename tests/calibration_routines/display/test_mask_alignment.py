@@ -12,15 +12,14 @@ import pytest
 from calibration_routines.display.display_io import DisplayBench
 from calibration_routines.display.mask_alignment import AlignmentFailedError, AlignmentSettings, MaskAlignment
 from calibration_routines.display.slm_calibration import measure_flatness, measure_look_up_table
-from drivers.simulated.display_world import DisplayWorld
+from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, parse_config
 from instrument.bench.display_setup import bench_display
 from instrument.cli import main
 from instrument.files.alignment_file import load_alignment
 from instrument.files.images import write_image
-from instrument.files.slm_correction import SlmCorrection, load_slm_correction
-from instrument.files.slm_image import phase_levels
+from instrument.files.slm_image import SlmCorrection, load_slm_correction, phase_levels
 from recon.errors import InputError
 from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, mode

@@ -152,7 +152,7 @@ def test_what_cannot_give_a_phase_is_refused() -> None:
         phase_from_halves(dict.fromkeys(SIDES, np.zeros((8, 8))), OPTICS)
     with pytest.raises(InputError, match="do not fill"):
         DpcOptics(1.6, 515.0, 0.1, 0.08)
-    with pytest.raises(BenchError, match="red, green or blue"):
+    with pytest.raises(BenchError, match="red, green, blue"):
         DpcSetup(0.1, 4.0, band="white")
 
 

@@ -24,7 +24,7 @@ from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
 from instrument.plan import PlanError
-from instrument.runs.layout import RunCondition
+from instrument.runs.run import RunCondition
 from instrument.runs.runner import RunStatus
 from recon.types import Geometry
 
@@ -43,7 +43,7 @@ control = "simulated"
 preset = "tiny"
 time_scale = 0
 """
-SWEEP = AxialSweep(60e3, 150e3, 5, average=2, dark_frames=2)
+SWEEP = AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=5, average=2, dark_frames=2)
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_a_sweep_gives_good_psfs_that_scale_with_depth_and_survive_the_disk(
 
 
 def test_psfs_match_the_light_that_fell_on_the_sensor(bench: Bench, tmp_path: Path) -> None:
-    sweep = AxialSweep(80e3, 80e3, average=4)
+    sweep = AxialSweep(z_min_um=80e3, average=4)
     psf = calibrate_sweep(bench, sweep, tmp_path).calibration.psfs[0, 0]
     truth = world_of(bench).psf((0.0, 0.0, 80e3), (0.0, 1.0, 0.0))
     assert np.corrcoef(psf.ravel(), truth.ravel())[0, 1] > 0.995
@@ -155,7 +155,7 @@ def test_a_source_too_weak_for_the_camera_is_refused_in_words(tmp_path: Path) ->
 def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp_path: Path) -> None:
     before = bench.source_position_um
     with pytest.raises(PlanError, match="outside the stage's limits"):
-        calibrate_sweep(bench, AxialSweep(60e3, 900e3, 3), tmp_path)
+        calibrate_sweep(bench, AxialSweep(z_min_um=60e3, z_max_um=900e3, planes=3), tmp_path)
     assert bench.source_position_um == before
     assert list(tmp_path.iterdir()) == []
 
@@ -163,7 +163,7 @@ def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp
 def test_a_bench_without_a_stage_takes_one_psf_by_hand(tmp_path: Path) -> None:
     text = TINY.replace('[stage]\ndriver = "simulated"\n', "")
     with open_bench(parse_config(text, None)) as bench:
-        done = calibrate_sweep(bench, AxialSweep(100e3, 100e3, by_hand=True), tmp_path)
+        done = calibrate_sweep(bench, AxialSweep(z_min_um=100e3, by_hand=True), tmp_path)
     assert done.findings == ()
     assert done.calibration.source_positions_um.tolist() == [[0.0, 0.0, 100e3]]
 
@@ -171,11 +171,11 @@ def test_a_bench_without_a_stage_takes_one_psf_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"z_min_um": 0.0}, "0 < z min"),
+        ({"z_min_um": 0.0}, "z_min_um must be a number, above 0"),
         ({"z_min_um": 200e3}, "0 < z min <= z max"),
         ({"planes": 1}, "one plane needs z min = z max"),
-        ({"average": 0}, "average must be at least 1"),
-        ({"target": 1.0}, "target must lie between"),
+        ({"average": 0}, "average must be a whole number, 1 or more"),
+        ({"target": 1.0}, "target must be a number, 0.05 or more, 0.9 or less"),
         ({"by_hand": True}, "5 planes need a stage"),
     ],
 )

@@ -34,8 +34,8 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
-from instrument.runs.layout import FinishReason, RunCondition
 from instrument.runs.resume import prepare_resume
+from instrument.runs.run import FinishReason, RunCondition
 from instrument.runs.runner import Runner, RunStatus
 from recon import reconstruct
 from recon.base import metrics
@@ -64,7 +64,7 @@ fall_off_sigma_deg = 12
 Z_UM = 100e3
 POINTS = tuple((x, y, Z_UM) for y in (-10e3, 0.0, 10e3) for x in (-15e3, 0.0, 15e3))
 MODELS_COMPARED: tuple[ModelName, ...] = ("convolution", "local")
-SWEEP = PointSweep(POINTS, kind="lateral", average=2, dark_frames=2, reference_every=4)
+SWEEP = PointSweep(points_um=POINTS, kind="lateral", average=2, dark_frames=2, reference_every=4)
 
 
 @pytest.fixture
@@ -112,7 +112,9 @@ def test_a_close_scene_needs_the_lateral_calibration(tmp_path: Path) -> None:
         assert bench.stage is not None
         bench.stage.home()
         grid = grid_sweep(bench, (12e3,), response=gaussian_fall_off(8.0))
-        done = calibrate_sweep(bench, PointSweep(grid.points_um, kind="lateral", average=2), tmp_path)
+        done = calibrate_sweep(
+            bench, PointSweep(points_um=grid.points_um, kind="lateral", average=2), tmp_path
+        )
         photo = photograph(bench, expose_scene(bench).exposure_ms, tmp_path, average=2, dark_frames=2)
         truth = world_of(bench).ground_truth(photo.measurement.shape[:2], 26.0)
     assert done.findings == ()
@@ -381,8 +383,8 @@ def test_binning_stops_at_the_finest_structure(width: float, binning: int) -> No
         ({"points_um": ()}, "at least one point"),
         ({"points_um": (POINTS[0], POINTS[0])}, "listed twice"),
         ({"points_um": ((0.0, 0.0, -1.0),)}, "in front of the diffuser"),
-        ({"average": 0}, "average must be at least 1"),
-        ({"reference_every": -1}, "reference_every must be at least 0"),
+        ({"average": 0}, "average must be a whole number, 1 or more"),
+        ({"reference_every": -1}, "reference_every must be a whole number, 0 or more"),
     ],
 )
 def test_senseless_sweeps_are_refused(wrong: dict[str, int], message: str) -> None:

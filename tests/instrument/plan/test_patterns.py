@@ -19,13 +19,13 @@ from instrument.plan.led_shapes import (
     Annulus,
     BrightField,
     DarkField,
-    Grid,
+    GridCell,
     HalfCircle,
     LedPlaces,
     LedShape,
     Single,
 )
-from instrument.plan.patterns import PATTERNS, led_shape, shape_buttons, shape_from_text, shape_text
+from instrument.plan.patterns import LED_PATTERNS, led_shape, shape_buttons, shape_from_text, shape_text
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from recon import InputError
@@ -99,10 +99,10 @@ def test_cells_of_a_grid_hold_every_led_once_by_place() -> None:
     x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 1.0])
     flat = Square()
     flat.led_positions_mm = np.column_stack([x.ravel(), y.ravel()])
-    assert [leds(cell, flat) for cell in Grid(2).series(flat)] == [[0], [1, 2], [3], [4, 5]]
+    assert [leds(cell, flat) for cell in GridCell(2).series(flat)] == [[0], [1, 2], [3], [4, 5]]
     flat.led_positions_mm = np.array([[0.0, 0.0], [1.0, 0.0]])
-    assert [leds(cell, flat) for cell in Grid(1).series(flat)] == [[0, 1]]
-    assert [cell.cell for cell in Grid(2).series(flat)] == [0, 1]  # the empty ones are left out
+    assert [leds(cell, flat) for cell in GridCell(1).series(flat)] == [[0, 1]]
+    assert [cell.cell for cell in GridCell(2).series(flat)] == [0, 1]  # the empty ones are left out
 
 
 # How it is written ---------------------------------------------------------------------------------
@@ -204,9 +204,9 @@ class Odd(LedShape):
 
 @pytest.fixture
 def odd() -> Iterator[None]:
-    PATTERNS.register(Odd)
+    LED_PATTERNS.register(Odd)
     yield
-    del PATTERNS._foreign["odd"]
+    del LED_PATTERNS._foreign["odd"]
 
 
 @pytest.mark.usefixtures("odd")

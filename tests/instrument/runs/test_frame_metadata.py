@@ -22,10 +22,9 @@ from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.plan import Part, Plan
 from instrument.runs.acquire import acquire
-from instrument.runs.layout import LOG
-from instrument.runs.recording import record
-from instrument.runs.run import Run
-from instrument.runs.snapshot import Light, read_snapshot, write_snapshot
+from instrument.runs.recorder import record
+from instrument.runs.run import LOG, Run
+from instrument.runs.snapshot import LightState, read_snapshot, write_snapshot
 
 BENCH = """
 [bench]
@@ -96,7 +95,7 @@ def assert_all_there(metadata: FrameMetadata) -> None:
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".npy"])
 def test_photographs_have_it(tmp_path: Path, bench: Bench, suffix: str) -> None:
     taken, path = bench.snap(1), tmp_path / f"photo{suffix}"
-    write_snapshot(bench, path, taken, Light.DARK)
+    write_snapshot(bench, path, taken, LightState.DARK)
     back = read_snapshot(path)
     assert back.metadata == taken.metadata
     assert (back.image == taken.image).all()
@@ -141,7 +140,7 @@ def test_what_a_newer_version_added_is_kept_with_a_word(
 
 def test_every_field_of_today_comes_back(tmp_path: Path, bench: Bench) -> None:
     taken = bench.snap(1)
-    write_snapshot(bench, tmp_path / "photo.tif", taken, Light.DARK)
+    write_snapshot(bench, tmp_path / "photo.tif", taken, LightState.DARK)
     back = read_snapshot(tmp_path / "photo.tif").metadata
     for declared in fields(FrameMetadata):
         assert getattr(back, declared.name) == getattr(taken.metadata, declared.name), declared.name

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from recon.analysis.points import Noise, try_points
+from recon.analysis.points import Noise, PointGrid, try_points
 from recon.analysis.window import WindowProblem
 
 WORLD = SimulatedWorld(WorldOptions(preset="tiny", time_scale=0.0, aperture_mm=(1.0, 1.0)))
@@ -23,10 +23,7 @@ def point(columns: float, _plane: float) -> np.ndarray:
 
 def dip(separation_px: float, noise: Noise) -> float:
     problem = WindowProblem(WORLD.psf((0.0, 0.0, Z_UM), GREEN)[None], (4, 12))
-    trial = try_points(
-        problem, point, columns=2, planes=1, separation_px=separation_px, separation_planes=0.0, noise=noise
-    )
-    return trial.dip
+    return try_points(problem, point, PointGrid(2, separation_px=separation_px), noise).dip
 
 
 def test_points_far_apart_are_resolved_and_near_ones_are_not() -> None:

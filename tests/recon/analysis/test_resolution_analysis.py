@@ -7,8 +7,15 @@ import pytest
 
 from recon.analysis.correlation import autocorrelate, correlate, critical_scale, similarity
 from recon.analysis.field import FieldPoint, convolution_holds_deg, field_of_view
-from recon.analysis.resolution import AxialResolution, axial_resolution, lateral_resolution
-from recon.analysis.sampling import axial_spacing_per_um, gaussian_response, lateral_spacing_um, voxel_grid
+from recon.analysis.resolution import (
+    AxialResolution,
+    axial_resolution,
+    axial_spacing_per_um,
+    gaussian_response,
+    lateral_resolution,
+    lateral_spacing_um,
+    voxel_grid,
+)
 from recon.camera.refocus import rescaled
 from recon.errors import InputError
 

@@ -11,8 +11,8 @@ import pytest
 import recon
 from recon import InputError
 from recon.base.blocks import block_mean, enlarged
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.precision import drift, precision_of

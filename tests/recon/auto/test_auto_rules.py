@@ -13,8 +13,8 @@ from recon.camera import registration_cache as remembered
 from recon.camera.camera_model import sort_by_depth
 from recon.camera.field_registration import NOT_ON_AXIS
 from recon.camera.local_convolution import FieldOfPsfs
+from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scene_score import score
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.part import Part
 

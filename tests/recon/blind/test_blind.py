@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from recon.blind import BlindSettings, calibrate_from_beads
+from recon.blind.polish import first_psf, offset_of
 from recon.blind.psf_step import BeadMixer, limit_rank, solve_psfs
-from recon.blind.start import first_psf, offset_of
 from recon.camera.interpolation import interpolation_weights
 from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
 from recon.camera.registration import displacement, shifted

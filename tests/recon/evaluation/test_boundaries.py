@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import griddata
 
-from recon.analysis.points import Noise, try_points
+from recon.analysis.points import Noise, PointGrid, try_points
 from recon.analysis.resolution import axial_resolution
 from recon.analysis.window import WindowProblem
-from recon.evaluation.catalogue import map_named
 from recon.evaluation.lenslets import build_camera
+from recon.evaluation.maps import map_named
 from recon.evaluation.maps_scene import local_condition
 from recon.evaluation.scene import SceneSpec
 from recon.evaluation.scene_trial import Options, judge_image, run_scene, scene_of, solve
@@ -74,11 +74,8 @@ def test_sixteen_points_need_more_room_than_two(drawn_map: DrawnMap) -> None:
         return try_points(
             window,
             image if depths > 1 else lambda c, _s: image(c, 9),
-            columns=columns,
-            planes=depths,
-            separation_px=px,
-            separation_planes=apart,
-            noise=Noise(),
+            PointGrid(columns, depths, px, apart),
+            Noise(),
             trials=1,
         ).dip
 

@@ -9,9 +9,8 @@ from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.evaluation.chart_judge import Judge
 from recon.evaluation.chart_reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
-from recon.evaluation.even import even_with_best
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scored import Point, pareto
+from recon.evaluation.scored import Point, even_with_best, pareto
 from recon.priors import PRIORS
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration

@@ -7,13 +7,12 @@ import pytest
 
 from recon.camera.convolution import PadCropConvolution
 from recon.errors import InputError
-from recon.evaluation.catalogue import MAPS, map_named
+from recon.evaluation.maps import MAPS, map_named, run_map
 from recon.evaluation.maps_solver import _OffBalance
-from recon.evaluation.stability_run import run_map
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.verdict.failure import Failure
-from recon.verdict.map import Axis, Cell, StressMap, Trial, as_text, boundary, severity_grid
+from recon.verdict.map import Axis, Cell, StressMap, Trial, boundary, severity_grid
 
 X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
 Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))
@@ -47,8 +46,6 @@ def test_the_boundary_is_interpolated_where_the_severity_crosses_one() -> None:
     assert boundary(X.values, Y.values, grid, logarithmic=True) == [
         (pytest.approx(30 * y), y) for y in Y.values
     ]
-    text = as_text(X, Y, (X.values, Y.values), grid)
-    assert text.count("#") == int(np.count_nonzero(grid >= 1)) + 1  # one in the legend
 
 
 def test_a_row_that_never_crosses_has_no_boundary_and_an_odd_cell_does_not_move_it() -> None:

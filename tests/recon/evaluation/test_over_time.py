@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
-from recon.evaluation.catalogue import map_named
+from recon.evaluation.maps import map_named
 from recon.evaluation.maps_time import READ_NOISE_E, video_of
 from recon.verdict.failure import Failure
 

@@ -7,9 +7,9 @@ import pytest
 
 from recon import InputError, reconstruct
 from recon.camera.registration import expected_shift
+from recon.evaluation.chart_judge import score
 from recon.evaluation.lenslets import build_camera
 from recon.evaluation.scene import FAMILIES, make_scene, spec_of
-from recon.evaluation.scene_score import score
 
 
 @pytest.mark.parametrize("family", FAMILIES)

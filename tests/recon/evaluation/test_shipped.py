@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from instrument.files.stability_file import read_stability
-from recon.evaluation.catalogue import MAPS
+from recon.evaluation.maps import MAPS
 from recon.verdict.cases import ALIKE, ALIKE_VOLUMES, DERIVED, GROUPS, cases_of, mixed_scenes
 from recon.verdict.evidence import Evidence
 from recon.verdict.judge import FEWEST, STRESSES

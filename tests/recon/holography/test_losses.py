@@ -1,4 +1,4 @@
-"""Losses: gradients against finite differences, images against coefficients, and a new one everywhere."""
+"""Losses: gradients by finite differences, images against coefficients; one of a user, found everywhere."""
 
 from __future__ import annotations
 
@@ -140,14 +140,3 @@ def test_a_registered_loss_is_found_by_the_terminal(registered, capsys, tmp_path
     assert registered in capsys.readouterr().out
     assert main(["hologram", "picture.png", "--loss", registered, "--iterations", "2"]) == 0
     assert read_slm_image("slm.png")[1]["options"]["loss"] == registered
-
-
-def test_a_registered_loss_is_found_by_the_window(registered, qtbot, tmp_path: Path):
-    from gui.panels.holograms import HologramsPanel
-    from gui.session import BenchSession
-    from instrument.bench.config_file import default_text, parse_config
-
-    session = BenchSession(parse_config(default_text(), tmp_path / "bench.toml"))
-    panel = HologramsPanel(session)
-    qtbot.addWidget(panel)
-    assert panel.loss.findText(registered) >= 0

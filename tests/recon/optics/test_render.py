@@ -9,7 +9,7 @@ from recon.optics.diffuser import smooth_diffuser
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off, response_on
 from recon.optics.grid import PixelGrid
 from recon.optics.render import render
-from recon.optics.scene import Beads, Layer, Scene
+from recon.optics.scene import Beads, Layer, Scene, TruthGrid
 from recon.optics.spectrum import mixed_spectrum
 from recon.optics.wave import WavePropagator
 
@@ -78,7 +78,7 @@ def test_truth_stands_upside_down_on_the_sensors_grid() -> None:
     shape = (100, 140)
     place = np.array([[3000.0, -1500.0, Z_UM]])
     scene = Scene("bead", beads=(Beads(place, np.ones((1, 3))),))
-    image = scene.true_image(shape, 26.0, DISTANCE_UM, GREEN_ONLY)
+    image = scene.true_image(TruthGrid(shape, 26.0, DISTANCE_UM), GREEN_ONLY)
     row, column = np.argwhere(image)[0]
     assert (row, column) == (
         50 + round(1500 * DISTANCE_UM / Z_UM / 26.0),
@@ -90,13 +90,13 @@ def test_truth_stands_upside_down_on_the_sensors_grid() -> None:
 def test_truth_keeps_a_pictures_light() -> None:
     rng = np.random.default_rng(0)
     layer = Layer(rng.random((30, 40, 3), dtype=np.float32), Z_UM, (9000.0, 12000.0), (500.0, 300.0))
-    image = Scene("noise", layers=(layer,)).true_image((300, 300), 7.3, DISTANCE_UM, GREEN_ONLY)
+    image = Scene("noise", layers=(layer,)).true_image(TruthGrid((300, 300), 7.3, DISTANCE_UM), GREEN_ONLY)
     assert image.sum() == pytest.approx(layer.radiance[:, :, 1].mean() * 9.0 * 12.0, rel=1e-5)
     # Upside down: a mark in the picture's upper left corner is seen at the lower right.
     radiance = np.zeros((8, 8, 3), np.float32)
     radiance[0, 0] = 1
     image = Scene("mark", layers=(Layer(radiance, Z_UM, (8000.0, 8000.0)),)).true_image(
-        (101, 101), 10.0, DISTANCE_UM, GREEN_ONLY
+        TruthGrid((101, 101), 10.0, DISTANCE_UM), GREEN_ONLY
     )
     row, column = np.argwhere(image).mean(axis=0)
     assert row > 60

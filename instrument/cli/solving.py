@@ -1,0 +1,155 @@
+"""A reconstruction on the terminal: what goes in, progress, what was found, its verdict, Ctrl-C."""
+
+from __future__ import annotations
+
+import typer
+
+from instrument.cli.app import saying_what_is_left
+from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
+from instrument.files.volume_zarr import uneven_steps
+from instrument.reconstruction.job import Job
+from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
+from instrument.reconstruction.options import OutputOptions
+from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from instrument.reconstruction.volume_file import write_volume
+from recon.reconstruction.choice import Choice
+from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.solve import ITERATIONS
+from recon.solvers.stopping import IterationRecord, StopReason
+from recon.verdict.verdict import Verdict
+
+
+def reconstruct_photograph(
+    request: PictureRequest | VolumeRequest, outputs: Outputs, output: OutputOptions
+) -> None:
+    """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
+    if output.explain:
+        tell_choice(request.explain(request.prepare()))
+        return
+    outputs.check(0, overwrite=output.force)
+    is_volume = isinstance(request, VolumeRequest)
+    with saying_what_is_left(*outputs.files()):
+        job = request.prepare()
+        planes = len(job.calibration.psfs) if is_volume else 1
+        outputs.check(planes * job.measurement.size, overwrite=output.force)
+        _tell_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
+        keeper = checkpoint_for(output.checkpoint, job, request)
+        with progress_bar() as bar, first_interrupt_cancels() as cancel:
+            total = request.settings.limit or 1000
+            task = bar.add_task("volume" if is_volume else "picture", total=total, note="")
+
+            def show(record: IterationRecord, _picture: object) -> None:
+                bar.update(
+                    task, completed=round(total * request.share(record)), note=f"change {record.change:.1e}"
+                )
+
+            result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
+        _tell(result)
+        if is_volume:
+            write_volume(outputs, result, job)
+            if steps := uneven_steps(result.grid.z_um):
+                typer.echo(f"{'Planes':<12}{steps} Each plane's depth is in {outputs.record.name}.")
+        else:
+            _write_picture(outputs, result, job, int(output.rotate_deg))
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+        for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
+            typer.echo(f"{name:<12}{text}")
+    _end(result, "volume" if is_volume else "picture")
+
+
+def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: OutputOptions) -> None:
+    """Reconstruct the patterns, then the picture; tell, write; exit code 130 where it was interrupted."""
+    outputs.check(0, overwrite=output.force)
+    with saying_what_is_left(*outputs.files()):
+        with one_task("patterns") as advance:
+            prepared = prepare_patterned(request, advance)
+        job = prepared.job
+        outputs.check(job.measurement.size, overwrite=output.force)
+        _tell_job(job, "calibration or frames come from the simulated bench")
+        with progress_bar() as bar, first_interrupt_cancels() as cancel:
+            task = bar.add_task("picture", total=request.iterations or ITERATIONS, note="")
+
+            def show(record: IterationRecord) -> None:
+                bar.update(task, completed=record.iteration, note=f"change {record.change:.1e}")
+
+            result = solve_patterned(prepared, watch=show, cancel=cancel)
+        _tell_end(result)
+        write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
+        typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
+    _end(result, "picture")
+
+
+def tell_choice(choice: Choice) -> None:
+    """Print what was chosen and why, and what one step up and down would cost."""
+    for line in choice.lines():
+        typer.echo(line)
+    typer.echo(
+        f"{'Chosen in':<12}{choice.seconds:.1f} s; --choose NAME=VALUE overrules any of it, --tolerance and "
+        "--iterations the end. Times and errors of a step are rough estimates"
+    )
+
+
+def tell_verdict(verdict: Verdict | None) -> None:
+    """Print the verdict, one sentence a line; nothing where none was asked for."""
+    for index, sentence in enumerate(verdict.sentences if verdict is not None else ()):
+        typer.echo(f"{'Verdict' if not index else '':<12}{sentence}")
+
+
+def _tell_job(job: Job, simulated: str) -> None:
+    for name, text in job.notes.items():
+        typer.echo(f"{name:<12}{text}")
+    if job.simulated:
+        typer.echo(f"SIMULATED   {simulated}")
+    for warning in job.warnings:
+        typer.echo(f"Warning: {warning}", err=True)
+
+
+def _tell(result: Reconstruction) -> None:
+    weight = "" if result.tau is None else f", tau {result.tau:.3g}"
+    if result.choice is not None:
+        for line in result.choice.brief():
+            typer.echo(line)
+    else:
+        typer.echo(f"{'Model':<12}{result.model}: {result.reason}")
+    typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
+    if memory := result.provenance.get("memory"):
+        typer.echo(f"{'Memory':<12}{memory}")
+    _tell_end(result)
+    tell_verdict(result.verdict)
+    for warning in result.warnings:
+        typer.echo(f"Warning: {warning}", err=True)
+
+
+def _tell_end(result: Reconstruction) -> None:
+    count = _iterations(result)
+    if not count:
+        typer.echo(f"{'Done':<12}in one step, {result.seconds:.1f} s")
+        return
+    each = f"{result.seconds / count * 1e3:.0f} ms each"
+    typer.echo(
+        f"{'Stopped':<12}after {count} iterations, {result.seconds:.1f} s ({each}): {result.stop_reasons[0]}"
+    )
+
+
+def _iterations(result: Reconstruction) -> int:
+    return max(len(history) for history in result.histories)
+
+
+def _write_picture(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) -> None:
+    write_reconstruction(outputs, result, job, rotate_deg=rotate_deg)
+    if outputs.figure is not None:
+        from instrument.reconstruction.result_figure import (
+            write_figure,  # matplotlib, only where it is wanted
+        )
+
+        write_figure(outputs.figure, result, job, rotate_deg=rotate_deg)
+
+
+def _end(result: Reconstruction, what: str) -> None:
+    if StopReason.CANCELLED in result.stop_reasons:
+        typer.echo(
+            f"Interrupted after {_iterations(result)} iterations: this is the {what} so far.", err=True
+        )
+        raise typer.Exit(130)

@@ -1,0 +1,158 @@
+"""Exported frames are the run's frames, read back with others' tools."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from drivers.frame import FrameMetadata
+from instrument.cli import main
+from instrument.files.errors import FileError
+from instrument.plan import Part, Plan
+from instrument.runs.export import export
+from instrument.runs.frame_record import Gap
+from instrument.runs.run import FinishReason, Run, RunError
+from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
+
+METADATA = FrameMetadata(
+    frame_id=0,
+    device_time_ns=None,
+    host_time_ns=0,
+    utc=datetime(2026, 1, 1, tzinfo=UTC),
+    exposure_ms=10.0,
+    gain=1.0,
+    pixel_format="Mono12",
+    significant_bits=12,
+    black_level=0.0,
+    roi=(0, 0, 32, 48),
+    binning=1,
+)
+BENCH = BenchRecord({}, "", {"camera": "mock"}, True, 6.5, {"exposure_ms": 1.0, "gain": 1.0}, {})
+STORED = [0, 1, 2, 4, 5]
+
+
+def image(index: int, colour: bool) -> np.ndarray:
+    shape = (32, 48, 3) if colour else (32, 48)
+    return np.random.default_rng(index).integers(0, 4096, shape).astype(np.uint16)
+
+
+@pytest.fixture(params=[False, True], ids=["grey", "colour"])
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Run:
+    return a_recording(tmp_path, colour=request.param)
+
+
+def a_recording(folder: Path, *, colour: bool) -> Run:
+    """Six frames at 20 frames/s, of which the fourth was lost."""
+    with RunWriter.create(folder, label="video", bench=BENCH) as writer:
+        for i in STORED:
+            stamp = replace(
+                METADATA,
+                frame_id=i,
+                host_time_ns=i * 50_000_000,
+                utc=METADATA.utc + timedelta(seconds=i / 20),
+            )
+            if i == 4:
+                writer.gap(Gap(3, 1, 0))
+            writer.write([FrameToStore(i, image(i, colour), stamp)])
+        return writer.finish(FinishReason.COMPLETED)
+
+
+def frames_of(run: Run) -> np.ndarray:
+    return np.stack([run.frame(i) for i in STORED])
+
+
+def test_the_run_is_as_made(run: Run) -> None:
+    assert np.array_equal(frames_of(run), [image(i, run.array.is_colour) for i in STORED])
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.ome.tif", "a.TIFF"])
+def test_tiff(run: Run, tmp_path: Path, name: str) -> None:
+    assert export(run, tmp_path / name) == STORED
+    assert np.array_equal(tifffile.imread(tmp_path / name), frames_of(run))
+    with tifffile.TiffFile(tmp_path / name) as tiff:
+        assert tiff.is_ome == (".ome" in name)
+        if tiff.is_ome:
+            assert 'PhysicalSizeX="6.5"' in tiff.ome_metadata
+            assert 'TimeIncrement="0.05"' in tiff.ome_metadata
+            assert 'DeltaT="0.2"' in tiff.ome_metadata
+        else:
+            assert json.loads(tiff.shaped_metadata[0]["frames"]) == STORED
+
+
+def test_numpy(run: Run, tmp_path: Path) -> None:
+    export(run, tmp_path / "a.npy", [4, 1])
+    assert np.array_equal(np.load(tmp_path / "a.npy"), [run.frame(4), run.frame(1)])
+
+
+def test_hdf5(run: Run, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    export(run, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert np.array_equal(file["frames"], frames_of(run))
+        assert list(file["frame_number"]) == STORED
+        assert json.loads(file["metadata"][3])["index"] == 4
+        assert file.attrs["simulated"]
+
+
+def test_png(run: Run, tmp_path: Path) -> None:
+    export(run, tmp_path / "pictures")
+    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    assert names == [f"frame-{i}.png" for i in STORED]
+    read = cv2.imread(str(tmp_path / "pictures" / "frame-4.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, run.frame(4))
+
+
+def test_mp4(run: Run, tmp_path: Path) -> None:
+    export(run, tmp_path / "a.mp4")
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(STORED)
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(20, rel=0.02)
+    assert (video.get(cv2.CAP_PROP_FRAME_HEIGHT), video.get(cv2.CAP_PROP_FRAME_WIDTH)) == (32, 48)
+    video.release()
+
+
+def test_averaged_frames_go_to_tiff_but_not_to_png(tmp_path: Path) -> None:
+    plan = Plan(label="x", parts=(Part(label="a", average=2),))
+    with RunWriter.create(tmp_path, label="x", bench=BENCH, plan=plan) as writer:
+        writer.write([FrameToStore(0, image(0, False).astype(np.float32) + 0.5, METADATA, 2)])
+        run = writer.finish(FinishReason.COMPLETED)
+    export(run, tmp_path / "a.tif")
+    assert np.array_equal(tifffile.imread(tmp_path / "a.tif")[0], run.frame(0))
+    with pytest.raises(RunError, match="float32"):
+        export(run, tmp_path / "pictures")
+
+
+def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    run = a_recording(tmp_path, colour=False)
+    with pytest.raises(FileError, match="no known format"):
+        export(run, tmp_path / "a.gif")
+    with pytest.raises(RunError, match="frame 3 is not there"):
+        export(run, tmp_path / "a.tif", [2, 3])
+    (tmp_path / "old.tif").write_text("old")
+    with pytest.raises(FileError, match="exists already"):
+        export(run, tmp_path / "old.tif")
+    with pytest.raises(FileError, match="does not exist"):
+        export(run, tmp_path / "nowhere" / "a.tif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["old.tif", run.path.name])
+
+
+def test_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = a_recording(tmp_path, colour=False)
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(run.path), "a.npy", "--frames", "1:5"]) == 0
+    shown = capsys.readouterr()
+    assert "Wrote 3 frames" in shown.out
+    assert "1 frames that are not in the run" in shown.err
+    assert np.array_equal(np.load("a.npy"), [run.frame(i) for i in (1, 2, 4)])
+    assert main(["export", str(run.path), "b.npy", "--frames", "one"]) == 2
+    assert main(["export", str(run.path), "b.npy", "--label", "psf"]) == 2
+    assert "recording" in capsys.readouterr().err
