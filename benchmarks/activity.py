@@ -31,7 +31,7 @@ from recon.base import fft as project_fft
 from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.streams.baseline import aligned, baseline, change, fading, motion
 from recon.streams.regions import find_regions
-from recon.streams.video import BLOCK, VideoSolver, video_camera
+from recon.streams.video import BLOCK, VideoSolver, stream_problem
 
 SHAPE = (128, 160)
 READ_NOISE = 2.0
@@ -98,7 +98,7 @@ def apart(count: int, rng: np.random.Generator, least_px: float) -> np.ndarray:
 
 def solve(psf: np.ndarray, frames: list[np.ndarray], warm: int) -> np.ndarray:
     """Return the pictures of a video."""
-    solver = VideoSolver(video_camera(frames[0], psf), warm_iterations=warm)
+    solver = VideoSolver(stream_problem(frames[0], psf), warm_iterations=warm)
     pictures = []
     for number, frame in enumerate(frames):
         if number % BLOCK == 0:

@@ -23,7 +23,7 @@ from scipy import ndimage
 from recon.base import fft as project_fft
 from recon.evaluation.lenslets import build_camera
 from recon.streams.joint import OVER_TIME, solve_together
-from recon.streams.video import video_camera
+from recon.streams.video import stream_problem
 
 SPEEDS_PX = (0.0, 0.1, 0.3, 1.0, 3.0)
 PHOTONS = (30.0, 300.0)
@@ -98,7 +98,7 @@ def main() -> None:
     for photons in PHOTONS:
         for speed in SPEEDS_PX:
             psf, raw, truth = block(options.frames, speed, photons)
-            camera = video_camera(raw[0], psf)
+            camera = stream_problem(raw[0], psf)
             alone = error(solve_together(camera, raw, "tv", weight=0.0, iterations=ITERATIONS), truth)
             line = f"{photons:g} photons, {speed:g} px a frame: alone {alone:.4f}"
             for name in OVER_TIME:

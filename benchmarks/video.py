@@ -40,7 +40,7 @@ from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
 from recon.base import fft as project_fft
 from recon.base.metrics import psnr
-from recon.streams.video import COLD_ITERATIONS, VideoSolver, video_camera
+from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
 from tests.mocks.recordings import write_recording
 
 PHOTONS = 1e4
@@ -88,16 +88,16 @@ def independent(camera, frames, truths):
     solver = VideoSolver(camera)
     found = {count: [0.0, 0.0] for count in COLD}
     for frame, truth in zip(frames, truths, strict=True):
-        data = (frame[None] / camera.deviation[:, None, None]).astype(np.float32)
+        problem = camera.with_data(frame)
         began_s = time.process_time()
-        solver._solver.restart(data)
+        solver.running.begin(problem)
         seconds = time.process_time() - began_s
         for count in range(1, COLD[-1] + 1):
             began_s = time.process_time()
-            solver._solver.advance()
+            solver.running.advance()
             seconds += time.process_time() - began_s
             if count in found:
-                found[count][0] += quality(solver._picture(), truth) / len(frames)
+                found[count][0] += quality(solver.picture(), truth) / len(frames)
                 found[count][1] += seconds / len(frames)
     return [(count, *values) for count, values in found.items()]
 
@@ -206,7 +206,7 @@ def main() -> None:
     if options.only != "overhead":
         for name, pan in PANS.items():
             frames, truths = panned(light, scene, height, width, pan, options.frames)
-            camera = video_camera(frames[0], psf)
+            camera = stream_problem(frames[0], psf)
             curve = independent(camera, frames, truths)
             print(f"{name}: independent", [(n, round(db, 2), round(1e3 * s)) for n, db, s in curve])
             rows = []

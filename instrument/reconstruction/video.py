@@ -30,9 +30,12 @@ from instrument.reconstruction.video_output import VideoPictures, create_output
 from instrument.reconstruction.video_source import has_light, require_video
 from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
 from instrument.runs.run import Run
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
-from recon.streams.video import BLOCK, COLD_ITERATIONS, PRIORS, WARM_ITERATIONS, VideoCamera, video_camera
+from recon.streams.running import Running
+from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, stream_problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,21 +146,27 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
     inputs, options = request.inputs, request.options
-    camera = video_camera(
-        picture.measurement,
+    problem = stream_problem(
+        Measurement(
+            picture.measurement,
+            picture.binned_noise(inputs.noise),
+            erasures=None if picture.valid is None else ~picture.valid,
+        ),
         picture.calibration,
         z_um=options.z_um,
-        prior=str(options.prior or "tv"),
+        model=options.model,
+        prior=options.prior,
         tau=options.tau,
-        noise=picture.binned_noise(inputs.noise),
-        erasures=None if picture.valid is None else ~picture.valid,
+        estimate_background=options.estimate_background,
     )
+    if problem.n_planes > 1:
+        raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
     reduction = picture.reduction
     if reduction.crop is not None:  # settled, so that a window is the same for every frame
         rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
         crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
         reduction = replace(reduction, crop=crop)
-    if request.over_time is not None and not camera.flat:
+    if request.over_time is not None and not problem.flat:
         raise BenchError("--over-time takes grey recordings.")
     usual = COLD_ITERATIONS if request.over_time is None else JOINT_ITERATIONS
     plan = VideoPlan(
@@ -170,17 +179,17 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         over_time=request.over_time,
         rotate_deg=request.rotate_deg,
         picture_shape=picture.measurement.shape,
-        settings=_settings(request, picture, camera, reduction),
+        settings=_settings(request, picture, problem, reduction),
     )
     job, resumed = _job(request, plan, force)
     if job is None:
         _create(request, run, plan, picture)
-        job = VideoJob.create(request.out, plan, camera, reduction)
+        job = VideoJob.create(request.out, plan, problem, reduction)
     saturated = sum(record.metadata.saturated_fraction > 0 for record in run.records.values())
     warnings = list(picture.warnings)
     if saturated:
         warnings.append(f"{saturated} of {len(frames)} frames have saturated pixels: expect halos there.")
-    if not has_light(picture.measurement, camera.deviation):
+    if not has_light(picture.measurement, problem.noise):
         warnings.append("The first frame holds nothing but noise: was the scene lit?")
     if missing := run.n_frames - len(frames):
         warnings.append(f"{missing} of {run.n_frames} frames were lost when recording: they stay NaN.")
@@ -259,10 +268,6 @@ def _check(request: VideoRequest) -> None:
             "--time and --tolerance do not apply to --video: pictures must not depend on the machine. "
             "Use --iterations and --warm."
         )
-    if given.prior is not None and str(given.prior) not in PRIORS:
-        raise BenchError(f"--prior {given.prior} is not for videos; choose one of {', '.join(PRIORS)}.")
-    if given.model not in ("auto", "convolution"):
-        raise BenchError(f"--model {given.model} is not for videos: they take one PSF for the whole field.")
 
 
 def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
@@ -289,9 +294,7 @@ def _binned_shape(run: Run, index: int, factor: int) -> tuple[int, int]:
     return height // factor, width // factor
 
 
-def _settings(
-    request: VideoRequest, picture: Job, camera: VideoCamera, reduction: Reduction
-) -> dict[str, Any]:
+def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: Reduction) -> dict[str, Any]:
     """Return what the result depends on, JSON-compatible."""
     provenance = {key: value for key, value in picture.provenance.items() if key != "image"}
     chosen: dict[str, Any] = plain(
@@ -300,9 +303,11 @@ def _settings(
             "psf_file": None if request.psf is None else str(request.psf.resolve()),
             "z_um": request.options.z_um,
             "prior": str(request.options.prior or "tv"),
-            "weight": camera.weight,
-            "noise_deviation": camera.deviation,
-            "optics_sha256": _digest(camera, reduction),
+            "model": problem.model,
+            "background_estimated": problem.smooth,
+            "weight": max(Running(problem).weights),
+            "noise_deviation": problem.noise,
+            "optics_sha256": _digest(problem, reduction),
             "simulated": picture.simulated,
             "software": {"diffuserbench": version("diffuserbench")},
         }
@@ -310,11 +315,11 @@ def _settings(
     return chosen
 
 
-def _digest(camera: VideoCamera, reduction: Reduction) -> str:
+def _digest(problem: Problem, reduction: Reduction) -> str:
     """Return a digest of PSFs, dark level and pixels used: files of the same name may have changed since."""
     digest = hashlib.sha256()
-    for array in (camera.psfs, camera.image_scale, reduction.dark, camera.valid):
-        values = np.zeros(0) if array is None else np.asarray(array)
+    for array in (problem.calibration.psfs, problem.image_scale, reduction.dark, problem.valid):
+        values = np.asarray(array)
         digest.update(f"{values.shape} {values.dtype}".encode())
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

@@ -86,7 +86,7 @@ def solve_block(
 
     def measured() -> Iterator[Floats]:
         nonlocal unlit
-        reduction, deviation = job.reduction, job.camera.deviation
+        reduction, deviation = job.reduction, job.problem.noise
         for index in block:
             frame = reduction.apply(frames.read(index))
             unlit += not has_light(frame, deviation)
@@ -98,7 +98,7 @@ def solve_block(
     else:
         stack = np.stack(list(measured()))
         together = solve_together(
-            job.camera, stack, together_in, iterations=plan.cold_iterations, ended=ended
+            job.problem, stack, together_in, iterations=plan.cold_iterations, ended=ended
         )
         solved = iter([] if together is None else together)
     for index in block:
@@ -124,7 +124,7 @@ def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
         return kept[2], kept[3]
     _kept.value = None  # its memory is needed
     solver = VideoSolver(
-        job.camera,
+        job.problem,
         cold_iterations=job.plan.cold_iterations,
         warm_iterations=job.plan.warm_iterations,
     )

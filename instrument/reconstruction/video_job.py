@@ -3,7 +3,7 @@
 ``.NAME.job/`` stands beside ``NAME.ome.zarr`` until the video is complete::
 
     job.json      the recording, the frames, the blocks, every setting
-    camera.npz    PSFs, dark level, noise, the prior's weight: settled once, so that all workers agree
+    camera.npz    PSFs, dark level, and the first frame, which settles noise and weights for all workers alike
     done/         a file for each block whose pictures are on the disk: how many of its frames had no light
 
 A worker needs the job's folder and a block's number, nothing else: it reads frames and writes pictures.
@@ -13,8 +13,9 @@ the disk already are left as they are.
 
 from __future__ import annotations
 
+import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,14 @@ from instrument.files.errors import FileError
 from instrument.files.record import RecordFormat, plain
 from instrument.reconstruction.job import Reduction
 from instrument.reconstruction.preparation import Crop
+from recon.base.declare import record
+from recon.base.noise import NoiseModel
+from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.streams.joint import OverTimeName
-from recon.streams.video import VideoCamera, blocks_of
+from recon.streams.video import blocks_of, stream_problem
+from recon.types import Calibration, Geometry
 
 _VIDEO_JOB = RecordFormat(
     "diffuserbench video job", "video job", restore="Begin anew with --force.", numbered_before=True
@@ -99,21 +106,15 @@ class VideoJob:
         return output.with_name(f".{output.name.removesuffix('.zarr').removesuffix('.ome')}.job")
 
     @classmethod
-    def create(cls, output: Path, plan: VideoPlan, camera: VideoCamera, reduction: Reduction) -> VideoJob:
+    def create(cls, output: Path, plan: VideoPlan, problem: Problem, reduction: Reduction) -> VideoJob:
         """Write a job beside its output; ``job.json``, which makes it one, comes last."""
         folder = cls.folder_of(output)
         (folder / _DONE).mkdir(parents=True)
         arrays: dict[str, Any] = {
-            "psfs": camera.psfs,
-            "deviation": camera.deviation,
-            "image_scale": camera.image_scale,
-            "weight": np.float64(camera.weight),
-            "prior": np.array(camera.prior),
-            "flat": np.array(camera.flat),
+            **_problem_arrays(problem),
             "dark": np.asarray(reduction.dark, np.float32),
             "binning": np.array([reduction.first_binning, reduction.binning]),
             "crop": _crop_array(reduction.crop),
-            "valid": np.zeros(0, bool) if camera.valid is None else camera.valid,
         }
         with whole_file(folder / _CAMERA) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -154,15 +155,20 @@ class VideoJob:
         with np.load(self.folder / _CAMERA) as file:
             return dict(file)
 
-    @property
-    def camera(self) -> VideoCamera:
-        """What the solver needs."""
+    @cached_property
+    def problem(self) -> Problem:
+        """The first frame's problem: the same for every worker."""
         a = self._arrays
-        valid = a["valid"] if a["valid"].size else None
-        return VideoCamera(
-            a["psfs"], a["deviation"], a["image_scale"], valid,
-            str(a["prior"]), float(a["weight"]), bool(a["flat"]),
-        )  # fmt: skip
+        asked = json.loads(str(a["options"]))
+        noise = a["noise"].tolist()
+        measurement = Measurement(
+            a["frame"],
+            NoiseModel(*noise) if len(noise) == 2 else noise[0] if noise else None,
+            erasures=a["erasures"] if a["erasures"].size else None,
+        )
+        pitch_um, distance_mm = (None if np.isnan(v) else float(v) for v in a["geometry"])
+        calibration = Calibration(a["psfs"], a["positions"], geometry=Geometry(pitch_um, distance_mm))
+        return stream_problem(measurement, calibration, ReconstructionOptions(**asked))
 
     @property
     def reduction(self) -> Reduction:
@@ -172,6 +178,24 @@ class VideoJob:
         dark = a["dark"] if a["dark"].ndim else float(a["dark"])
         crop = Crop(*(int(n) for n in a["crop"])) if a["crop"].size else None
         return Reduction(first, dark, crop, last)
+
+
+def _problem_arrays(problem: Problem) -> dict[str, Any]:
+    """Return all that a problem is made of again."""
+    measurement, geometry = problem.measurement, problem.calibration.geometry
+    noise = measurement.noise
+    known = [] if noise is None else [noise] if isinstance(noise, float | int) else asdict(noise).values()
+    asked = {name: value for name, value in record(problem.options).items() if value is not None}
+    optics = (geometry.pixel_pitch_um, geometry.diffuser_distance_mm)
+    return {
+        "frame": np.asarray(measurement.image),
+        "noise": np.array(list(known), float),
+        "erasures": np.zeros(0, bool) if measurement.erasures is None else np.asarray(measurement.erasures),
+        "psfs": problem.calibration.psfs,
+        "positions": problem.calibration.source_positions_um,
+        "geometry": np.array([np.nan if value is None else value for value in optics]),
+        "options": np.array(json.dumps(asked)),
+    }
 
 
 def _crop_array(crop: Crop | None) -> npt.NDArray[np.int64]:

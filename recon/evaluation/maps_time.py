@@ -12,7 +12,7 @@ import numpy.typing as npt
 from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.evaluation.scene_trial import PIXELS
 from recon.streams.joint import OverTimeName, solve_together
-from recon.streams.video import VideoCamera, video_camera
+from recon.streams.video import stream_problem
 from recon.verdict.failure import Failure, bounded, relative_error
 from recon.verdict.map import Axis, Size, StressMap, Trial
 
@@ -110,8 +110,8 @@ def _alone(key: tuple[int, int, float, float, float, int], iterations: int) -> f
 def _error(video: Video, name: OverTimeName, weight: float, iterations: int) -> float:
     from scipy.ndimage import gaussian_filter
 
-    camera: VideoCamera = video_camera(video.frames[0], video.psf)
-    pictures = solve_together(camera, video.frames, name, weight=weight, iterations=iterations)
+    problem = stream_problem(video.frames[0], video.psf)
+    pictures = solve_together(problem, video.frames, name, weight=weight, iterations=iterations)
     assert pictures is not None  # nothing ends it before
     return relative_error(gaussian_filter(pictures, (0, 1, 1)), video.truth)
 

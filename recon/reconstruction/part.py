@@ -122,6 +122,7 @@ class Part:
 
     def set_data(self, problem: Problem) -> None:
         """Take another photograph's data."""
+        self.problem = problem
         self.data = self._measured = problem.data[self._rows].astype(self.dtype, copy=False)
 
     @property

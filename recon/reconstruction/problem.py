@@ -342,6 +342,13 @@ class Problem:
         )
         return np.ascontiguousarray(volumes[0] if len(volumes) == 1 else np.moveaxis(volumes, 0, -1))
 
+    def whole(self, volumes: list[Floats]) -> Floats:
+        """Return what the parts' volumes are together, channels last as the measurement has them."""
+        volume = volumes[0] if len(volumes) == 1 else np.stack(volumes, axis=-1)
+        if not self.flat and self.n_channels == 1:
+            volume = volume[..., None]
+        return np.ascontiguousarray(volume)
+
     def start(self, before: Reconstruction, channels: slice, grid_shape: tuple[int, int]) -> Array:
         """Place a reconstruction's object on the operator's grid of some channels, scaled.
 

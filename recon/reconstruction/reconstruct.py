@@ -64,7 +64,7 @@ def reconstruct(
         When the input is unusable, or the solver has no way for it; the text says what was found, what was
         expected and what to do.
     """
-    known, options = _given(overrides, options)
+    known, options = given(overrides, options)
     if not isinstance(measurement, Measurement):
         measurement = Measurement(measurement)
     problem = Problem.of(replace(measurement, **known), calibration, options)
@@ -75,10 +75,10 @@ def reconstruct(
     )
 
 
-def _given(
+def given(
     overrides: Mapping[str, Any], options: ReconstructionOptions | None
 ) -> tuple[dict[str, Any], ReconstructionOptions]:
-    """Tell facts about the measurement from options."""
+    """Tell facts about the measurement, by name, from options."""
     known = {name: value for name, value in overrides.items() if name in FACTS}
     asked = {name: value for name, value in overrides.items() if name not in FACTS}
     return known, with_overrides(options or ReconstructionOptions(), asked)

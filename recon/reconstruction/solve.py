@@ -263,9 +263,6 @@ def _state(part: Part, solution: Array) -> Array | None:
 
 def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) -> Reconstruction:
     """Return what all parts gave as one result."""
-    volume = found[0].volume if len(found) == 1 else np.stack([f.volume for f in found], axis=-1)
-    if not problem.flat and problem.n_channels == 1:
-        volume = volume[..., None]
     signs = [f.signs for f in found if f.signs is not None]
     left_out = np.max(signs, axis=0).tolist() if signs else []
     taus = [f.tau for f in found if f.tau is not None]
@@ -273,7 +270,7 @@ def _together(problem: Problem, offered: OfferedSolver, found: list[_Solved]) ->
     empty = () if problem.together else tuple(f.empty for f in found)
     memory = found[-1].memory
     return Reconstruction(
-        volume=np.ascontiguousarray(volume),
+        volume=problem.whole([f.volume for f in found]),
         grid=problem.grid,
         model=problem.model,
         reason=problem.reason,

@@ -18,10 +18,11 @@ from recon.camera.convolution import PadCropConvolution
 from recon.camera.erasures import Erasures
 from recon.errors import InputError
 from recon.priors.base import Prior
-from recon.reconstruction.weights import penalty_of
+from recon.reconstruction.measurement import Floats
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
 from recon.solvers.sensor_admm import SensorAdmm
 from recon.streams.over_time import LowRankPlusSparse, OverTime, TemporalTotalVariation
-from recon.streams.video import Floats, VideoCamera
 
 OverTimeName = Literal["tv", "lowrank"]
 OVER_TIME: tuple[OverTimeName, ...] = ("tv", "lowrank")
@@ -83,7 +84,7 @@ class JointAdmm(SensorAdmm):
 
 
 def solve_together(
-    camera: VideoCamera,
+    problem: Problem,
     frames: Floats,
     over_time: OverTimeName,
     *,
@@ -95,8 +96,8 @@ def solve_together(
 
     Parameters
     ----------
-    camera : VideoCamera
-        Grey.
+    problem : Problem
+        Of :func:`~recon.streams.video.stream_problem`; grey.
     frames : ndarray, float32, (n_frames, height, width)
         Background subtracted.
     over_time : "tv" or "lowrank"
@@ -115,31 +116,37 @@ def solve_together(
     Raises
     ------
     InputError
-        When the frames are colour, or fewer than two.
+        When the frames are colour, or fewer than two; or their camera has more than one PSF or a background:
+        frames are the channels of one problem, which a solver of one channel at a time cannot join.
     """
-    if not camera.flat or frames.ndim != 3:
+    if not problem.flat or frames.ndim != 3:
         raise InputError("Priors over time take grey frames; reconstruct each channel on its own.")
     if len(frames) < 2:
         raise InputError("A prior over time needs two frames at least.")
-    shape = (camera.psfs.shape[1], camera.psfs.shape[2])
-    convolution = PadCropConvolution(camera.psfs, shape, n_channels=len(frames))
-    operator: LinearOperator = convolution
-    data = frames / camera.deviation[:, None, None]
-    if camera.valid is not None:
-        valid = np.repeat(camera.valid, len(frames), axis=0)
-        operator, data = Erasures(valid, data.shape) @ convolution, np.where(valid, data, 0)
-    scale = camera.weight * (1.0 if weight is None else weight)
+    if not problem.together:
+        raise InputError(
+            "A prior over time joins frames as the channels of one problem: it takes one PSF, one depth, no "
+            "background and the cpu. Leave the prior over time out."
+        )
+    shape = problem.sensor_shape
+    part = Part(problem, slice(0, 1))
+    part.weigh(problem.options.tau)
+    psfs = problem.depths.central[0] / problem.energy[:, None, None]
+    operator: LinearOperator = PadCropConvolution(psfs, shape, n_channels=len(frames), dtype=part.dtype)
+    data = frames / problem.noise[:, None, None]
+    if not problem.valid.all():
+        valid = np.repeat(problem.valid, len(frames), axis=0)
+        operator, data = Erasures(valid, data.shape, part.dtype) @ operator, np.where(valid, data, 0)
+    scale = part.weight * (1.0 if weight is None else weight)
     prior_over_time: OverTime = (
         TemporalTotalVariation(scale)
         if over_time == "tv"
         else LowRankPlusSparse(RANK_SHARE * scale * float(np.sqrt(np.prod(shape))), SPARSE_SHARE * scale)
     )
-    solver = JointAdmm(operator, data, penalty_of(camera.prior, camera.weight), prior_over_time)
+    solver = JointAdmm(operator, data, part.prior, prior_over_time)
     for _ in range(iterations):
         if ended():
             return None
         solver.advance()
-    (row, column), (height, width) = convolution.centre, shape
-    top, left = row - height // 2, column - width // 2
-    window = solver.solution[:, top : top + height, left : left + width]
-    return np.ascontiguousarray(window * camera.image_scale, np.float32)
+    rows, columns = problem.window
+    return np.ascontiguousarray(solver.solution[:, rows, columns] * problem.image_scale[0], np.float32)

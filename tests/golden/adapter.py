@@ -162,24 +162,25 @@ def patterned(
 
 def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: int, **options: Any) -> Result:
     """Reconstruct frames one after the other, each from where the one before ended; begin anew half way."""
-    from recon.streams.video import VideoSolver, video_camera
+    from recon.streams.video import VideoSolver, stream_problem
 
-    camera = video_camera(frames[0], psf, **options)
-    solver = VideoSolver(camera, cold_iterations=cold, warm_iterations=warm)
+    solver = VideoSolver(
+        stream_problem(frames[0], psf, **options), cold_iterations=cold, warm_iterations=warm
+    )
     pictures = []
     for n, frame in enumerate(frames):
         if n == len(frames) // 2:
             solver.begin()
         pictures.append(solver.next(frame))
-    return {"image": np.stack(pictures), "weight": camera.weight}
+    return {"image": np.stack(pictures), "weight": solver.running.weights[0]}
 
 
 def joint(frames: npt.NDArray[Any], psf: npt.NDArray[Any], over_time: Any, **options: Any) -> Result:
     """Reconstruct frames together, with a prior over time."""
     from recon.streams.joint import solve_together
-    from recon.streams.video import video_camera
+    from recon.streams.video import stream_problem
 
-    return {"image": solve_together(video_camera(frames[0], psf), frames, over_time, **options)}
+    return {"image": solve_together(stream_problem(frames[0], psf), frames, over_time, **options)}
 
 
 def live(

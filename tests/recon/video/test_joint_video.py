@@ -14,7 +14,7 @@ from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm
 from recon.streams.joint import JointAdmm, OverTimeName, solve_together
 from recon.streams.over_time import LowRankPlusSparse, TemporalTotalVariation
-from recon.streams.video import video_camera
+from recon.streams.video import stream_problem
 
 
 def dual_minimum(course: np.ndarray, threshold: float) -> np.ndarray:
@@ -136,7 +136,7 @@ def test_time_helps_where_frames_are_alike() -> None:
     whole[0, top : top + 24, left : left + 28] = scene
     clean = wide.forward(whole)[0]
     frames = (clean + 0.1 * clean.max() * rng.standard_normal((8, 24, 28))).astype(np.float32)
-    camera = video_camera(frames[0], psf)
+    camera = stream_problem(frames[0], psf)
 
     def error(name: OverTimeName, weight: float) -> float:
         found = solve_together(camera, frames, name, weight=weight)
@@ -152,9 +152,9 @@ def test_time_helps_where_frames_are_alike() -> None:
 
 def test_colour_and_single_frames_are_refused() -> None:
     frames = np.random.default_rng(0).random((3, 20, 20, 3)).astype(np.float32)
-    camera = video_camera(frames[0], frames[0, ..., 0] ** 4)
+    camera = stream_problem(frames[0], frames[0, ..., 0] ** 4)
     with pytest.raises(InputError, match="grey"):
         solve_together(camera, frames, "tv")
-    grey = video_camera(frames[0, ..., 0], frames[0, ..., 0] ** 4)
+    grey = stream_problem(frames[0, ..., 0], frames[0, ..., 0] ** 4)
     with pytest.raises(InputError, match="two frames"):
         solve_together(grey, frames[:1, ..., 0], "tv")
