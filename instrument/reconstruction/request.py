@@ -13,12 +13,11 @@ import numpy.typing as npt
 from instrument.files.errors import BenchError
 from instrument.reconstruction.job import (
     Job,
-    NoiseChoice,
     job_from_calibration,
     job_from_files,
     refocused,
 )
-from instrument.reconstruction.options import InputOptions, SourceOptions
+from instrument.reconstruction.options import InputOptions, NoiseChoice, SourceOptions
 from instrument.reconstruction.volume_job import volume_job
 from recon.base.checks import select_psf
 from recon.base.options import require_options
@@ -107,27 +106,9 @@ class PictureRequest:
                 "to it."
             )
         if self.calibration is not None and self.psf is None:
-            job = job_from_calibration(
-                self.calibration,
-                self.image,
-                dark=inputs.dark,
-                crop=inputs.crop,
-                binning=inputs.binning,
-                erasures=inputs.erasures,
-                mosaic=inputs.mosaic,
-            )
+            job = job_from_calibration(self.calibration, self.image, inputs)
         elif self.psf is not None and self.calibration is None:
-            job = job_from_files(
-                self.psf,
-                self.image,
-                dark=inputs.dark,
-                crop=inputs.crop,
-                binning=inputs.binning,
-                erasures=inputs.erasures,
-                mosaic=inputs.mosaic,
-                allow_saturated=inputs.allow_saturated,
-                allow_mixed_depth=inputs.allow_mixed_depth,
-            )
+            job = job_from_files(self.psf, self.image, inputs)
         else:
             raise BenchError("Give either --psf FILE or --calibration FOLDER (one of them).")
         return job if options.z_um is None else refocused(job, options.z_um)
@@ -197,15 +178,7 @@ class VolumeRequest:
         _require_volume_prior(options.prior or "tv")
         if options.positive_background and options.estimate_background is False:
             raise BenchError("--positive-background and --no-background exclude each other.")
-        return volume_job(
-            self.psfs,
-            self.image,
-            dark=inputs.dark,
-            crop=inputs.crop,
-            binning=inputs.binning,
-            erasures=inputs.erasures,
-            mosaic=inputs.mosaic,
-        )
+        return volume_job(self.psfs, self.image, self.inputs)
 
     def solve(
         self,
