@@ -65,6 +65,8 @@ class OfferedSolver:
         The prior that it takes where none is asked for.
     one_step : bool
         Whether it has no iterations: limits do not apply to it.
+    cost : float
+        Rough time that a picture takes, relative to the first solver's.
     """
 
     name: str
@@ -74,6 +76,7 @@ class OfferedSolver:
     tolerance: float | Callable[[Problem], float] = 2e-3
     prior: str = "tv"
     one_step: bool = False
+    cost: float = 1.5
 
     def accepts(self, problem: Problem) -> str | None:
         """Say why it cannot solve a problem; None where it can."""
@@ -235,12 +238,14 @@ def _offered() -> tuple[OfferedSolver, ...]:
             make=_admm,
             refuses=_admm_refuses,
             tolerance=lambda problem: 2e-3 if problem.is_plain else 1e-3,
+            cost=1.0,
         ),
         OfferedSolver(
             name="admm-sensor",
             help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
             make=_sensor_admm,
             refuses=lambda problem: _plain_only(problem) or _by_name(problem, SPLITTING_PRIORS),
+            cost=2.0,
         ),
         OfferedSolver(
             name="fista",
@@ -256,6 +261,7 @@ def _offered() -> tuple[OfferedSolver, ...]:
             refuses=_wiener_refuses,
             prior="none",
             one_step=True,
+            cost=0.01,
         ),
     )
 
