@@ -417,7 +417,7 @@ class LivePanel(Panel):
             check_photograph_file(target, average)
             with self.session.live.paused():
                 light = light_of(bench)
-                taken = bench.snap(average, on_frame=lambda n: context.report(n))
+                taken = bench.snap(average, on_progress=lambda n, _: context.report(n))
             write_snapshot(bench, target, taken, light)
 
         try:
