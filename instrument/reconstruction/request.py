@@ -29,7 +29,7 @@ from instrument.reconstruction.volume_job import volume_job
 from recon.base.checks import select_psf
 from recon.base.namespace import DEVICES, Device
 from recon.base.options import require_options
-from recon.camera.camera_model import MODELS, ModelName, members_of_depths
+from recon.camera.camera_model import ModelName, members_of_depths, model_names
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -60,10 +60,10 @@ def _require_choice(asked: str, model: ModelName) -> None:
 
 def known_model(name: str) -> ModelName:
     """Return the camera model of that name; BenchError where there is none."""
-    found = next((model for model in MODELS if model == name), None)
+    found = next((model for model in model_names() if model == name), None)
     if found is None:
-        raise BenchError(f"--model {name!r} is not known; choose one of {', '.join(MODELS)}.")
-    return found
+        raise BenchError(f"--model {name!r} is not known; choose one of {', '.join(model_names())}.")
+    return found  # type: ignore[return-value]
 
 
 def _require_volume_prior(name: str) -> None:
@@ -88,7 +88,7 @@ class Settings:
     dark, crop, binning, erasures
         As :func:`instrument.reconstruction.job.job_from_files`.
     model : str
-        One of :data:`recon.camera.camera_model.MODELS`.
+        One of :func:`recon.camera.camera_model.model_names`.
     prior : str or None
         None: the method's default.
     mosaic : str or None
