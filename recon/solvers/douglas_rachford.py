@@ -33,11 +33,10 @@ from recon.camera.planes import PlaneGroups
 from recon.errors import StructureError
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
-from recon.solvers.balance import is_due
 from recon.solvers.empty_planes import EXCESS, REVIEW, EmptyPlanes, PlaneWatch
 from recon.solvers.prior_splits import require_exact
 from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, squares
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
 from recon.solvers.stopping import IterationRecord
 
 _THRESHOLD = 0.1

@@ -28,11 +28,10 @@ from recon.camera.convolution3d import Convolution3D
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.balance import is_due
 from recon.solvers.base import Solver
 from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
 from recon.solvers.sensor_system import SensorSystem, residual_norm
-from recon.solvers.splitting import SensorData, Tuning
+from recon.solvers.splitting import SensorData, Tuning, is_due
 from recon.solvers.stopping import IterationRecord
 
 _PENALTY = 0.5

@@ -32,10 +32,9 @@ from recon.camera.convolution3d import Convolution3D
 from recon.priors.base import Prior
 from recon.priors.simple import Separable
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.balance import is_due
 from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
 from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, squares
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
 from recon.solvers.stopping import IterationRecord
 
 FIRST_PENALTY = 0.5
