@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.offered import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
@@ -340,6 +341,8 @@ def _verdict(
         )
         if not own
     ]
+    if problem.model in CAMERAS:
+        foreign.append(f"the camera model {problem.model}")
     if problem.patterned:
         foreign.append("patterned light")
     if foreign:
