@@ -181,7 +181,9 @@ class PictureRequest:
     z_um : float or None
         Distance of the scene; a PSF is refocused to it.
     method : str
-        One of :func:`recon.reconstruction.solvers.SOLVERS`.
+        One of :data:`recon.reconstruction.solvers.SOLVERS`.
+    estimate_background, positive_background, memory_gib, device
+        As of :class:`VolumeRequest`.
     allow_saturated, allow_mixed_depth : bool
         With ``psf``: as :func:`instrument.reconstruction.job.job_from_files`.
     settings : Settings
@@ -192,6 +194,10 @@ class PictureRequest:
     calibration: Path | None = None
     z_um: float | None = None
     method: str = "admm"
+    estimate_background: bool | None = None
+    positive_background: bool = False
+    memory_gib: float | None = None
+    device: Device = "cpu"
     allow_saturated: bool = False
     allow_mixed_depth: bool = False
     settings: Settings = field(default_factory=Settings)
@@ -199,7 +205,14 @@ class PictureRequest:
     @property
     def options(self) -> ReconstructionOptions:
         """What is asked of the reconstruction."""
-        return self.settings.asked(z_um=self.z_um, solver=self.method)
+        return self.settings.asked(
+            z_um=self.z_um,
+            solver=self.method,
+            estimate_background=self.estimate_background,
+            positive_background=self.positive_background,
+            memory_gib=self.memory_gib,
+            device=self.device,
+        )
 
     def prepare(self) -> Job:
         """Read the files and bring them together; the options are checked first.
@@ -214,6 +227,8 @@ class PictureRequest:
         given = self.settings
         given.require(z_um=self.z_um)
         require_solver(self.method)
+        if self.positive_background and self.estimate_background is False:
+            raise BenchError("--positive-background and --no-background exclude each other.")
         if given.prior is not None:
             require_prior(given.prior)
         if given.wishes is not None:

@@ -151,13 +151,13 @@ class ReconstructionOptions:
         flags=("--background/--no-background",),
         label="Smooth background",
         group=_CHOICE,
-        applies=("volume",),
+        applies=("picture", "volume", "video"),
     )
     positive_background: bool = option(
         False,
         help="A background that is nowhere negative; up to three more runs.",
         group=_RARE,
-        applies=("volume",),
+        applies=("picture", "volume"),
     )
     axis_weights: npt.ArrayLike | None = option(
         None,
@@ -180,7 +180,7 @@ class ReconstructionOptions:
         group=_RARE,
     )
     device: Device = option(
-        "cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE, applies=("volume",)
+        "cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE, applies=("picture", "volume")
     )
     precision: Literal["auto"] | Precision = option(
         "auto",
@@ -199,7 +199,7 @@ class ReconstructionOptions:
         metavar="GIB",
         group=_COMPUTE,
         recorded=False,
-        applies=("volume",),
+        applies=("picture", "volume"),
     )
     scratch: Path | None = option(
         None,

@@ -106,9 +106,6 @@ def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     code, output = run("--volume", folder, "--image", image, "--out", out, *options)
     assert code == 2
     assert f"With --volume these do not apply: {options[0]} (for a picture" in output
-    code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, "--no-background")
-    assert code == 2
-    assert "do not apply: --no-background (for a volume)" in output
     assert not out.exists()
 
 
@@ -121,7 +118,7 @@ def test_noise_is_passed_on_and_reduced_by_binning(files, run):
     assert json.loads(out.with_suffix(".json").read_text())["provenance"]["noise_deviation"] == [4.0]
 
 
-@pytest.mark.parametrize("option", [("--scratch", "."), ("--memory", "4")])
+@pytest.mark.parametrize("option", [("--scratch", ".")])
 def test_memory_is_a_matter_of_volumes(files, run, option):
     folder, image, out = files
     code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, *option)
@@ -185,3 +182,18 @@ def test_a_name_that_ends_in_ome_zarr_writes_that(files, run):
     assert code == 2
     assert "exists already" in output
     assert run(*arguments, "--force")[0] == 0
+
+
+def test_what_volumes_are_asked_for_pictures_are_asked_for_as_well(files, run):
+    """A device, a background, a limit of memory: one path takes them all."""
+    folder, image, out = files
+    common = ("--psf", folder / "psf0.tif", "--image", image, "--out", out, "-n", "2", "--force")
+    assert run(*common, "--background", "--model", "convolution")[0] == 0
+    assert json.loads(out.with_suffix(".json").read_text())["background_estimated"]
+    assert run(*common, "--memory", "4")[0] == 0
+    code, output = run(*common, "--memory", "0.00001")
+    assert code == 2
+    assert "Bin the images" in output
+    code, output = run(*common, "--method", "admm-gpu")
+    assert code == 2
+    assert "--device gpu" in output
