@@ -23,8 +23,10 @@ from lenslet_scene import Camera, expose
 
 from recon.base.threads import set_threads
 from recon.camera.convolution3d import Convolution3D
+from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import StoppingRules
-from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.splitting import Tuning
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 
 
@@ -54,12 +56,13 @@ def main() -> None:
     psfs /= np.sqrt(np.mean(np.sum(psfs.astype(float) ** 2, axis=(1, 2, 3)))).astype(np.float32)
     operator = Convolution3D(psfs, counts.shape)
     weight = a.tau * max(float(p.max()) for p in operator.adjoint_planes(counts[None]))
-    DouglasRachford(operator, counts[None], weight).step()  # compile
+    prior = L1(weight) + NonNegativity()
+    SparseDouglasRachford(operator, counts[None], prior).step()  # compile
     rules = StoppingRules(iterations=a.iterations, tolerance=a.tolerance)
     print("| planes | iterations | processor s | objective | left out | certificate |")
     print("|---|---|---|---|---|---|")
     for name, drop in (("all", False), ("empty ones left out", True)):
-        solver = DouglasRachford(operator, counts[None], weight, drop_empty=drop)
+        solver = SparseDouglasRachford(operator, counts[None], prior, tuning=Tuning(drop_empty=drop))
         began = time.process_time()
         shown: list[str] = []
 
@@ -80,7 +83,7 @@ def main() -> None:
             flush=True,
         )
 
-    tv = LeanTotalVariation(operator, counts[None], weight)
+    tv = LeanTotalVariation(operator, counts[None], TotalVariation.of_volume(weight) + NonNegativity())
     tv.compile()
     volume = tv.run(rules).solution[0]
     light = volume.sum(axis=(1, 2), dtype=float)

@@ -31,7 +31,7 @@ from literal_fused import FusedLiteralAdmm
 
 from recon.base.threads import set_threads
 from recon.camera.convolution3d import Convolution3D
-from recon.priors import HaarTotalVariation, NonNegativity
+from recon.priors import HaarTotalVariation, NonNegativity, TotalVariation
 from recon.solvers import Fista
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 from tests.recon.solvers.literal_volume import LiteralAdmm
@@ -135,7 +135,7 @@ def main() -> None:
     all_curves = {}
     for name in a.scenes:
         s = scene(name, a.sensor, a.depths)
-        lean = LeanTotalVariation(s.operator, s.data, s.weight)
+        lean = LeanTotalVariation(s.operator, s.data, TotalVariation.of_volume(s.weight) + NonNegativity())
         constants = best_constants(s, a.search)
         fused = FusedLiteralAdmm(s.operator, s.data, s.weight, penalties=constants)
         balanced = LiteralAdmm(s.operator, s.data, s.weight, penalties=constants, balance=True)

@@ -35,7 +35,7 @@ from scipy import fft
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from instrument.reconstruction.request import Settings
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
 from recon.base import fft as project_fft
@@ -140,7 +140,11 @@ def overhead(psf, frames) -> dict[str, float]:
             for kind, times in seconds.items():
                 out = folder / f"{kind}{turn}.ome.zarr"
                 request = VideoRequest(
-                    run=run, out=out, psf=folder / "psf.npy", settings=Settings(dark=0.0, binning=1), block=8
+                    run=run,
+                    out=out,
+                    psf=folder / "psf.npy",
+                    inputs=InputOptions(dark=0.0, binning=1),
+                    block=8,
                 )
                 job = prepare_video(request).job
                 blocks = list(range(len(job.blocks)))
@@ -168,7 +172,7 @@ def offline(psf, frames) -> float:
                 run=run,
                 out=out,
                 psf=folder / "psf.npy",
-                settings=Settings(dark=0.0, binning=1),
+                inputs=InputOptions(dark=0.0, binning=1),
                 block=len(frames) // 2,
             )
             job = prepare_video(request).job

@@ -21,8 +21,10 @@ from lenslet_scene import Camera, beads, expose
 
 from recon.base.threads import set_threads
 from recon.camera.convolution3d import Convolution3D
+from recon.priors import L1, NonNegativity
 from recon.solvers import StoppingRules
-from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.splitting import Room
 
 
 def peak_gib() -> float:
@@ -49,7 +51,7 @@ def main() -> None:
     # The prior's weight: three deviations of what noise alone correlates to with a PSF.
     power = float(operator.power().mean()) / a.depths
     weight = 3 * float(np.sqrt(data.mean() + 4)) * float(np.sqrt(power))
-    solver = DouglasRachford(operator, data, weight, keep_state=False)
+    solver = SparseDouglasRachford(operator, data, L1(weight) + NonNegativity(), room=Room(keep_state=False))
     began = time.perf_counter()
 
     def tell(_, record):

@@ -43,14 +43,15 @@ def problem(sensor: int, depths: int):
 
 def solver(method: str, operator, data):
     """Return a solver by its name in METHODS."""
-    from recon.solvers.douglas_rachford import DouglasRachford
+    from recon.priors import L1, NonNegativity, TotalVariation
+    from recon.solvers.douglas_rachford import SparseDouglasRachford
     from recon.solvers.tv_admm_volume import LeanTotalVariation
     from tests.recon.solvers.literal_volume import LiteralAdmm
 
     if method == "lean TV":
-        return LeanTotalVariation(operator, data, 10.0)
+        return LeanTotalVariation(operator, data, TotalVariation.of_volume(10.0) + NonNegativity())
     if method == "l1 (Douglas-Rachford)":
-        return DouglasRachford(operator, data, 10.0)
+        return SparseDouglasRachford(operator, data, L1(10.0) + NonNegativity())
     if method == "literal TV, naive":
         return LiteralAdmm(operator, data, 10.0, penalties=(1.0, 1.0, 1.0))
     from literal_fused import FusedLiteralAdmm

@@ -273,7 +273,7 @@ class ProcedurePanel(Panel):
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
         self.stack.setCurrentIndex(self.choice.currentIndex())
-        self.about.setText(self.form.tip + ".")
+        self.about.setText(f"{self.form.tip.removesuffix('.')}.")
         self._typed()
 
     def _typed(self) -> None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gui.jobs import JobCancelledError, JobContext
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
-from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from instrument.reconstruction.volume_file import write_volume
 from recon.base.declare import Imports, expression
@@ -102,7 +102,9 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         with contextlib.suppress(
             JobCancelledError
         ):  # the solver hears of it by itself, and keeps what it has
-            context.report(SoFar(request.share(record), note, prepared, np.array(image), tuple(history)))
+            context.report(
+                SoFar(done_share(request.options, record), note, prepared, np.array(image), tuple(history))
+            )
         shown_s = time.monotonic()
         cost_s = shown_s - now_s
 

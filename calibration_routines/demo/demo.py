@@ -28,7 +28,7 @@ from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.runs.finish import CtrlC
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon import Reconstruction, reconstruct
 
 FILE = "demo.json"
@@ -265,7 +265,7 @@ def _warm_up() -> None:
     reconstruct(psf + 1.0, psf, iterations=2)
 
 
-def _reporting(advance: Advance) -> Progress:
+def _reporting(advance: Advance) -> RunProgress:
     return lambda status: advance(status.done, status.total)
 
 

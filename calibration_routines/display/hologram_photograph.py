@@ -27,6 +27,8 @@ from recon.holography.lowpass import make_band
 from recon.holography.options import Envelope
 
 Array = npt.NDArray[Any]
+HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"
+"""What options of photographs are about, and their heading."""
 _GAIN = 0.8  # part of what a photograph lacked that is asked for beyond
 _ITERATIONS = 15  # between two photographs
 
@@ -75,15 +77,13 @@ class Refinement:
 class CaptureOptions:
     """How a hologram is photographed."""
 
-    average: int = option(
-        4, least=1, help="Photographs a frame.", applies=("hologram",), group="Photographed, with --capture"
-    )
+    average: int = option(4, least=1, help="Photographs a frame.", applies=(HOLOGRAM,), group=PHOTOGRAPHED)
     refine: int = option(
         0,
         least=0,
         help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
-        applies=("hologram",),
-        group="Photographed, with --capture",
+        applies=(HOLOGRAM,),
+        group=PHOTOGRAPHED,
     )
 
 

@@ -50,7 +50,7 @@ from instrument.plan import Plan
 from instrument.runs.acquire import prepare
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon.base.declare import RARE, option
 
 MOST_STEPS = 300
@@ -207,7 +207,7 @@ def measure_angular_response(
     sweep: AngularSweep,
     folder: Path | str | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     on_exposures: Callable[[SweepExposures], None] | None = None,
     control: RunControl | None = None,
 ) -> tuple[AngularResponse, Path]:

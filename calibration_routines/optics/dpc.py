@@ -31,7 +31,7 @@ from instrument.plan.led_shapes import HalfCircle
 from instrument.runs.acquire import abilities_of, prepare
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
 from recon.base.declare import RARE, option
 
@@ -156,7 +156,7 @@ def measure_diffuser(
     setup: DpcSetup,
     folder: Path | str | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     control: RunControl | None = None,
 ) -> tuple[DiffuserSurface, Path]:
     """Photograph the four halves and compute the surface; saved in the run's folder.

@@ -20,7 +20,7 @@ from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 
@@ -92,7 +92,7 @@ def photograph(
     average: int = 1,
     dark_frames: int = 4,
     binning: int = 1,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     control: RunControl | None = None,
 ) -> Photograph:
     """Photograph the scene into a run; ends with everything dark.

@@ -22,7 +22,7 @@ from instrument.bench.bench import Bench
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints
 from instrument.runs.acquire import acquire
 from instrument.runs.run import Run
-from instrument.runs.runner import Progress
+from instrument.runs.runner import RunProgress
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ def measure_field_response(
     folder: Path | str | None = None,
     *,
     average: int = 2,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
 ) -> FieldResponse:
     """Move the source to the middle of the field's four edges and to its centre, and fit the light received.
 

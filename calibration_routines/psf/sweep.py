@@ -65,7 +65,7 @@ from instrument.plan import Step
 from instrument.runs.acquire import acquire, prepare
 from instrument.runs.run import Run
 from instrument.runs.run_control import EndedEarlyError
-from instrument.runs.runner import Progress, Runner
+from instrument.runs.runner import Runner, RunProgress
 from recon.types import Calibration, Geometry
 
 OnRunner = Callable[[Runner], None]
@@ -118,7 +118,7 @@ def calibrate_sweep(
     folder: Path | str | None = None,
     *,
     exposures: SweepExposures | None = None,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     on_analysis: Analysed | None = None,
     on_event: OnEvent | None = None,
     on_runner: OnRunner | None = None,
@@ -201,7 +201,7 @@ def finish_sweep(
     run: Path | str,
     bench: Bench | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     on_analysis: Analysed | None = None,
     on_runner: OnRunner | None = None,
 ) -> SweepCalibration:
@@ -232,7 +232,7 @@ def _finished(
     run: Run,
     record: SweepRecord,
     bench: Bench | None,
-    on_progress: Progress | None,
+    on_progress: RunProgress | None,
     on_analysis: Analysed | None,
     on_runner: OnRunner | None,
 ) -> SweepCalibration:
@@ -250,7 +250,7 @@ def _judged(
     run: Run,
     record: SweepRecord,
     bench: Bench | None,
-    on_progress: Progress | None,
+    on_progress: RunProgress | None,
     on_analysis: Analysed | None,
     on_runner: OnRunner | None,
 ) -> SweepCalibration:

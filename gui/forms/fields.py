@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QSignalBlocker
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
@@ -47,6 +47,10 @@ class Behaviour:
     require : callable, optional
         Called with a value that the declaration allows; returns why it cannot be all the same, empty where
         it can.
+    help_of : callable, optional
+        Returns what is said of one of the words to choose from; empty for nothing.
+    offers : callable, optional
+        Returns the words on offer now, where a device and not the declaration knows them.
     enabled_when : callable, optional
         Called with what is chosen and ticked in the form, by name; returns why the field does not apply,
         empty where it does. One that does not apply has its default.
@@ -59,6 +63,8 @@ class Behaviour:
     needed_when: Callable[[], str] | None = None
     understand: Callable[[str], Any] | None = None
     require: Callable[[Any], str] | None = None
+    help_of: Callable[[str], str] | None = None
+    offers: Callable[[], Sequence[str]] | None = None
     enabled_when: Callable[[dict[str, Any]], str] | None = None
 
 
@@ -141,6 +147,11 @@ class OptionField:
         """Show a value in the option's own unit; no change is told of."""
         raise NotImplementedError
 
+    @property
+    def is_being_edited(self) -> bool:
+        """Whether somebody is at it: what a device reads back must not take it away."""
+        return False
+
     def raw(self) -> object:
         """Return what stands in the widget; equal as long as nothing was changed."""
         return self.read()
@@ -180,6 +191,15 @@ class NumberField(OptionField):
         if number is None and not problem and self.behaviour.needed_when is not None:
             problem = self.behaviour.needed_when()
         return (None, problem) if number is None or problem else (self._in_own_unit(number), "")
+
+    @property
+    def is_being_edited(self) -> bool:
+        """Whether a number was typed and is not in force."""
+        return self.widget.isModified()
+
+    def set_limits(self, least: float, most: float) -> None:
+        """Keep to limits that a device gives, in the shown unit."""
+        self.widget.set_limits(least, most)
 
     def raw(self) -> object:
         """Return the text without its unit."""
@@ -240,22 +260,31 @@ class ChoiceField(OptionField):
             self.widget.addItem("yes", True)
             self.widget.addItem("no", False)
         self._words_from = self.widget.count()
-        self._add(option.words)
+        self._add(option.words if behaviour.offers is None else behaviour.offers())
+
+    @property
+    def is_being_edited(self) -> bool:
+        """Whether its words are listed."""
+        return self.widget.view().isVisible()
 
     def offer(self, words: Sequence[str]) -> None:
-        """Offer only some of its words; the default, else the first, where another was chosen."""
+        """Offer these of its words; the default, else the first, where another was chosen."""
+        if [self.widget.itemText(i) for i in range(self._words_from, self.widget.count())] == list(words):
+            return
         blocked = QSignalBlocker(self.widget)
         chosen = self.widget.currentText()
         while self.widget.count() > self._words_from:
             self.widget.removeItem(self._words_from)
         self._add(words)
-        left = next((word for word in (chosen, self.option.default) if word in words), words[0])
-        self.widget.setCurrentText(str(left))
+        left = next((word for word in (chosen, self.option.default) if word in words), "")
+        self.widget.setCurrentIndex(max(self.widget.findText(str(left)), 0))
         blocked.unblock()
 
     def _add(self, words: Sequence[str]) -> None:
         for word in words:
             self.widget.addItem(word, read(self._spoken, word))
+            said = "" if self.behaviour.help_of is None else self.behaviour.help_of(word)
+            self.widget.setItemData(self.widget.count() - 1, said or None, Qt.ItemDataRole.ToolTipRole)
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
@@ -325,6 +354,11 @@ class EntryField(OptionField):
         except BenchError as error:
             return None, str(error)
 
+    @property
+    def is_being_edited(self) -> bool:
+        """Whether it was typed in, and is refused or has the keyboard."""
+        return self.widget.isModified() and (self.widget.hasFocus() or bool(self.widget.property("refused")))
+
     def raw(self) -> object:
         """Return the text: whether it names a file is not looked up at every key."""
         return self.widget.text()
@@ -372,6 +406,8 @@ class LinesField(OptionField):
 
 def field_for(option: Option, behaviour: Behaviour) -> OptionField:
     """Return the field that fits an option's type."""
+    if behaviour.offers is not None:
+        return ChoiceField(option, behaviour)
     numbers = {int, float} & set(option.kinds)
     if option.kinds == (bool,) and option.default is not None:
         return SwitchField(option, behaviour)

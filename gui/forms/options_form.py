@@ -161,6 +161,15 @@ class OptionsForm(QWidget):
         for name in known:
             self.settled.emit(name)
 
+    def show_present(self, values: Mapping[str, Any]) -> None:
+        """Show what a device reads back, but for fields that are being edited; nothing is settled by that."""
+        for name, value in values.items():
+            field = self.fields[name]
+            if not field.is_being_edited:
+                field.show(value)
+                self._clear_reason(name)
+        self._edited()
+
     def begin_with(self, values: Mapping[str, Any]) -> None:
         """Show values in the fields that are empty."""
         empty = {

@@ -22,15 +22,16 @@ from gui.forms.fields import Behaviour
 from gui.forms.options_form import FOLDED, OptionsForm, scrolled
 from gui.reconstruction_work import ReconstructionWork, lines_of
 from instrument.files.errors import BenchError
-from instrument.reconstruction.asked import request_of
 from instrument.reconstruction.kept_request import require_kept
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
-from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
 from recon.base.declare import option, options_of
+from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.solvers import SOLVERS
 
-CALIBRATION, PSF, VOLUME = "Picture, from a calibration", "Picture, from a PSF image", "Volume, from PSFs"
+CALIBRATION, PSF, VOLUME = "Picture (calibration)", "Picture (PSF image)", "Volume (PSFs)"
 SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}
 """The option that names the PSFs of each kind."""
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
@@ -88,6 +89,8 @@ class ReconstructForm(QWidget):
                 "volume": Behaviour(browse="folder", must_exist=True, needed=True),
                 "z_um": Behaviour(needed_when=self._which_depth),
                 "scratch": Behaviour(must_exist=True),
+                "solver": Behaviour(help_of=lambda name: SOLVERS[name].help if name in SOLVERS else ""),
+                "prior": Behaviour(help_of=lambda name: PRIORS[name].help if name in PRIORS else ""),
                 "out": Behaviour(
                     browse="save", filters="Results (*.tif *.ome.zarr)", needed=True, require=self._no_result
                 ),
@@ -243,4 +246,6 @@ class ReconstructForm(QWidget):
 
 def _one_shot(present: dict[str, Any]) -> str:
     """Say why nothing tells it when to stop; empty where something does."""
-    return "wiener is one shot: it has no iterations." if present.get("solver") == "wiener" else ""
+    solver = str(present.get("solver"))
+    one_step = solver in SOLVERS and SOLVERS[solver].one_step
+    return f"{solver} is one shot: it has no iterations." if one_step else ""

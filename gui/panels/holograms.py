@@ -135,6 +135,7 @@ class HologramsPanel(Panel):
                 "z_mm": Behaviour(require=self._beyond_reach),
                 "further": Behaviour(require=lambda planes: self._beyond_reach(*(z for _, z in planes))),
                 "expansion": Behaviour(require=_no_square),
+                "loss": Behaviour(help_of=lambda name: LOSSES[name].help),
                 "alignment": Behaviour(filters="Alignments (*.json)", must_exist=True),
                 "correction": Behaviour(filters="SLM calibrations (*.json)", must_exist=True),
                 "out": Behaviour(browse="save", filters="Patterns (*.png)"),
@@ -161,7 +162,7 @@ class HologramsPanel(Panel):
         whole.addWidget(left)
         whole.addWidget(self.views)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([300, 880])
+        whole.setSizes([330, 850])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)

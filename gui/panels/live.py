@@ -20,9 +20,9 @@ from PySide6.QtWidgets import (
 )
 
 from drivers.frame import Frame
+from gui.forms.camera import CameraForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.panels.camera_form import CameraForm
 from gui.session import BenchSession
 from gui.theme import NAMES
 from gui.widgets.image_view import ImageView
@@ -417,7 +417,7 @@ class LivePanel(Panel):
             check_photograph_file(target, average)
             with self.session.live.paused():
                 light = light_of(bench)
-                taken = bench.snap(average, on_frame=lambda n: context.report(n))
+                taken = bench.snap(average, on_progress=lambda n, _: context.report(n))
             write_snapshot(bench, target, taken, light)
 
         try:

@@ -143,7 +143,7 @@ class ReconstructionsPanel(Panel):
         whole.addWidget(self.tabs)
         whole.addWidget(right)
         whole.setStretchFactor(1, 1)
-        whole.setSizes([310, 860])
+        whole.setSizes([330, 840])
         layout = QVBoxLayout(self.body)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(whole)

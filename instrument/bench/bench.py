@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from instrument.bench.camera_settings import apply_table
 from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.bench.config_file import load_config
 from instrument.bench.lights import Ask, Lights, SceneSwitch
-from instrument.bench.photograph import Snapshot, photograph
+from instrument.bench.photograph import Progress, Snapshot, photograph
 from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
 from instrument.bench.source_mount import Position, SourceMount, known_geometry
 from instrument.files.errors import BenchError
@@ -167,10 +167,10 @@ class Bench:
         return known_geometry(self.config.geometry, self.camera, self.shared.values())
 
     # Photographs -------------------------------------------------------------------------------
-    def snap(self, average: int = 1, *, on_frame: Callable[[int], None] | None = None) -> Snapshot:
+    def snap(self, average: int = 1, *, on_progress: Progress | None = None) -> Snapshot:
         """Take one photograph, the mean of ``average`` frames, all exposed after this call.
 
-        ``on_frame`` is called with the number of frames taken so far, after each.
+        ``on_progress`` is called after each frame.
 
         Raises
         ------
@@ -178,14 +178,11 @@ class Bench:
             When the camera fails, or the LED array was lost meanwhile.
         """
 
-        def noticed(taken: int) -> None:
+        def take_note(frame: Frame) -> None:
+            self.newest_frame = frame
             self.require_light()
-            if on_frame is not None:
-                on_frame(taken)
 
-        taken = photograph(
-            self.camera, average, on_frame=noticed, seen=lambda frame: setattr(self, "newest_frame", frame)
-        )
+        taken = photograph(self.camera, average, on_progress=on_progress, on_frame=take_note)
         return replace(taken, metadata=self.with_surroundings(taken.metadata))
 
     def require_light(self) -> None:

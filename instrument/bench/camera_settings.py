@@ -11,6 +11,33 @@ from drivers.camera import Camera, Roi
 from drivers.device import Setting
 from drivers.errors import DeviceError, LimitError
 from instrument.bench.config import CameraTable
+from recon.base.declare import option
+from recon.errors import InputError
+
+
+def _roi(text: str) -> Roi:
+    """Read ``TOP, LEFT, HEIGHT, WIDTH``."""
+    words = text.replace(",", " ").split()
+    if len(words) != 4 or not all(word.isdecimal() for word in words):
+        raise InputError("a region is four whole numbers, top, left, height, width.")
+    return Roi(*map(int, words))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """What is set on a camera by hand; limits and words to choose from are the camera's own."""
+
+    exposure_ms: float = option(help="Exposure time.", unit="ms", label="Exposure")
+    gain: float = option(help="Electronic gain as a factor; 1 is the base gain.", unit="×")
+    black_level: float = option(help="Offset that the camera adds.", unit="counts", least=0)
+    binning: int = option(help="Sensor pixels summed along each axis.")
+    pixel_format: str = option(help="Pixel format by its GenICam name.", label="Format")
+    roi: Roi = option(
+        help="Region of interest in sensor pixels before binning: top, left, height, width.",
+        metavar="TOP, LEFT, HEIGHT, WIDTH",
+        parse=_roi,
+        label="Region",
+    )
 
 
 @dataclass(frozen=True, slots=True)

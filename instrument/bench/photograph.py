@@ -12,6 +12,9 @@ from drivers.camera import Camera
 from drivers.frame import Frame, FrameMetadata
 from instrument.files.errors import BenchError
 
+Progress = Callable[[int, int], object]
+"""Called with how many are done so far, and how many there are in all."""
+
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
@@ -42,12 +45,12 @@ def photograph(
     camera: Camera,
     average: int = 1,
     *,
-    on_frame: Callable[[int], None] | None = None,
-    seen: Callable[[Frame], None] | None = None,
+    on_progress: Progress | None = None,
+    on_frame: Callable[[Frame], object] | None = None,
 ) -> Snapshot:
     """Take the mean of ``average`` frames, all exposed after this call.
 
-    ``on_frame`` is called with the number of frames taken so far, after each; ``seen`` with the frame itself.
+    ``on_progress`` is called after each frame, ``on_frame`` with the frame itself.
 
     Raises
     ------
@@ -65,10 +68,10 @@ def photograph(
         metadata.append(frame.metadata)
         if average > 1:
             total = np.add(total, frame.image)
-        if seen is not None:
-            seen(frame)
         if on_frame is not None:
-            on_frame(taken)
+            on_frame(frame)
+        if on_progress is not None:
+            on_progress(taken, average)
     if average == 1:
         return Snapshot(frame.image, frame.metadata, average)
     mean = np.asarray(total / average, np.float32)

@@ -15,7 +15,6 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions
-from instrument.reconstruction.request import Settings
 from instrument.reconstruction.video_output import VideoPictures
 from instrument.runs.run import STATE
 from recon.base.declare import option
@@ -128,8 +127,8 @@ def _video(
         out=files.out / "video.ome.zarr",
         psf=source.psf,
         calibration=source.calibration,
-        z_um=scene.z_um,
-        settings=Settings(binning=inputs.binning),
+        inputs=inputs,
+        options=scene,
         warm_iterations=WARM_ITERATIONS,
     )
     reconstruct_to_video(request, workers=None, scheduler=None, force=files.force)

@@ -156,7 +156,7 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
 def _photograph(bench: Bench, average: int) -> Snapshot:
     with progress_bar() as bar:
         task = bar.add_task("Frames", total=average, note="")
-        return bench.snap(average, on_frame=lambda taken: bar.update(task, completed=taken))
+        return bench.snap(average, on_progress=lambda taken, _: bar.update(task, completed=taken))
 
 
 def _report(target: Path, taken: Snapshot, light: LightState) -> None:

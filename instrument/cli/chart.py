@@ -283,10 +283,10 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     from instrument.reconstruction.volume_job import volume_job
 
     if psf is not None:
-        return job_from_files(psf, image, dark=inputs.dark, crop=inputs.crop, binning=inputs.binning)
+        return job_from_files(psf, image, inputs)
     assert folder is not None
     prepared = volume_job if volume else job_from_calibration
-    return prepared(folder, image, dark=inputs.dark, crop=inputs.crop, binning=inputs.binning)
+    return prepared(folder, image, inputs)
 
 
 def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:

@@ -11,9 +11,8 @@ import typer
 from instrument.cli.app import App, examples
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError
-from instrument.reconstruction.asked import request_of, settings_of
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions, VideoOptions
-from instrument.reconstruction.request import PictureRequest, Settings, VolumeRequest
+from instrument.reconstruction.request import VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs
 from recon.reconstruction.options import ReconstructionOptions
 
@@ -40,16 +39,6 @@ class _Asked:
     output: OutputOptions
     video: VideoOptions
     given: Given
-
-    @property
-    def settings(self) -> Settings:
-        """What pictures, volumes and videos are all asked for."""
-        return settings_of(self.inputs, self.options)
-
-    @property
-    def request(self) -> PictureRequest | VolumeRequest:
-        """What a photograph is to be made into."""
-        return request_of(self.source, self.inputs, self.options)
 
 
 @app.command(
@@ -79,41 +68,36 @@ def reconstruct(
     video is taken up again by the same command.
     """
     asked = _Asked(source, inputs, options, output, video, given)
+    if options.choose is not None and options.choose.precision is not None and "precision" in given:
+        raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")
     if source.patterned is not None:
         _patterned(asked, run, source.patterned)
     elif source.video:
         _video(asked, run)
     elif run is not None:
         raise BenchError("RUN: for videos; give --video as well, or leave it out.")
-    elif source.image is None:
-        raise BenchError("Give a photograph with --image FILE, or a recording: RUN --video.")
-    elif source.volume is not None:
-        _volume(asked)
     else:
-        _picture(asked)
+        _photograph(asked)
 
 
-def _picture(asked: _Asked) -> None:
+def _photograph(asked: _Asked) -> None:
     from instrument.cli.solving import reconstruct_photograph
 
     given, source, output = asked.given, asked.source, asked.output
-    given.refuse("a picture (give --volume, or --video with a recording)", "picture")
+    request = request_of(source, asked.inputs, asked.options)
+    is_volume = isinstance(request, VolumeRequest)
+    if is_volume:
+        given.refuse("--volume", "volume")
+    else:
+        given.refuse("a picture (give --volume, or --video with a recording)", "picture")
     if source.calibration is not None and (flags := given.flags("allow_saturated", "allow_mixed_depth")):
         raise BenchError(
             f"{' and '.join(flags)}: for a PSF image (--psf); a calibration's PSFs were judged when they "
             "were measured. Leave it out."
         )
     _require_auto(asked)
-    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, output.figure), output)
-
-
-def _volume(asked: _Asked) -> None:
-    from instrument.cli.solving import reconstruct_photograph
-
-    output = asked.output
-    asked.given.refuse("--volume", "volume")
-    _require_auto(asked)
-    reconstruct_photograph(asked.request, Outputs.named(output.out or _PICTURE, volume=True), output)
+    outputs = Outputs.named(output.out or _PICTURE, output.figure, volume=is_volume)
+    reconstruct_photograph(request, outputs, output)
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
@@ -133,15 +117,14 @@ def _video(asked: _Asked, run: Path | None) -> None:
         out=output.out or Path("video.ome.zarr"),
         psf=source.psf,
         calibration=source.calibration,
-        z_um=asked.options.z_um,
-        settings=asked.settings,
+        inputs=asked.inputs,
+        options=asked.options,
         rotate_deg=int(output.rotate_deg),
         fps=video.fps,
         film=video.film,
         block=video.block,
         over_time=video.over_time,
         warm_iterations=video.warm_iterations,
-        estimate_background=asked.options.estimate_background,
     )
     reconstruct_to_video(request, workers=video.workers, scheduler=video.scheduler, force=output.force)
 
@@ -181,5 +164,3 @@ def _require_auto(asked: _Asked) -> None:
         raise BenchError(
             f"--choose overrules what --model auto chooses; it does not go with --model {model}."
         )
-    if wishes is not None and wishes.precision is not None and "precision" in asked.given:
-        raise BenchError("--precision and --choose precision=... say the same twice: leave one of them out.")

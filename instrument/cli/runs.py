@@ -148,7 +148,7 @@ def export(
             target,
             indices,
             frames_per_s=frames_per_s,
-            on_frame=lambda done: bar.update(task, completed=done),
+            on_progress=lambda done, _: bar.update(task, completed=done),
         )
     typer.echo(f"Wrote {len(indices)} frames: {target}")
     if absent := len(wanted) - len(indices):

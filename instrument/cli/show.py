@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibration_routines.display.hologram_photograph import CaptureOptions
+from calibration_routines.display.hologram_photograph import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError, FileError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 app = App()
 
 PICTURES = (".png", ".tif", ".tiff", ".npy", ".bmp")
-_PATTERN, _SHOWN, _PHOTOGRAPHED = ("hologram",), "Shown on the SLM", "Photographed, with --capture"
+_PATTERN, _SHOWN = (HOLOGRAM,), "Shown on the SLM"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +48,9 @@ class _Shown:
         group=_SHOWN,
     )
     capture: Path | None = option(
-        None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=_PHOTOGRAPHED
+        None, help="Photograph it (PNG) and end.", applies=_PATTERN, group=PHOTOGRAPHED
     )
-    target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=_PHOTOGRAPHED)
+    target: Path | None = option(None, help="The picture wanted.", applies=_PATTERN, group=PHOTOGRAPHED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +61,9 @@ class ShowOptions(CaptureOptions, _Shown):
         False,
         help="Ask nobody; the laser stays on, and the background is estimated.",
         applies=_PATTERN,
-        group=_PHOTOGRAPHED,
+        group=PHOTOGRAPHED,
     )
-    force: bool = option(False, help="Overwrite files that exist.", applies=_PATTERN, group=_PHOTOGRAPHED)
+    force: bool = option(False, help="Overwrite files that exist.", applies=_PATTERN, group=PHOTOGRAPHED)
     picture: Path | None = option(
         None,
         help="Where its picture goes (PNG).",

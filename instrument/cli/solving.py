@@ -11,7 +11,7 @@ from instrument.reconstruction.job import Job
 from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
-from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, iteration_limit
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from instrument.reconstruction.volume_file import write_volume
 from recon.reconstruction.choice import Choice
@@ -37,12 +37,14 @@ def reconstruct_photograph(
         _tell_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
         with progress_bar() as bar, first_interrupt_cancels() as cancel:
-            total = request.settings.limit or 1000
+            total = iteration_limit(request.options) or 1000
             task = bar.add_task("volume" if is_volume else "picture", total=total, note="")
 
             def show(record: IterationRecord, _picture: object) -> None:
                 bar.update(
-                    task, completed=round(total * request.share(record)), note=f"change {record.change:.1e}"
+                    task,
+                    completed=round(total * done_share(request.options, record)),
+                    note=f"change {record.change:.1e}",
                 )
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)

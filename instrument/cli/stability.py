@@ -62,7 +62,7 @@ def stability(
     """
     from recon.evaluation.maps import MAPS, cells_of, map_named, run_map
 
-    chosen = [map_named(name) for name in names] if names else list(MAPS.values())
+    chosen = [map_named(name) for name in names or MAPS]
     if options.list_maps:
         for stress in chosen:
             typer.echo(f"{stress.name:<20}{stress.title}\n{'':<20}{stress.x.label} x {stress.y.label}")

@@ -198,8 +198,11 @@ def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
         record = json.loads(path.read_text())
         same = record["about"]["fingerprint"] == key
         points = [_point(p) for p in record["points"]]
-        failed = dict(record["failed"])
-        cut_off = set(record["missing"])
+        failed, cut_off = dict(record["failed"]), set(record["missing"])
+        if record.get("kind", "reconstruction") == "reconstruction":
+            points = [replace(p, setting=_renamed(p.setting), family=_renamed(p.family)) for p in points]
+            failed = {_renamed(name): why for name, why in failed.items()}
+            cut_off = {_renamed(name) for name in cut_off}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FileError(path, f"is no chart of this program ({error}).", "Name another folder.") from error
     if not same:
@@ -209,6 +212,14 @@ def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
             "Name another folder with --out.",
         )
     return points, failed, cut_off
+
+
+def _renamed(setting: str) -> str:
+    """Return what a setting is called now: volumes and a GPU had methods of their own."""
+    method, _, rest = setting.partition(" ")
+    if method == "admm-gpu":
+        return f"admm {rest} gpu"
+    return f"admm {rest}" if method == "volume" else setting
 
 
 def _point(record: dict[str, Any]) -> Point:

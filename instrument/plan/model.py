@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -359,6 +360,24 @@ class Plan(PlanData):
         """Return the plan that :meth:`to_json` wrote."""
         return cls.model_validate_json(text)
 
+    @classmethod
+    def with_unknown(cls, data: Any, name: Path | str = "plan") -> tuple[Plan, tuple[str, ...]]:
+        """Return the plan that plain data describe, and the keys that a newer program may have added.
+
+        Raises
+        ------
+        PlanError
+            Naming every mistake but unknown keys.
+        """
+        try:
+            return cls.model_validate(data), ()
+        except ValidationError as error:
+            extra = [e["loc"] for e in error.errors(include_url=False) if e["type"] == "extra_forbidden"]
+        data = json.loads(json.dumps(data))
+        for location in extra:
+            _leave_out(data, location)
+        return cls.checked(data, name), tuple(".".join(map(str, location)) for location in extra)
+
     @property
     def digest(self) -> str:
         """SHA-256 of the plan's JSON: equal for equal plans."""
@@ -377,3 +396,12 @@ class Plan(PlanData):
             return cls.model_validate(data)
         except ValidationError as error:
             raise PlanError(name, plan_problems(error)) from None
+
+
+def _leave_out(data: Any, location: Sequence[int | str]) -> None:
+    """Take a key out of nested data; the names of a union's members, which are no keys, are passed over."""
+    *way, last = location
+    for step in way:
+        if isinstance(step, int) or step in data:
+            data = data[step]
+    data.pop(last, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +13,8 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
-from instrument.reconstruction.erasures import Choice, Erased, erasures_of, reduce_valid
+from instrument.reconstruction.erasures import Erased, erasures_of, reduce_valid
 from instrument.reconstruction.mosaic import (
-    MosaicChoice,
     in_colour,
     matched_mosaic,
     mosaic_psf,
@@ -23,6 +22,7 @@ from instrument.reconstruction.mosaic import (
     pattern_of,
     reduce_mosaic,
 )
+from instrument.reconstruction.options import DarkChoice, InputOptions, NoiseChoice
 from instrument.reconstruction.preparation import (
     Crop,
     Dark,
@@ -79,13 +79,6 @@ class Reduction:
         return reduce(bin_image(pixels, self.first_binning), self.dark, self.crop, self.binning)
 
 
-DarkChoice = Literal["auto"] | float | Path
-NoiseChoice = NoiseModel | float | Literal["estimate"] | None
-"""A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
-Binning = int | None
-"""Pixels to average along each axis; None chooses automatically."""
-
-
 @dataclass(frozen=True, slots=True)
 class Job:
     """What :func:`recon.reconstruct` is called with, and how it came about.
@@ -136,19 +129,12 @@ class Job:
 def job_from_files(
     psf_path: Path,
     image_path: Path,
-    *,
-    dark: DarkChoice = "auto",
-    crop: Crop | None = None,
-    binning: Binning = None,
-    erasures: Choice = "saturated",
-    mosaic: MosaicChoice = "auto",
-    allow_saturated: bool = False,
-    allow_mixed_depth: bool = False,
+    inputs: InputOptions,
 ) -> Job:
     """Prepare a PSF and an image from anywhere.
 
-    ``mosaic`` names the colour mosaic of which a grey image is the raw frame; its PSF, when grey as well,
-    is taken to be one too.
+    Where a grey image is the raw frame of a colour mosaic, its PSF, when grey as well, is taken to be one
+    too.
 
     Raises
     ------
@@ -156,16 +142,17 @@ def job_from_files(
         When a file cannot be used, the two do not belong together, or the window or binning does not fit.
     """
     psf, image = read_image(psf_path), read_image(image_path)
+    crop, binning = inputs.crop, inputs.binning
     _refuse_constant(image)
-    warnings = check_psf(psf, allow_saturated=allow_saturated)
-    pattern = pattern_of(mosaic, image)
-    check_pair(psf, image, allow_mixed_depth=allow_mixed_depth, mosaic=pattern is not None)
-    level = _dark(dark, psf, image)
+    warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
+    pattern = pattern_of(inputs.mosaic, image)
+    check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
+    level = _dark(inputs.dark, psf, image)
     window = _window(crop, image)
     factor = auto_binning(window) if binning is None else binning
     if pattern is not None and binning is None and factor > 1:
         factor += factor % 2
-    erased = erasures_of(erasures, image)
+    erased = erasures_of(inputs.erasures, image)
     valid = _reduced_valid(erased, crop, factor)
     if pattern is None:
         measurement = reduce(image.pixels, level.image, crop, factor)
@@ -213,53 +200,35 @@ def job_from_files(
 def job_from_calibration(
     folder: Path,
     image_path: Path,
-    *,
-    dark: DarkChoice = "auto",
-    crop: Crop | None = None,
-    binning: Binning = None,
-    erasures: Choice = "saturated",
-    mosaic: MosaicChoice = "auto",
+    inputs: InputOptions,
 ) -> Job:
     """Prepare an image for a calibration folder, or a run folder with one calibration inside.
 
-    An image with a whole multiple of the calibration's pixels is binned to them first; ``crop`` and
-    ``binning`` then act on the pixels of both. Errors as ``job_from_files``.
+    An image with a whole multiple of the calibration's pixels is binned to them first; window and
+    binning then act on the pixels of both. Errors as ``job_from_files``.
     """
     folder = find_calibration(folder)
-    return job_with(
-        load_calibration(folder),
-        folder,
-        image_path,
-        dark=dark,
-        crop=crop,
-        binning=binning,
-        erasures=erasures,
-        mosaic=mosaic,
-    )
+    return job_with(load_calibration(folder), folder, image_path, inputs)
 
 
 def job_with(
     calibration: Calibration,
     folder: Path,
     image_path: Path,
-    *,
-    dark: DarkChoice = "auto",
-    crop: Crop | None = None,
-    binning: Binning = None,
-    erasures: Choice = "saturated",
-    mosaic: MosaicChoice = "auto",
+    inputs: InputOptions,
 ) -> Job:
     """Prepare an image for a calibration that came from ``folder``; as :func:`job_from_calibration`."""
     image = read_image(image_path)
+    crop = inputs.crop
     _refuse_constant(image)
     shape = calibration.psfs.shape[-2:]
     match = _matching_binning(image, shape, folder)
-    pattern = pattern_of(mosaic, image)
+    pattern = pattern_of(inputs.mosaic, image)
     if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
-    pixels, level = _calibrated_dark(dark, image, calibration, match)
-    factor = 1 if binning is None else binning
-    erased = erasures_of(erasures, image)
+    pixels, level = _calibrated_dark(inputs.dark, image, calibration, match)
+    factor = inputs.binning or 1
+    erased = erasures_of(inputs.erasures, image)
     matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
     valid = _reduced_valid(matched, crop, factor)
     if pattern is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,12 +10,10 @@ from instrument.files.checkpoint import CheckpointFolder, digest
 from instrument.files.errors import BenchError
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
+from recon.base.declare import identity
 from recon.solvers.stopping import StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
-_SEEN_IN_JOB = ("image", "psf", "psfs", "calibration", "dark", "crop", "binning", "erasures", "mosaic")
-_WHEN_TO_STOP = ("iterations", "time_s", "tolerance", "stop_at_noise")
-_WITHOUT_BEARING = ("allow_saturated", "allow_mixed_depth", "memory_gib", "scratch", "settings")
 
 
 def require_kept(request: PictureRequest | VolumeRequest) -> None:
@@ -26,7 +23,7 @@ def require_kept(request: PictureRequest | VolumeRequest) -> None:
     ------
     BenchError
     """
-    if isinstance(request, PictureRequest) and request.method == "wiener":
+    if request.options.solver == "wiener":
         raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
 
 
@@ -47,18 +44,15 @@ def checkpoint_for(
     if folder is None:
         return None
     require_kept(request)
-    given = asdict(request)
-    given |= given["settings"]
-    apart = {*_SEEN_IN_JOB, *_WHEN_TO_STOP, *_WITHOUT_BEARING}
     problem = {
         "program": f"diffuserbench {version('diffuserbench')}",
         "measurement": digest(job.measurement),
         "psfs": digest(job.calibration.psfs),
         "psf positions": digest(job.calibration.source_positions_um),
         "valid pixels": digest(job.valid),
-        **{name: value for name, value in given.items() if name not in apart},
+        **identity(request.options),
         # As it will be used: the photograph's metadata may have told it.
-        "noise": str(job.binned_noise(request.settings.noise)),
+        "noise": str(job.binned_noise(request.inputs.noise)),
     }
     return CheckpointFolder(folder, problem)
 

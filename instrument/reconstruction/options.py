@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from instrument.reconstruction.erasures import Choice as ErasuresChoice
-from instrument.reconstruction.job import DarkChoice, NoiseChoice
 from instrument.reconstruction.mosaic import MosaicChoice, mosaic_named
 from instrument.reconstruction.preparation import Crop
 from recon.base.declare import RARE, option
@@ -17,6 +16,10 @@ from recon.camera.bayer import PATTERNS
 from recon.errors import InputError
 from recon.streams.joint import OverTimeName
 from recon.streams.video import WARM_ITERATIONS
+
+DarkChoice = Literal["auto"] | float | Path
+NoiseChoice = NoiseModel | float | Literal["estimate"] | None
+"""A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
 
 _FILES, _PHOTOGRAPH, _VIDEO, _OUTPUT = "Input", "The photograph", "Videos", "Output"
 _KEPT = ("picture", "volume")

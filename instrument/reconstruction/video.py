@@ -20,8 +20,9 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
 from instrument.files.volume_zarr import is_zarr_name
 from instrument.reconstruction.job import Job, Reduction
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
-from instrument.reconstruction.request import PictureRequest, Settings
+from instrument.reconstruction.request import PictureRequest
 from instrument.reconstruction.video_block import BlockReport, CancelledError
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
@@ -30,6 +31,7 @@ from instrument.reconstruction.video_source import has_light, require_video
 from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
 from recon.streams.running import Running
@@ -48,10 +50,9 @@ class VideoRequest:
         ``NAME.ome.zarr``; ``NAME.mp4`` and ``NAME.json`` go beside it.
     psf, calibration : Path or None
         One of the two.
-    z_um : float or None
-    estimate_background : bool or None
-        Estimate a smooth background of every frame; None: no.
-    settings : Settings
+    inputs : InputOptions
+        As for a picture.
+    options : ReconstructionOptions
         As for a picture; ``iterations`` are those of a block's first frame. Stopping by time or tolerance
         would make pictures depend on the machine: they do not apply.
     warm_iterations : int
@@ -72,9 +73,8 @@ class VideoRequest:
     out: Path
     psf: Path | None = None
     calibration: Path | None = None
-    z_um: float | None = None
-    estimate_background: bool | None = None
-    settings: Settings = field(default_factory=Settings)
+    inputs: InputOptions = field(default_factory=InputOptions)
+    options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     warm_iterations: int = WARM_ITERATIONS
     block: int | None = None
     over_time: OverTimeName | None = None
@@ -140,25 +140,24 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         When something cannot be used, or the output holds another video.
     """
     _check(request)
-    request.settings.require(z_um=request.z_um)
     run = Run.open(request.run)
     require_video(run)
     frames = tuple(sorted(run.records))
     picture = _first_picture(request, run, frames[0])
     assert picture.reduction is not None
-    settings = request.settings
+    inputs, options = request.inputs, request.options
     problem = stream_problem(
         Measurement(
             picture.measurement,
-            picture.binned_noise(settings.noise),
+            picture.binned_noise(inputs.noise),
             erasures=None if picture.valid is None else ~picture.valid,
         ),
         picture.calibration,
-        z_um=request.z_um,
-        model=settings.model,
-        prior=settings.prior,
-        tau=settings.tau,
-        estimate_background=request.estimate_background,
+        z_um=options.z_um,
+        model=options.model,
+        prior=options.prior,
+        tau=options.tau,
+        estimate_background=options.estimate_background,
     )
     if problem.n_planes > 1:
         raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
@@ -175,7 +174,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         frames=frames,
         n_frames=run.n_frames,
         block=request.block or (BLOCK if request.over_time is None else JOINT_BLOCK),
-        cold_iterations=settings.iterations or usual,
+        cold_iterations=options.iterations or usual,
         warm_iterations=request.warm_iterations,
         over_time=request.over_time,
         rotate_deg=request.rotate_deg,
@@ -263,7 +262,7 @@ def _check(request: VideoRequest) -> None:
         raise FileError(request.out, "a video is written as OME-Zarr: the name must end in .ome.zarr.")
     if not request.out.parent.is_dir():
         raise FileError(request.out, f"its folder {request.out.parent} does not exist.", "Make it first.")
-    given = request.settings
+    given = request.options
     if given.time_s is not None or given.tolerance is not None:
         raise BenchError(
             "--time and --tolerance do not apply to --video: pictures must not depend on the machine. "
@@ -274,7 +273,9 @@ def _check(request: VideoRequest) -> None:
 def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
     """Prepare the first frame as a photograph would be."""
     # What is saturated differs from frame to frame; pixels can only be left out of all.
-    erasures = "none" if request.settings.erasures == "saturated" else request.settings.erasures
+    inputs = request.inputs
+    if inputs.erasures == "saturated":
+        inputs = replace(inputs, erasures="none")
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / f"{run.path.name} frame {index}.npy"
         np.save(image, run.frame(index))
@@ -282,8 +283,8 @@ def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:
             image=image,
             psf=request.psf,
             calibration=request.calibration,
-            z_um=request.z_um,
-            settings=replace(request.settings, erasures=erasures, iterations=None),
+            inputs=inputs,
+            options=replace(request.options, iterations=None),
         ).prepare()
     return replace(job, simulated=job.simulated or run.is_simulated)
 
@@ -300,8 +301,8 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
         {
             **provenance,
             "psf_file": None if request.psf is None else str(request.psf.resolve()),
-            "z_um": request.z_um,
-            "prior": request.settings.prior or "tv",
+            "z_um": request.options.z_um,
+            "prior": str(request.options.prior or "tv"),
             "model": problem.model,
             "background_estimated": problem.smooth,
             "weight": max(Running(problem).weights),
@@ -385,7 +386,8 @@ def _create(request: VideoRequest, run: Run, plan: VideoPlan, picture: Job) -> N
     geometry = picture.calibration.geometry
     height, width = plan.picture_shape[:2]
     z = picture.calibration.source_positions_um[:, 2]
-    z_um = request.z_um if request.z_um is not None else (float(z[0]) if np.isfinite(z[0]) else None)
+    asked_um = request.options.z_um
+    z_um = asked_um if asked_um is not None else (float(z[0]) if np.isfinite(z[0]) else None)
     pitch = None
     if geometry.pixel_pitch_um and geometry.diffuser_distance_mm and z_um:
         pitch = geometry.pixel_pitch_um * z_um / (1000 * geometry.diffuser_distance_mm)

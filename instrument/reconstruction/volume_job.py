@@ -8,10 +8,9 @@ import numpy as np
 
 from instrument.files.calibration_file import is_calibration
 from instrument.files.images import read_stack
-from instrument.reconstruction.erasures import Choice
-from instrument.reconstruction.job import DarkChoice, Job, job_from_calibration, job_with
-from instrument.reconstruction.mosaic import MosaicChoice
-from instrument.reconstruction.preparation import Crop, darkest_block
+from instrument.reconstruction.job import Job, job_from_calibration, job_with
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run import STATE
 from recon.types import Calibration
 
@@ -19,12 +18,7 @@ from recon.types import Calibration
 def volume_job(
     psfs: Path,
     image: Path,
-    *,
-    dark: DarkChoice = "auto",
-    crop: Crop | None = None,
-    binning: int | None = None,
-    erasures: Choice = "saturated",
-    mosaic: MosaicChoice = "auto",
+    inputs: InputOptions,
 ) -> Job:
     """Prepare a photograph and PSFs at several depths.
 
@@ -34,7 +28,7 @@ def volume_job(
         A calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one image
         file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs lose
         their darkest level; float ones are taken to be free of any offset.
-    image, dark, crop, binning, erasures, mosaic
+    image, inputs
         As :func:`instrument.reconstruction.job.job_from_calibration`.
 
     Raises
@@ -42,9 +36,7 @@ def volume_job(
     FileError, BenchError
     """
     if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
-        return job_from_calibration(
-            psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures, mosaic=mosaic
-        )
+        return job_from_calibration(psfs, image, inputs)
     stack = read_stack(psfs, leave_out=image).pixels
     pixels = stack.astype(np.float32)
     if stack.dtype.kind == "u":
@@ -53,6 +45,4 @@ def volume_job(
     calibration = Calibration(
         np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs)}
     )
-    return job_with(
-        calibration, psfs, image, dark=dark, crop=crop, binning=binning, erasures=erasures, mosaic=mosaic
-    )
+    return job_with(calibration, psfs, image, inputs)

@@ -13,7 +13,7 @@ from instrument.files.errors import FileError
 from instrument.plan import BenchAbilities, Plan, check
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import Progress, Runner
+from instrument.runs.runner import Runner, RunProgress
 from instrument.runs.writer import BenchRecord, RunWriter
 
 
@@ -22,7 +22,7 @@ def acquire(
     plan: Plan,
     folder: Path | str | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     calibrations: Sequence[str] = (),
     control: RunControl | None = None,
 ) -> Run:
@@ -59,7 +59,7 @@ def prepare(
     plan: Plan,
     folder: Path | str | None = None,
     *,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
     calibrations: Sequence[str] = (),
     control: RunControl | None = None,
 ) -> Runner:

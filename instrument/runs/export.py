@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, whole_file
 from instrument.files.errors import BenchError, FileError
 from instrument.runs.run import Run, RunError
@@ -26,7 +27,7 @@ def export(
     frames: Sequence[int] | None = None,
     *,
     frames_per_s: float | None = None,
-    on_frame: Callable[[int], None] | None = None,
+    on_progress: Progress | None = None,
 ) -> list[int]:
     """Write frames of a run to a file, or to a folder of PNG files; the format follows from the name.
 
@@ -44,8 +45,8 @@ def export(
         Which ones, all of them stored; None means every stored frame.
     frames_per_s : float, optional
         Of an MP4; None means the recording's own rate, 10 for a run of a plan.
-    on_frame : callable, optional
-        Called with the number of frames written so far.
+    on_progress : callable, optional
+        Called after each frame.
 
     Raises
     ------
@@ -64,8 +65,8 @@ def export(
     def images() -> Iterator[Image]:
         for done, index in enumerate(indices, start=1):
             yield run.frame(index)
-            if on_frame is not None:
-                on_frame(done)
+            if on_progress is not None:
+                on_progress(done, len(indices))
 
     name = target.name.lower()
     if target.is_dir() or not target.suffix:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from instrument.bench.bench import Bench
 from instrument.bench.camera_settings import restore_camera
+from instrument.bench.photograph import Progress
 from instrument.plan import check
 from instrument.runs.acquire import abilities_of
 from instrument.runs.run import DamagedFrame, Run, RunCondition, RunError
-from instrument.runs.runner import Progress, Runner
+from instrument.runs.runner import Runner, RunProgress
 from instrument.runs.writer import RunWriter
 
 
@@ -54,7 +55,7 @@ class RunFindings:
         return "\n  ".join(lines)
 
 
-def inspect(run: Run, on_progress: Callable[[int, int], None] | None = None) -> RunFindings:
+def inspect(run: Run, on_progress: Progress | None = None) -> RunFindings:
     """Read every frame that a run's log calls written, and say what is left to do.
 
     Parameters
@@ -96,7 +97,7 @@ def prepare_resume(
     path: Path | str,
     *,
     on_verify: Callable[[int, int], None] | None = None,
-    on_progress: Progress | None = None,
+    on_progress: RunProgress | None = None,
 ) -> tuple[Runner, RunFindings]:
     """Verify a run and return the runner of the steps that are left, with what was found.
 

@@ -177,7 +177,10 @@ class Run:
         path = self.path / PLAN
         if not path.exists():
             return None
-        return Plan.from_json(path.read_text()).with_slm_images(lambda image: self.path / image)
+        with RUN_STATE.damaged(path):
+            plan, unknown = Plan.with_unknown(self._json(PLAN), path)
+        RUN_STATE.tell_unknown(path, unknown)
+        return plan.with_slm_images(lambda image: self.path / image)
 
     @cached_property
     def provenance(self) -> dict[str, Any]:

@@ -84,7 +84,7 @@ class RunStatus:
     newest: Snapshot | None = field(default=None, compare=False, repr=False)
 
 
-Progress = Callable[[RunStatus], None]
+RunProgress = Callable[[RunStatus], None]
 FrameWatch = Callable[[Step, Snapshot], bool]
 """Sees each step's photograph once it is stored; returns whether it touched the bench."""
 
@@ -130,7 +130,7 @@ class Runner:
         *,
         todo: Sequence[int] | None = None,
         start: Step | None = None,
-        on_progress: Progress | None = None,
+        on_progress: RunProgress | None = None,
         on_frame: FrameWatch | None = None,
     ) -> None:
         self._bench = bench

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
+from instrument.bench.photograph import Progress
 from instrument.runs.run import DamagedFrame, FinishReason, Run
 
 
@@ -32,7 +32,7 @@ class Verification:
         return not self.damaged and not self.problems
 
 
-def verify(run: Run, on_progress: Callable[[int, int], None] | None = None) -> Verification:
+def verify(run: Run, on_progress: Progress | None = None) -> Verification:
     """Read every frame of a run and hold it, its metadata and the image array against the log.
 
     Parameters

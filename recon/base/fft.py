@@ -3,7 +3,8 @@
 Transforms keep the precision of their input (float32 to complex64, float64 to complex128) and use the number
 of threads set in :mod:`recon.base.threads`. Backend: rocket-fft, ducc0's BSD-licensed FFT inside numba, which
 unlike ``scipy.fft`` writes into arrays that the caller owns (twice as fast on large arrays, where fresh
-memory costs as much as the transform).
+memory costs as much as the transform). :func:`rfft` and :func:`irfft` take a GPU's arrays too, and leave
+those to their own library.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.namespace import namespace_of
 from recon.base.threads import get_threads, in_blocks, set_threads
 
 __all__ = [
@@ -84,6 +86,8 @@ def rfft(x: RealArray, *, axes: int = 2, out: ComplexArray | None = None) -> Com
     ndarray
         Half spectrum, not scaled (as ``scipy.fft.rfftn``).
     """
+    if (xp := namespace_of(x)) is not np:
+        return _onto(xp.fft.rfftn(x, axes=tuple(range(-axes, 0))), out)
     x = np.ascontiguousarray(x)
     if out is None:
         out = np.empty(spectrum_shape(x.shape), complex_dtype(x.dtype))
@@ -106,6 +110,9 @@ def irfft(X: ComplexArray, last: int, *, axes: int = 2, out: RealArray | None = 
     out : ndarray, optional
         C-contiguous real array of equal precision to write into.
     """
+    if (xp := namespace_of(X)) is not np:
+        size = (*X.shape[X.ndim - axes : -1], last)
+        return _onto(xp.fft.irfftn(X, s=size, axes=tuple(range(-axes, 0))), out)
     if not X.flags.c_contiguous:
         raise ValueError("The spectrum must be C-contiguous: it is transformed in place.")
     shape = (*X.shape[:-1], last)
@@ -172,6 +179,14 @@ def idct(X: RealArray, out: RealArray) -> RealArray:
 def _cosine(x: RealArray, out: RealArray, kind: int) -> RealArray:
     _check(out, x.shape, x.dtype)
     _kernels().cosine(x, out, np.array([0, 1]), kind, 0.5 / float(np.sqrt(x.size)), get_threads())
+    return out
+
+
+def _onto(result: RealArray, out: RealArray | None) -> RealArray:
+    """Return a device's array, in ``out`` where there is one."""
+    if out is None:
+        return result
+    out[...] = result
     return out
 
 

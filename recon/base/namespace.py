@@ -49,6 +49,13 @@ def array_namespace(device: Device) -> Namespace:
     return cupy
 
 
+def namespace_of(array: Any) -> Namespace:
+    """Return the module that an array is of."""
+    return (
+        np if isinstance(array, np.ndarray) else importlib.import_module(type(array).__module__.split(".")[0])
+    )
+
+
 def to_host(array: Any) -> npt.NDArray[Any]:
     """Return an array as one of NumPy; its own memory only where it comes from a GPU."""
     return np.asarray(array.get() if hasattr(array, "get") else array)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib.metadata import EntryPoint, entry_points
-from typing import Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from recon.errors import InputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 class Named(Protocol):
@@ -75,6 +76,8 @@ class Registry(Mapping[str, T], Generic[T]):
         InputError
             When nothing has, with the names that there are.
         """
+        import difflib
+
         known = self._all()
         if name in known:
             return known[name]
@@ -105,6 +108,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def _known_own(self) -> dict[str, T]:
         if self._own is None:
+            from importlib.metadata import entry_points  # a tenth of a second: not for an import of recon
+
             self._own = {registered.name: registered for registered in self._make_own()}
             for point in entry_points(group=self.group):
                 self._load(point)

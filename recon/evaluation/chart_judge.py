@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
 from recon.camera.background import BackgroundRemoval
-from recon.evaluation.chart_settings import Setting, binnings_of
 from recon.evaluation.scored import Point
+from recon.evaluation.trial import Setting, binnings_of
 from recon.reconstruction.measurement import Measurement, channel_noise
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
@@ -152,6 +152,12 @@ class Judge:
             source_positions_um=positions[nearest : nearest + 1],
         )
 
+    @property
+    def used(self) -> Calibration:
+        """What the setting reconstructs with: of a picture with one PSF that PSF alone."""
+        plain = self.setting.is_plain and not self.problem.volume
+        return self.central if plain else self.calibration
+
     def point(self, found: Array, iterations: int, seconds: float) -> Point:
         """Score a picture or volume of the full field."""
         planes = found[None] if found.ndim == 2 else found
@@ -199,7 +205,7 @@ class Judge:
         if self._camera is None:
             problem = Problem.of(
                 Measurement(self.measurement, self.noise, erasures=self.erasures),
-                self.central if self.setting.method != "volume" else self.calibration,
+                self.used,
                 ReconstructionOptions(
                     model=self.setting.model,
                     estimate_background=self.setting.background,

@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from recon.base.noise import NoiseModel
 from recon.evaluation.chart_judge import Judge
-from recon.evaluation.chart_settings import ON_DEVICE, Setting, left_out, require_applicable, settings_for
 from recon.evaluation.scene import Family, make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.evaluation.trial import Setting, left_out, require_applicable, settings_for
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.types import Calibration
@@ -127,43 +128,16 @@ def run_setting(
         with aside():
             points.append(judge.point(now(), record.iteration, record.seconds))
 
-    common: dict[str, Any] = {
-        "erasures": judge.erasures,
-        "noise": judge.noise,
-        "field": "full",
-        "iterations": counts[-1],
-        "time_s": limit_s,
-        "judged": False,
-    }
-    if setting.method == "volume":
-        volume = reconstruct(
-            judge.measurement,
-            judge.calibration,
-            prior=setting.prior,
-            model=setting.model,
-            estimate_background=setting.background,
-            tolerance=1e-7,
-            on_progress=note,
-            precision=setting.precision,
-            **common,
-        )
-        return Curve(tuple(points), StopReason.TIME not in volume.stop_reasons)
-    one_shot = setting.method == "wiener"
-    if one_shot:
-        common |= {"iterations": None, "time_s": None}
-    result = reconstruct(
-        judge.measurement,
-        judge.central,
-        solver="auto" if setting.method == ON_DEVICE else setting.method,
-        device="gpu" if setting.method == ON_DEVICE else "cpu",
-        model="convolution",
-        prior=setting.prior,
-        tolerance=None if one_shot else 1e-7,
-        on_progress=None if one_shot else note,
-        precision=setting.precision,
-        **common,
+    options = setting.options(
+        iterations=counts[-1], time_s=limit_s, tolerance=1e-7, field="full", judged=False
     )
-    if one_shot:
+    found = reconstruct(
+        Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
+        judge.used,
+        options,
+        on_progress=None if setting.one_step else note,
+    )
+    if setting.one_step:
         with aside():
-            points = [judge.point(result.image, 0, result.seconds)]
-    return Curve(tuple(points), result.stop_reason is not StopReason.TIME)
+            points = [judge.point(found.volume, 0, found.seconds)]
+    return Curve(tuple(points), StopReason.TIME not in found.stop_reasons)

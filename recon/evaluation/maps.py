@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from recon.errors import InputError
 from recon.evaluation import (
@@ -14,6 +15,7 @@ from recon.evaluation import (
     maps_solver,
     maps_time,
 )
+from recon.evaluation.trial import VOLUME, own_methods
 from recon.verdict.map import Cell, Size, StressMap, cell_of
 
 
@@ -72,8 +74,20 @@ MAPS: dict[str, StressMap] = {
 }
 
 
+_OF_SCENES = {stress.name for module in (maps_light, maps_scene, maps_calibration) for stress in module.MAPS}
+"""Maps whose methods are a solver and a prior, which any scene can be reconstructed by."""
+
+
 def map_named(name: str) -> StressMap:
     """Return a map by its name."""
     if name not in MAPS:
         raise InputError(f"There is no map {name!r}. Maps: {', '.join(MAPS)}.")
-    return MAPS[name]
+    return with_own_methods(MAPS[name])
+
+
+def with_own_methods(stress: StressMap) -> StressMap:
+    """Return a map with the solvers and priors that others' packages, or this program, have registered."""
+    first = stress.methods[0]
+    if stress.name not in _OF_SCENES or "," in first:
+        return stress
+    return replace(stress, methods=(*stress.methods, *own_methods(volume=first.startswith(VOLUME))))

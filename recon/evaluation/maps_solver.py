@@ -15,7 +15,7 @@ from recon.camera.convolution3d import Convolution3D
 from recon.evaluation.maps_light import PICTURE
 from recon.evaluation.scene import SceneSpec, TestScene
 from recon.evaluation.scene_trial import judge_image, scene_of, spec_at
-from recon.priors import NonNegativity, TotalVariation
+from recon.priors import L1, NonNegativity, TotalVariation
 from recon.priors.base import Prior
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part
@@ -26,7 +26,8 @@ from recon.solvers.base import Outcome
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.fista import Fista
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.solvers.tv_admm_volume import LeanTotalVariation
+from recon.solvers.splitting import Tuning
+from recon.solvers.tv_admm_volume import volume_solver
 from recon.verdict.failure import PRECISION, Failure, bounded, convergence_severity
 from recon.verdict.map import Axis, Size, StressMap, Trial
 
@@ -133,13 +134,12 @@ def _volume_penalties(method: str, x: float, y: float, seed: int, size: Size) ->
     noise = float(np.sqrt(np.mean(np.maximum(scene.measurement, 0)) + scene.spec.read_noise_e**2))
     data = (scene.measurement / noise).astype(np.float32)[None]
     camera = Convolution3D(psfs / np.float32(energy), data.shape[1:])
-    solver: LeanTotalVariation | DouglasRachford
+    prior: Prior = L1(1.5 * y) + NonNegativity()
     if method == "volume tv":
-        default = LeanTotalVariation(camera, data, y).penalty
-        solver = LeanTotalVariation(camera, data, y, penalty=x * default)
-    else:
-        default = DouglasRachford(camera, data, 1.5 * y).gamma
-        solver = DouglasRachford(camera, data, 1.5 * y, step=x * default)
+        prior = TotalVariation.of_volume(y) + NonNegativity()
+    default = volume_solver(camera, data, prior)
+    first = default.gamma if isinstance(default, DouglasRachford) else default.penalty
+    solver = volume_solver(camera, data, prior, tuning=Tuning(first=x * first))
     outcome = solver.run(StoppingRules(iterations=STEPS, tolerance=1e-3))
     height, width = data.shape[1:]
     top, left = camera.centre[0] - height // 2, camera.centre[1] - width // 2

@@ -18,9 +18,10 @@ from recon.errors import InputError
 from recon.evaluation.chart_calibration import ITERATIONS
 from recon.evaluation.chart_judge import Judge
 from recon.evaluation.chart_reconstruction import SCORES, ChartProblem, run_setting
-from recon.evaluation.chart_settings import Setting
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.evaluation.trial import Setting
+from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
 from recon.solvers.stopping import StopReason
 
@@ -135,19 +136,13 @@ class OwnCalibrationsProblem:
         points: list[Point] = []
         spent = 0.0
         for prior, group in _SCENES.items():
-            judge = Judge(problem, Setting("volume", setting.model, prior, background=True), 0)
+            way = Setting("admm", setting.model, prior, background=True)
+            judge = Judge(problem, way, 0)
+            left_s = None if limit_s is None else max(limit_s - spent, 1e-3)
             found = reconstruct(
-                judge.measurement,
+                Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
                 judge.calibration,
-                prior=prior,
-                model=setting.model,
-                estimate_background=True,
-                erasures=judge.erasures,
-                noise=judge.noise,
-                field="full",
-                iterations=ITERATIONS,
-                time_s=None if limit_s is None else max(limit_s - spent, 1e-3),
-                judged=False,
+                way.options(iterations=ITERATIONS, time_s=left_s, field="full", judged=False),
             )
             if StopReason.TIME in found.stop_reasons:
                 return Curve(tuple(points), finished=False)
@@ -164,7 +159,7 @@ class OwnCalibrationsProblem:
         scene = make_scene("beads", size=16, grid=3, depths=2)
         small = ChartProblem(scene.measurement, scene.calibration, volume=True)
         for prior in _SCENES:
-            run_setting(small, Setting("volume", setting.model, prior, background=True), counts=(1,))
+            run_setting(small, Setting("admm", setting.model, prior, background=True), counts=(1,))
 
     def fingerprint(self) -> str:
         """Digest photographs, calibrations and the names that results are kept by."""

@@ -15,7 +15,9 @@ from recon.camera.camera_model import ModelName
 from recon.errors import InputError
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.evaluation.stability_spots import REACH_PX, spot_severity
+from recon.evaluation.trial import VOLUME, Setting
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solvers import SOLVERS
@@ -39,18 +41,6 @@ LEVEL = 0.7
 LEAST_RESOLVED_PX = 2.0
 """No grid of pixels tells neighbours apart that are nearer: there must be a darker pixel between them."""
 ITERATIONS = {"quick": 150, "full": 200}
-METHODS: Mapping[str, Mapping[str, str]] = {
-    "admm tv": {"solver": "admm", "prior": "tv"},
-    "admm l1": {"solver": "admm", "prior": "l1"},
-    "admm-sensor tv": {"solver": "admm-sensor", "prior": "tv"},
-    "fista tv": {"solver": "fista", "prior": "tv"},
-    "fista l1": {"solver": "fista", "prior": "l1"},
-    "wiener": {"solver": "wiener", "prior": "none"},
-    "volume tv": {"prior": "tv"},
-    "volume l1": {"prior": "l1"},
-    "volume nonnegative": {"prior": "nonnegative"},
-}
-"""Methods by the name they have on the maps, with what :func:`recon.reconstruct` is told."""
 
 
 @dataclass(frozen=True)
@@ -99,16 +89,16 @@ def solve(scene: TestScene, method: str, options: Options, iterations: int | Non
         clipped = scene.measurement >= float(scene.measurement.max())
         erasures = clipped if erasures is None else erasures | clipped
     background = scene.background if options.subtract_background and scene.background.any() else None
-    given: dict[str, Any] = dict(METHODS[method])
-    # The local model of a picture has a solver of its own: ADMM.
-    able = method.startswith(("volume", "admm ")) and len(scene.calibration.psfs) > len(scene.z_um)
-    model: ModelName = options.model or ("local" if able else "convolution")
-    if method.startswith("volume"):
-        given["estimate_background"] = options.estimate_background
-    if not SOLVERS.named(given.get("solver", "admm")).one_step:
-        given["iterations"] = iterations
+    varies = len(scene.calibration.psfs) > len(scene.z_um)
+    setting = Setting.named(method, options.model or ("local" if varies else "convolution"))
     measurement = Measurement(scene.measurement, background=background, erasures=erasures)
-    return reconstruct(measurement, scene.calibration, model=model, **given)
+    asked = setting.options(iterations=iterations)
+    if options.model is None and varies:
+        problem = Problem.of(measurement, scene.calibration, asked)
+        if setting.refusal(problem) is not None:  # it is for one PSF
+            asked = replace(asked, model="convolution")
+    background_too = options.estimate_background if method.startswith(VOLUME) else None
+    return reconstruct(measurement, scene.calibration, replace(asked, estimate_background=background_too))
 
 
 def judge(scene: TestScene, result: Reconstruction) -> Trial:

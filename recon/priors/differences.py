@@ -17,8 +17,9 @@ class Differences(LinearOperator):
     ----------
     shape : tuple of int
         Shape of the object, channels first.
-    weights : tuple of float
+    weights : array, (n_axes,) or (n_z, n_axes)
         One for each of the trailing axes, e.g. ``(1, 1)`` for a picture; a volume's depth axis wants its own.
+        Of a volume also for each depth.
     wrap : tuple of bool, optional
         Whether the last pixel of an axis neighbours the first; default True for all. Wrapped differences are
         diagonal in Fourier space. Without wrapping the last difference is zero.
@@ -28,17 +29,19 @@ class Differences(LinearOperator):
     def __init__(
         self,
         shape: tuple[int, ...],
-        weights: tuple[float, ...],
+        weights: npt.ArrayLike,
         wrap: tuple[bool, ...] | None = None,
         dtype: npt.DTypeLike = np.float32,
     ) -> None:
-        super().__init__(shape, (len(weights), *shape), dtype)
-        if not 1 <= len(weights) <= len(shape):
-            raise ValueError(f"{len(weights)} weights do not fit an object of shape {shape}.")
-        self.weights = tuple(float(w) for w in weights)
-        self.wrap = (True,) * len(weights) if wrap is None else wrap
-        if len(self.wrap) != len(weights):
-            raise ValueError(f"wrap has {len(self.wrap)} entries for {len(weights)} weights.")
+        self.weights = np.asarray(weights, np.float64)
+        n_axes = self.weights.shape[-1]
+        super().__init__(shape, (n_axes, *shape), dtype)
+        by_depth = self.weights.ndim == 2 and len(shape) >= 3 and len(self.weights) == shape[-3]
+        if not 1 <= n_axes <= len(shape) or not (self.weights.ndim == 1 or by_depth):
+            raise ValueError(f"Weights {self.weights.shape} do not fit an object of shape {shape}.")
+        self.wrap = (True,) * n_axes if wrap is None else wrap
+        if len(self.wrap) != n_axes:
+            raise ValueError(f"wrap has {len(self.wrap)} entries for {n_axes} weights.")
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return the differences, one object-sized array for each axis."""
@@ -47,7 +50,7 @@ class Differences(LinearOperator):
             first, last, inner, shifted = _parts(axis)
             np.subtract(x[shifted], x[inner], out=d[inner])
             d[last] = x[first] - x[last] if wrap else 0
-            d *= d.dtype.type(weight)
+            d *= weight
         return out
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
@@ -56,7 +59,7 @@ class Differences(LinearOperator):
         out[...] = 0
         for d, axis, weight, wrap in self._axes(y):
             first, last, inner, shifted = _parts(axis)
-            flow = d * d.dtype.type(weight)
+            flow = d * weight
             if not wrap:
                 flow[last] = 0
             out -= flow
@@ -67,11 +70,14 @@ class Differences(LinearOperator):
     @property
     def norm_bound(self) -> float:
         """``2 sqrt(sum weights^2)``: a difference at most doubles."""
-        return 2 * float(np.sqrt(sum(w * w for w in self.weights)))
+        return 2 * float(np.sqrt((self.weights**2).reshape(-1, len(self.wrap)).max(axis=0).sum()))
 
-    def _axes(self, stack: Array) -> list[tuple[Array, int, float, bool]]:
-        n = len(self.weights)
-        return [(stack[i], i - n, self.weights[i], self.wrap[i]) for i in range(n)]
+    def _axes(self, stack: Array) -> list[tuple[Array, int, Array, bool]]:
+        n = len(self.wrap)
+        # By depth: a number for each plane, whatever axes follow.
+        weights = self.weights.T.astype(self.dtype).reshape(n, -1, 1, 1)
+        each = weights if self.weights.ndim == 2 else weights[:, 0, 0, 0]
+        return [(stack[i], i - n, each[i], self.wrap[i]) for i in range(n)]
 
 
 def _parts(axis: int) -> tuple[Any, Any, Any, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from recon.camera.base import Array
 from recon.priors.base import Prior
@@ -18,9 +19,9 @@ class TotalVariation(Prior):
     weight : float
     isotropic : bool
         Sum the Euclidean norm of each pixel's differences; else their absolute values.
-    axis_weights : tuple of float
+    axis_weights : array, (n_axes,) or (n_z, n_axes)
         Weights of the differences along the trailing axes: ``(1, 1)`` for a picture, ``(wz, 1, 1)`` for a
-        volume.
+        volume, at each depth where they differ.
     wrap : tuple of bool, optional
         See :class:`~recon.priors.differences.Differences`.
     separable : Separable, optional
@@ -36,7 +37,7 @@ class TotalVariation(Prior):
         weight: float,
         *,
         isotropic: bool = False,
-        axis_weights: tuple[float, ...] = (1.0, 1.0),
+        axis_weights: npt.ArrayLike = (1.0, 1.0),
         wrap: tuple[bool, ...] | None = None,
         separable: Separable | None = None,
         tolerance: float = 1e-6,
@@ -46,11 +47,18 @@ class TotalVariation(Prior):
             raise ValueError(f"A prior's weight must not be negative; got {weight}.")
         self.weight = float(weight)
         self.isotropic = isotropic
-        self.axis_weights = axis_weights
+        self.axis_weights = np.asarray(axis_weights, np.float64)
         self.wrap = wrap
         self.separable = separable or Zero()
         self.tolerance = tolerance
         self.max_inner = max_inner
+
+    @classmethod
+    def of_volume(
+        cls, weight: float, axis_weights: npt.ArrayLike = (1.0, 1.0, 1.0), *, isotropic: bool = False
+    ) -> TotalVariation:
+        """Return that of (..., n_z, height, width): periodic in the plane, as the FFT is, not in depth."""
+        return cls(weight, isotropic=isotropic, axis_weights=axis_weights, wrap=(False, True, True))
 
     def terms(self) -> tuple[Prior, ...]:
         """Return the total variation on its own and the separable part."""

@@ -87,7 +87,7 @@ class ReconstructionOptions:
         flags=("--solver", "--method", "-m"),
         group=_MAIN,
         replaced=_replaced,
-        applies=("picture",),
+        applies=("picture", "volume"),
     )
     iterations: int | None = option(
         None,
@@ -207,7 +207,7 @@ class ReconstructionOptions:
         metavar="FOLDER",
         group=_COMPUTE,
         recorded=False,
-        applies=("volume",),
+        applies=("picture", "volume"),
     )
     judged: bool = option(
         True,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from recon.camera.low_rank import low_rank
 from recon.camera.patterned import PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.errors import InputError
-from recon.priors import Prior
+from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem, window_of
 from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
 from recon.solvers import memory
@@ -257,6 +258,26 @@ class Part:
     def prior(self) -> Prior:
         """The prior with its weight."""
         return penalty_of(self.problem.prior, self.weight)
+
+    def prior_on(self, axis_weights: Array, wrap: tuple[bool, ...]) -> Prior:
+        """Return the prior of an object (1, n_z, height, width): a named total variation is of all its axes.
+
+        Parameters
+        ----------
+        axis_weights : ndarray, (3,) or (n_z, 3)
+            Weights of the z, y and x differences.
+        wrap : tuple of bool
+            Which of the three axes wrap around.
+        """
+        terms = list(self.prior.terms())
+        if not isinstance(self.problem.prior, Prior):
+            for i, term in enumerate(terms):
+                if isinstance(term, TotalVariation) and term.axis_weights.shape == (2,):
+                    isotropic = term.isotropic
+                    terms[i] = TotalVariation(
+                        term.weight, isotropic=isotropic, axis_weights=axis_weights, wrap=wrap
+                    )
+        return reduce(add, terms)
 
     def weigh(self, tau: float | None) -> None:
         """Set the prior's weight: relative to ``max |A^H b|``, or from the noise."""

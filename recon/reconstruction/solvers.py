@@ -15,15 +15,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from recon.base.registry import Registry
-from recon.camera.base import Array
+from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
-from recon.priors import Prior
+from recon.priors import PRIORS, Prior
 from recon.solvers.base import Callback, Keeper, Outcome
 from recon.solvers.stopping import StoppingRules
 
 if TYPE_CHECKING:
-    from recon.camera.convolution3d import Convolution3D
-    from recon.camera.spatially_varying import SpatiallyVarying
     from recon.reconstruction.part import Part
     from recon.reconstruction.problem import Problem
 
@@ -67,6 +65,8 @@ class OfferedSolver:
         The prior that it takes where none is asked for.
     one_step : bool
         Whether it has no iterations: limits do not apply to it.
+    cost : float
+        Rough time that a picture takes, relative to the first solver's.
     """
 
     name: str
@@ -76,6 +76,7 @@ class OfferedSolver:
     tolerance: float | Callable[[Problem], float] = 2e-3
     prior: str = "tv"
     one_step: bool = False
+    cost: float = 1.5
 
     def accepts(self, problem: Problem) -> str | None:
         """Say why it cannot solve a problem; None where it can."""
@@ -108,12 +109,15 @@ def _plain_only(problem: Problem) -> str | None:
 
 
 def _by_name(problem: Problem, priors: Iterable[str], where: str = "") -> str | None:
+    """Refuse a prior by name that is not among the project's own here, and any whose prox is inexact."""
     prior = problem.prior
-    if isinstance(prior, Prior):
-        return None if problem.together else f"{where} priors are given by name: {', '.join(priors)}".strip()
-    if prior in priors:
-        return None
-    return f"{where} it takes the priors {', '.join(priors)}, not {prior!r}".strip()
+    if not isinstance(prior, Prior):
+        if PRIORS.is_own(prior):
+            refused = f"{where} it takes the priors {', '.join(priors)}, not {prior!r}".strip()
+            return None if prior in priors else refused
+        prior = PRIORS[prior](1.0)
+    inexact = [type(term).__name__ for term in prior.terms() if not term.exact]
+    return f"the prox of {inexact[0]} is inexact: a splitting would settle elsewhere" if inexact else None
 
 
 def _admm_refuses(problem: Problem) -> str | None:
@@ -133,6 +137,8 @@ def _admm(part: Part, start: Array | None) -> Runs:
     from recon.camera.convolution3d import Convolution3D
     from recon.camera.spatially_varying import SpatiallyVarying
     from recon.solvers.admm import Admm
+    from recon.solvers.splitting import Room, SensorData, Tuning
+    from recon.solvers.tv_admm_volume import volume_solver
 
     problem, camera = part.problem, part.camera
     if problem.together:
@@ -140,92 +146,25 @@ def _admm(part: Part, start: Array | None) -> Runs:
     if isinstance(camera, SpatiallyVarying):
         return _varying_admm(part, camera, start)
     assert isinstance(camera, Convolution3D)
-    return _on_device(part, camera, start) if problem.options.device != "cpu" else _exact(part, camera, start)
+    data = SensorData(part.data, part.valid[0], part.removal)
+    prior = part.prior_on(problem.axis_weights, (False, True, True))
+    tuning = Tuning(drop_empty=problem.options.drop_empty)
+    room = Room(part.namespace, part.storage, keep_state=False)
+    return volume_solver(camera, data, prior, initial=start, tuning=tuning, room=room)
 
 
 def _of_picture(start: Array | None) -> Array | None:
     return None if start is None else start[:, 0]
 
 
-def _is_tv(part: Part) -> bool:
-    return part.problem.prior_name.startswith("tv")
-
-
-def _exact(part: Part, camera: Convolution3D, start: Array | None) -> Runs:
-    """Return the solver of a convolution a depth whose data term is exact."""
-    from recon.solvers.douglas_rachford import DouglasRachford
-    from recon.solvers.tv_admm_volume import LeanTotalVariation
-
-    if not _is_tv(part):
-        return DouglasRachford(
-            camera,
-            part.data,
-            part.weight,
-            valid=part.valid[0],
-            background=part.removal,
-            initial=start,
-            drop_empty=part.problem.options.drop_empty,
-            keep_state=False,
-            storage=part.storage,
-        )
-    return LeanTotalVariation(
-        camera,
-        part.data,
-        part.weight,
-        axis_weights=part.problem.axis_weights,
-        isotropic=part.problem.prior_name == "tv-isotropic",
-        valid=part.valid[0],
-        background=part.removal,
-        initial=start,
-        keep_state=False,
-        storage=part.storage,
-    )
-
-
-def _on_device(part: Part, camera: Convolution3D, start: Array | None) -> Runs:
-    """Return the solver that runs on the device's arrays."""
-    from recon.solvers.gpu_camera import DepthCamera
-    from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-    from recon.solvers.gpu_total_variation import PlainTotalVariation
-
-    plain = DepthCamera(
-        part.namespace,
-        camera.channel_spectrum(0),
-        camera.grid_shape,
-        camera.sensor_window,
-        part.valid[0],
-        part.removal,
-    )
-    start = None if start is None else start[0]
-    if not _is_tv(part):
-        return PlainDouglasRachford(plain, part.data[0], part.weight, initial=start)
-    return PlainTotalVariation(
-        plain,
-        part.data[0],
-        part.weight,
-        axis_weights=part.problem.axis_weights,
-        isotropic=part.problem.prior_name == "tv-isotropic",
-        initial=start,
-    )
-
-
-def _varying_admm(part: Part, camera: SpatiallyVarying, start: Array | None) -> Runs:
+def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Runs:
     from recon.solvers.operator_admm import OperatorAdmm
+    from recon.solvers.splitting import SensorData
 
-    z, y, x = (
-        float(w) for w in np.broadcast_to(part.problem.axis_weights, (part.problem.n_planes, 3)).mean(axis=0)
-    )
-    return OperatorAdmm(
-        camera,
-        part.central,
-        part.data,
-        part.weight,
-        axis_weights=(z, y, x) if _is_tv(part) else None,
-        isotropic=part.problem.prior_name == "tv-isotropic",
-        valid=part.valid[0],
-        background=part.removal,
-        initial=start,
-    )
+    problem = part.problem
+    mean = np.broadcast_to(problem.axis_weights, (problem.n_planes, 3)).mean(axis=0)
+    data = SensorData(part.data, part.valid[0], part.removal)
+    return OperatorAdmm(camera, part.central, data, part.prior_on(mean, (False,) * 3), initial=start)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Runs:
@@ -299,12 +238,14 @@ def _offered() -> tuple[OfferedSolver, ...]:
             make=_admm,
             refuses=_admm_refuses,
             tolerance=lambda problem: 2e-3 if problem.is_plain else 1e-3,
+            cost=1.0,
         ),
         OfferedSolver(
             name="admm-sensor",
             help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
             make=_sensor_admm,
             refuses=lambda problem: _plain_only(problem) or _by_name(problem, SPLITTING_PRIORS),
+            cost=2.0,
         ),
         OfferedSolver(
             name="fista",
@@ -320,6 +261,7 @@ def _offered() -> tuple[OfferedSolver, ...]:
             refuses=_wiener_refuses,
             prior="none",
             one_step=True,
+            cost=0.01,
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`recon.solvers.data_split` over spectra and sensor images (imported lazily: numba).
+"""Compiled loops of :mod:`recon.solvers.admm` over spectra and sensor images (imported lazily: numba).
 
 One channel at a time; a call does the rows from ``start`` to ``stop``, and sums are kept per row, so that
 results do not depend on the number of threads. Scalars must come in the arrays' precision.

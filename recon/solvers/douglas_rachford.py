@@ -1,63 +1,70 @@
-"""Douglas-Rachford splitting for l1 in a volume: one volume of state, one of transfer functions.
+"""Douglas-Rachford splitting for a prior with a prox: one volume of state, one of transfer functions.
 
-Solves ``min_{x >= 0} 1/2 ||b - A x||^2 + tau ||x||_1`` (Kuo 2020, Eqs. 4.2 and 6.2 with the identity as
-sparsifying transform) by alternating the exact proximal maps of its two halves:
+Solves ``min_x 1/2 ||b - A x||^2 + p(x)`` by alternating the exact proximal maps of its two halves (for the
+sparse volumes of Kuo 2020, Eqs. 4.2 and 6.2, ``p`` is ``tau ||x||_1`` for ``x >= 0``):
 
     x = prox of the data term at z = z + gamma A^H e,    e = b - A x
-    u = prox of the prior at 2 x - z                   = max(z + 2 gamma A^H e - gamma tau, 0)
+    u = prox of p at 2 x - z                           (of l1: max(z + 2 gamma A^H e - gamma tau, 0))
     z <- z + alpha (u - x)
 
 ``e`` solves ``(I + gamma A A^H) e = b - A z`` on the sensor plane
-(:class:`~recon.solvers.sensor_system.SensorSystem`). x and u are never stored: a plane is back-projected,
-updated, transformed and summed while it is in the core's cache. Over-relaxation alpha = 1.7.
+(:class:`~recon.solvers.sensor_system.SensorSystem`). Over-relaxation alpha = 1.7.
 
-Planes in which u has been zero for a while are left out: the problem is solved on the others. Before the
-result is called converged (and now and then before), the optimality condition ``A_z^H e <= tau`` is looked
-at on the planes left out; those that miss it come back, with ``z = -gamma A_z^H e``, the value of z that an
-empty plane has at the minimiser.
+:class:`SparseDouglasRachford` does so for l1 on the processor without ever storing x and u: a plane is
+back-projected, updated, transformed and summed while it is in the core's cache. Planes in which u has been
+zero for a while are left out: the problem is solved on the others. Before the result is called converged (and
+now and then before), the optimality condition ``A_z^H e <= tau`` is looked at on the planes left out; those
+that miss it come back, with ``z = -gamma A_z^H e``, the value of z that an empty plane has at the minimiser.
 """
 
 from __future__ import annotations
 
+from copy import copy as shallow_copy
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.base import fft
+from recon.base.namespace import require_memory, to_host
 from recon.base.threads import in_blocks
-from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
 from recon.camera.planes import PlaneGroups
-from recon.solvers.balance import is_due
+from recon.errors import StructureError
+from recon.priors.base import Prior
+from recon.priors.simple import Separable
 from recon.solvers.empty_planes import EXCESS, REVIEW, EmptyPlanes, PlaneWatch
-from recon.solvers.memory import Storage
-from recon.solvers.scale import expected_height
+from recon.solvers.prior_splits import require_exact
 from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import VolumeSplitting
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
 from recon.solvers.stopping import IterationRecord
+
+_THRESHOLD = 0.1
+"""Threshold to begin with, relative to the expected height of a voxel."""
+_PLANES = 8
+"""Planes, spread over the depths, from which that height is told."""
+_VOLUMES = 6
+"""z, H, the back-projection, the prior's iterate and what they pass through."""
 
 
 class DouglasRachford(VolumeSplitting):
-    """l1 and non-negativity for one channel of a volume.
+    """A prior with an exact prox for one channel of a volume, on any device.
 
     Parameters
     ----------
-    operator, data, weight, valid, background, relaxation, keep_state, storage
-        As :class:`~recon.solvers.splitting.VolumeSplitting`.
-    positive : bool
-        Non-negativity as well.
+    operator : Convolution3D
+        One channel.
+    data : ndarray, (1, height, width), or SensorData
+    prior : Prior
+        Sees arrays (1, n_z, height, width). Of a sum without a common prox, see
+        :class:`~recon.solvers.volume_admm.VolumeAdmm`.
     initial : ndarray, (1, n_z, grid_height, grid_width), optional
         Starting point; default zeros.
-    step : float, optional
-        gamma. Default: such that the threshold ``gamma tau`` is ``_THRESHOLD`` of the height that a voxel may
-        be expected to have.
-    balance : bool
-        Adapt gamma to ``||u|| / ||A^H e||``, the length of the way that x has to go over that of the
+    tuning, room
+        As :class:`~recon.solvers.splitting.VolumeSplitting`. The first step gamma is by default such that
+        l1's threshold ``gamma tau`` is ``_THRESHOLD`` of the height that a voxel may be expected to have; it
+        is balanced by ``||u|| / ||A^H e||``, the length of the way that x has to go over that of the
         multiplier.
-    drop_empty : bool
-        Leave out planes that stay empty.
 
     Attributes
     ----------
@@ -65,66 +72,157 @@ class DouglasRachford(VolumeSplitting):
         The planes left out at the end of a run, and whether they were rightly so.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = (
-        "z", "e", "gamma", "_used_gamma", "_tolerance", "_active", "_empty_for", "_patience",
-    )  # fmt: skip
+    state_names: ClassVar[tuple[str, ...]] = ("z", "e", "gamma", "_used_gamma", "_tolerance")
 
     def __init__(
         self,
         operator: Convolution3D,
-        data: Array,
-        weight: float,
+        data: Array | SensorData,
+        prior: Prior,
         *,
-        positive: bool = True,
-        valid: npt.NDArray[np.bool_] | None = None,
-        background: BackgroundRemoval | None = None,
         initial: Array | None = None,
-        step: float | None = None,
-        relaxation: float = 1.7,
-        balance: bool = True,
-        drop_empty: bool = True,
-        keep_state: bool = True,
-        storage: Storage | None = None,
+        tuning: Tuning | None = None,
+        room: Room | None = None,
     ) -> None:
-        super().__init__(
-            operator,
-            data,
-            weight,
-            valid=valid,
-            background=background,
-            relaxation=relaxation,
-            balance=balance,
-            keep_state=keep_state,
-            storage=storage,
+        super().__init__(operator, data, tuning, room, 1.7)
+        require_exact(*prior.terms())
+        # Its own: what a prox keeps from call to call belongs to this run.
+        self.prior = shallow_copy(prior)
+        self.prior.memory = None
+        self.weight = sum(term.weight for term in prior.terms() if isinstance(term, Separable))
+        self.empty = EmptyPlanes()
+        self.z = self.room.zeros(operator.domain_shape[1:], operator.dtype)
+        if initial is not None:
+            self.z[...] = self.xp.asarray(np.reshape(initial, self.z.shape))
+        self._allocate()
+        first = self.tuning.first
+        if first is None:
+            height = self._expected_height()
+            # Without a threshold to set, the step that weighs data and prior alike at a typical frequency.
+            set_by_height = height > 0 and self.weight > 0
+            first = _THRESHOLD * height / self.weight if set_by_height else 1 / float(self._power.mean())
+        self.gamma = self._used_gamma = float(first)
+        self.e = self.xp.zeros_like(self.data)
+        self._solve_data_term(self.xp.zeros_like(self.data) if initial is None else self._forward(self.z))
+
+    # Steps that compiled code replaces ---------------------------------------------------------------
+    def _allocate(self) -> None:
+        """Make what an iteration works with."""
+        require_memory(self.xp, _VOLUMES * self.operator.dtype.itemsize * int(self.z.size))
+        self._power = self.xp.asarray(self.operator.power())
+
+    def _sweep(self) -> tuple[Array, Array]:
+        """Update z; return the transform of what the sensor sees of it, and the sums of :meth:`step`."""
+        f = self.operator.dtype.type
+        d = self._back_projection()
+        scale = f(self.gamma / self._used_gamma)
+        state = self.z + (1 - scale) * d
+        d *= scale
+        u = self.prior.prox((state + 2 * d)[None], self.gamma)[0].astype(state.dtype, copy=False)
+        r = u - state - d
+        self.z = state + f(self.relaxation) * r
+        sums = np.array([self.prior.value(u[None]), squares(r), squares(u), squares(d)])
+        return (self._transfer * fft.rfft(self.z)).sum(axis=0), sums
+
+    def _back_projection(self) -> Array:
+        """``gamma A^H e``."""
+        return fft.irfft(
+            self.xp.conj(self._transfer) * self._weighted_spectrum(), self.operator.grid_shape[1]
         )
+
+    @property
+    def solution(self) -> Array:
+        """The prior's iterate u, in the host's memory; computed on demand."""
+        prior = shallow_copy(self.prior)  # leaves what its prox starts from as it is
+        return to_host(prior.prox((self.z + 2 * self._back_projection())[None], self._used_gamma))
+
+    # -------------------------------------------------------------------------------------------------
+    def _expected_height(self) -> float:
+        """Brightest voxel of the regularised back-projection ``M^H (M M^H + lambda)^-1 C^T b``.
+
+        What the data say when no prior is asked: within a small factor of the brightest voxels of the
+        solution, whatever exposure and size.
+        """
+        xp, operator = self.xp, self.operator
+        spectrum = self.system.spectrum_of(self.data) / (self._power + 0.01 * float(self._power.mean()))
+        height = 0.0
+        for z in range(0, operator.domain_shape[1], max(operator.domain_shape[1] // _PLANES, 1)):
+            X = xp.conj(xp.asarray(operator.transfer_plane(z))) * spectrum
+            height = max(height, float(fft.irfft(X, operator.grid_shape[1]).max()))
+        return height
+
+    def _weighted_spectrum(self) -> Array:
+        """Spectrum of ``gamma e``."""
+        E = self.system.spectrum_of(self.e)
+        E *= E.real.dtype.type(self._used_gamma)
+        return E
+
+    def _solve_data_term(self, forward_z: Array) -> None:
+        """Solve for e from ``A z``, masked."""
+        self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
+        self.system.solve(self.data - forward_z, self.e)
+
+    def step(self) -> IterationRecord:
+        """Do one iteration. ``objective`` and ``data_residual`` are those of x, and of u in the prior."""
+        residual = residual_norm(self.e)
+        total, sums = self._sweep()
+        value, gap, size, dual = sums
+        gap = float(np.sqrt(gap / size)) if size > 0 else 0.0
+        self._used_gamma = self.gamma
+        if self.balance and is_due(self.iteration) and size > 0 and dual > 0:
+            self.gamma *= float(np.clip(np.sqrt(size / dual), 0.2, 5.0))
+        self.system.follow(gap)
+        self._solve_data_term(self.system.from_spectrum(total))
+        return IterationRecord(
+            0,
+            0.0,
+            0.5 * residual**2 + float(value),
+            residual,
+            primal_residual=gap,
+            change=self.relaxation * gap,
+        )
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with what the prior's prox keeps."""
+        memory = np.zeros(0) if self.prior.memory is None else to_host(self.prior.memory)
+        return {**super().checkpoint(copy=copy), "prior": memory.copy() if copy else memory}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
+        super().restore(state)
+        self.prior.memory = self.xp.array(state["prior"]) if state["prior"].size else None
+
+
+class SparseDouglasRachford(DouglasRachford):
+    """l1 with or without non-negativity, compiled, on the processor.
+
+    As :class:`DouglasRachford`; planes that stay empty are left out, where ``tuning`` does not forbid it.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = (
+        "z", "e", "gamma", "_used_gamma", "_tolerance", "_active", "_empty_for", "_patience",
+    )  # fmt: skip
+
+    @staticmethod
+    def knows(prior: Prior) -> bool:
+        """Whether a prior is l1 (of any weight) and perhaps non-negativity, and nothing else."""
+        return isinstance(prior, Separable) and prior.upper == np.inf and prior.lower in (0.0, -np.inf)
+
+    def _allocate(self) -> None:
         from recon.solvers import _l1_kernels
 
+        if not (isinstance(self.prior, Separable) and self.knows(self.prior)):
+            raise StructureError("These sweeps are for l1 and non-negativity alone.")
         self._kernels = _l1_kernels
-        self.positive = positive
+        self.positive = self.prior.lower == 0
+        operator = self.operator
         # Without a threshold no plane is certain to be empty.
-        self.drop_empty = drop_empty and self.weight > 0
-        dtype = operator.dtype
-        self.z = self._storage.zeros(operator.domain_shape[1:], dtype)
+        self.drop_empty = self.tuning.drop_empty and self.weight > 0
         self.watch = PlaneWatch(len(self.z))
-        self.empty = EmptyPlanes()
-        if initial is not None:
-            self.z[...] = np.reshape(initial, self.z.shape)
-        self._power = operator.power()
-        if step is None:
-            height = expected_height(operator, self.system, self.data)
-            # Without a threshold to set, the step that weighs data and prior alike at a typical frequency.
-            step = (
-                _THRESHOLD * height / weight if height > 0 and weight > 0 else 1 / float(self._power.mean())
-            )
-        self.gamma = self._used_gamma = float(step)
-        self.e = np.zeros_like(self.data)
         self._statistics = np.zeros((len(self.z), _l1_kernels.STATISTICS))
         spectrum = fft.spectrum_shape(operator.grid_shape)
-        self._totals = np.zeros((operator.groups.count, *spectrum), fft.complex_dtype(dtype))
+        self._totals = np.zeros((operator.groups.count, *spectrum), fft.complex_dtype(operator.dtype))
         self._regroup()
-        self._solve_data_term(
-            operator.forward(self.z)[0] if initial is not None else np.zeros_like(self.data)
-        )
 
     # The watch's arrays are part of the state.
     @property
@@ -194,18 +292,7 @@ class DouglasRachford(VolumeSplitting):
         """Look at the optimality condition on the planes left out; go on where one misses it."""
         return not self._bring_back()
 
-    def _weighted_spectrum(self) -> Array:
-        """Spectrum of ``gamma e``."""
-        E = self.system.spectrum_of(self.e)
-        E *= E.real.dtype.type(self._used_gamma)
-        return E
-
-    def _solve_data_term(self, forward_z: Array) -> None:
-        self.system.set_curvature(self._power * self._power.dtype.type(self._used_gamma))
-        self.system.solve(self.data - self.system.masked(forward_z), self.e)
-
-    def step(self) -> IterationRecord:
-        """Do one iteration. ``objective`` and ``data_residual`` are those of x, and of u in the prior."""
+    def _sweep(self) -> tuple[Array, Array]:
         k = self._kernels
         dtype = self.operator.dtype
         if self.drop_empty and self.iteration:
@@ -229,32 +316,17 @@ class DouglasRachford(VolumeSplitting):
         self._statistics[...] = 0
         self._groups.run(job)
         self.watch.note(self._statistics[:, 0])
-        residual = residual_norm(self.e)
-        l1, gap, size, dual = self._statistics.sum(axis=0)
         total = self._totals[0]
         for other in self._totals[1:]:
             total += other
-        gap = float(np.sqrt(gap / size)) if size > 0 else 0.0
-        self._used_gamma = self.gamma
-        if self.balance and is_due(self.iteration) and size > 0 and dual > 0:
-            self.gamma *= float(np.clip(np.sqrt(size / dual), 0.2, 5.0))
-        self.system.follow(gap)
-        self._solve_data_term(self.system.from_spectrum(total))
-        return IterationRecord(
-            0,
-            0.0,
-            0.5 * residual**2 + self.weight * float(l1),
-            residual,
-            primal_residual=gap,
-            change=self.relaxation * gap,
-        )
+        return total, self._statistics.sum(axis=0) * (self.weight, 1, 1, 1)
 
     def _end(self) -> Array:
         self.empty = EmptyPlanes(
             tuple(int(z) for z in np.flatnonzero(~self.watch.active)),
             float(self._peaks().max()) / self.weight if self.weight > 0 else 0.0,
         )
-        return self.solution if self.keep_state else self._write_solution(self.z)
+        return self.solution if self.room.keep_state else self._write_solution(self.z)
 
     @property
     def solution(self) -> Array:
@@ -277,6 +349,3 @@ class DouglasRachford(VolumeSplitting):
         self._groups.run(job)
         z[~self.watch.active] = 0
         return z[None]
-
-
-_THRESHOLD = 0.1

@@ -8,11 +8,13 @@ split ``z = y`` with its own prox and penalty, which adds to the pixels'.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy as shallow_copy
 from typing import Any
 
 import numpy as np
 
+from recon.base.namespace import namespace_of, to_host
 from recon.base.threads import in_blocks
 from recon.camera.base import Array
 from recon.errors import StructureError
@@ -62,7 +64,8 @@ class ProxSplit:
         self.sums = (0.0, 0.0, 0.0, 0.0)
 
     def _prox(self) -> Array:
-        return np.asarray(self.prior.prox(self.state, 1 / self.mu), self.state.dtype)
+        split: Array = self.prior.prox(self.state, 1 / self.mu).astype(self.state.dtype, copy=False)
+        return split
 
     def meet(self, y: Array, relax: float) -> None:
         """Update from the object."""
@@ -70,7 +73,7 @@ class ProxSplit:
         self.state = self.state + self.state.dtype.type(relax) * (y - before)
         self.split = self._prox()
         parts = (y - self.split, self.split - before, self.split, self.state - self.split)
-        self.sums = tuple(float(np.vdot(v, v)) for v in parts)  # type: ignore[assignment]
+        self.sums = tuple(float(namespace_of(v).vdot(v, v)) for v in parts)  # type: ignore[assignment]
 
     def pull(self) -> Array:
         """Return what it adds to the next right-hand side, ``mu R(t)``."""
@@ -90,13 +93,14 @@ class ProxSplit:
 
     def set_penalty(self, mu: float) -> None:
         """Change the penalty; split variable and (unscaled) multiplier stay what they are."""
-        self.state = self.split + self.state.dtype.type(self.mu / mu) * (self.state - self.split)
+        if mu != self.mu:
+            self.state = self.split + self.state.dtype.type(self.mu / mu) * (self.state - self.split)
         self.mu = mu
 
     def restart(self) -> None:
         """Begin anew from zero."""
         self.prior.memory = None
-        self.state = np.zeros_like(self.state)
+        self.state = self.state * 0
         self.split = self._prox()
         self.sums = (0.0, 0.0, 0.0, 0.0)
 
@@ -104,15 +108,29 @@ class ProxSplit:
         """Return the state, with what the prior's prox keeps."""
         memory = np.zeros(0) if self.prior.memory is None else self.prior.memory
         return {
-            "state": self.state, "split": self.split, "mu": self.mu, "sums": np.array(self.sums),
-            "memory": memory,
+            "state": to_host(self.state), "split": to_host(self.split), "mu": self.mu,
+            "sums": np.array(self.sums), "memory": to_host(memory),
         }  # fmt: skip
 
     def restore(self, kept: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
-        self.state, self.split, self.mu = np.array(kept["state"]), np.array(kept["split"]), float(kept["mu"])
+        xp = namespace_of(self.state)
+        self.state, self.split, self.mu = xp.array(kept["state"]), xp.array(kept["split"]), float(kept["mu"])
         self.sums = tuple(float(v) for v in kept["sums"])  # type: ignore[assignment]
-        self.prior.memory = np.array(kept["memory"]) if kept["memory"].size else None
+        self.prior.memory = xp.array(kept["memory"]) if kept["memory"].size else None
+
+
+def kept_splits(splits: Sequence[ProxSplit]) -> dict[str, Any]:
+    """Return what splits keep, by name, for a solver's checkpoint."""
+    kept = enumerate(split.checkpoint() for split in splits)
+    return {f"prior_{i}_{name}": value for i, part in kept for name, value in part.items()}
+
+
+def restore_splits(splits: Sequence[ProxSplit], state: dict[str, Any]) -> None:
+    """Go on from a checkpoint with :func:`kept_splits` in it."""
+    for i, split in enumerate(splits):
+        prefix = f"prior_{i}_"
+        split.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
 
 class PriorSplits:
@@ -278,14 +296,11 @@ class PriorSplits:
 
     def checkpoint(self) -> dict[str, Any]:
         """Return what :attr:`others` keep, by name."""
-        kept = enumerate(other.checkpoint() for other in self.others)
-        return {f"prior_{i}_{name}": value for i, part in kept for name, value in part.items()}
+        return kept_splits(self.others)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
-        for i, other in enumerate(self.others):
-            prefix = f"prior_{i}_"
-            other.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        restore_splits(self.others, state)
 
     def _thresholds(self) -> Array:
         weights = np.array([[self.tv.weight if self.tv else 0.0], [self.separable.weight]])
@@ -305,12 +320,17 @@ def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable, tuple[P
     for term in prior.terms():
         if isinstance(term, Separable):
             separable = separable.with_separable(term)
-        elif tv is None and isinstance(term, TotalVariation) and term.axis_weights == (1.0, 1.0):
+        elif tv is None and isinstance(term, TotalVariation) and _is_plain(term):
             tv = term
         else:
             others.append(term)
     require_exact(*others)
     return tv, separable, tuple(others)
+
+
+def _is_plain(tv: TotalVariation) -> bool:
+    """Whether differences wrap around and weigh alike."""
+    return np.array_equal(tv.axis_weights, (1.0, 1.0)) and tv.wrap in (None, (True, True))
 
 
 def require_exact(*priors: Prior) -> None:

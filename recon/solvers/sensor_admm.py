@@ -279,7 +279,8 @@ class SensorAdmm(Solver):
 
     def _quadratic(self, channel: int) -> Array:
         """Return the penalties of differences and of pixels in the quadratic problem."""
-        pixels = self._splits.pixel_penalties[channel] + self._extra_penalty()
+        others = sum(other.mu for other in self._splits.others)
+        pixels = self._mu[1, channel] + others + self._extra_penalty()
         return np.array([self._mu[0, channel], pixels])
 
     def _extra_penalty(self) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
+from recon.base.namespace import Namespace, namespace_of
 from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array
 
@@ -31,9 +32,15 @@ class SensorSystem:
     background : BackgroundRemoval, optional
         A smooth background to be estimated as well, for the same valid pixels: a projection that is a further
         factor of ``C``.
+    dtype : dtype
+    max_steps : int
+    xp : module
+        Whose arrays: ``numpy`` or ``cupy``.
+
+    Attributes
+    ----------
     tolerance : float
         Residual to reach, relative to the right-hand side (see :meth:`follow`).
-    max_steps : int
     """
 
     def __init__(
@@ -44,25 +51,26 @@ class SensorSystem:
         background: BackgroundRemoval | None = None,
         *,
         dtype: npt.DTypeLike = np.float32,
-        tolerance: float = 1e-4,
         max_steps: int = 30,
+        xp: Namespace = np,
     ) -> None:
+        self.xp = xp
         self.window = window
-        self.tolerance = tolerance
+        self.tolerance = 1e-4
         self.max_steps = max_steps
         self.dtype = np.dtype(dtype)
-        self._background = background
-        self._mask = None if valid is None or valid.all() else valid.astype(self.dtype)
-        self._plane = np.zeros(grid_shape, self.dtype)
-        self._spectrum = np.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
-        self._q = np.zeros(fft.spectrum_shape(grid_shape), self.dtype)
-        self._preconditioner = np.ones_like(self._q)
+        self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
+        self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
+        self._plane = xp.zeros(grid_shape, self.dtype)
+        self._spectrum = xp.empty(fft.spectrum_shape(grid_shape), fft.complex_dtype(self.dtype))
+        self._q = xp.zeros(fft.spectrum_shape(grid_shape), self.dtype)
+        self._preconditioner = xp.ones_like(self._q)
         self.steps = 0
 
     def set_curvature(self, q: Array) -> None:
         """Give ``q``, real, on the half spectrum."""
         self._q[...] = q
-        np.divide(1.0, 1.0 + 0.5 * q, out=self._preconditioner)
+        self.xp.divide(1.0, 1.0 + 0.5 * q, out=self._preconditioner)
 
     def follow(self, progress: float) -> None:
         """Set the tolerance by how far the solver around it has still to go (a relative residual).
@@ -80,8 +88,13 @@ class SensorSystem:
         """Take out, in place, what says nothing: pixels that are not valid, a smooth background."""
         if self._mask is not None:
             image *= self._mask
-        if self._background is not None:
-            self._background.forward(image[None], image[None])
+        if self._basis is not None:
+            rows, columns, inverse = self._basis
+            coefficients = rows @ image.astype(np.float64) @ columns.T
+            best = (inverse @ coefficients.ravel()).reshape(coefficients.shape)
+            image -= (rows.T @ best @ columns).astype(self.dtype)
+            if self._mask is not None:
+                image *= self._mask
         return image
 
     def spectrum_of(self, e: Array) -> Array:
@@ -105,21 +118,22 @@ class SensorSystem:
 
     def solve(self, right: Array, e: Array) -> None:
         """Improve ``e`` in place until the residual is down to the tolerance."""
-        target = self.tolerance * float(np.linalg.norm(right))
+        xp = self.xp
+        target = self.tolerance * float(xp.linalg.norm(right))
         if not np.isfinite(target):
             e[...] = np.nan
             return
         residual = right - e - self._bend(e)
-        direction = np.zeros_like(e)
+        direction = xp.zeros_like(e)
         rho = 1.0
         self.steps = 0
-        while float(np.linalg.norm(residual)) > target and self.steps < self.max_steps:
+        while float(xp.linalg.norm(residual)) > target and self.steps < self.max_steps:
             z = self._filtered(residual, self._preconditioner)
-            rho, rho_before = float(np.vdot(residual, z)), rho
+            rho, rho_before = float(xp.vdot(residual, z)), rho
             direction *= rho / rho_before if self.steps else 0.0
             direction += z
             image = direction + self._bend(direction)
-            length = e.dtype.type(rho / float(np.vdot(direction, image)))
+            length = e.dtype.type(rho / float(xp.vdot(direction, image)))
             e += length * direction
             residual -= length * image
             self.steps += 1
@@ -127,5 +141,5 @@ class SensorSystem:
 
 def residual_norm(e: Array) -> float:
     """``||e||``; infinity where it is not a number, which a stopping rule takes for lost."""
-    norm = float(np.linalg.norm(e))
+    norm = float(namespace_of(e).linalg.norm(e))
     return norm if np.isfinite(norm) else np.inf

@@ -1,16 +1,96 @@
-"""What the two fast volume solvers share: one channel, the data term on the sensor, where state lives."""
+"""What the volume solvers share: one channel, the data term on the sensor, where state lives.
+
+The device is a property of arrays: a solver's own live in the memory of ``room.xp``. Classes here run on any;
+their compiled subclasses replace single steps where the arrays are NumPy's and the prior is one they know.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base import fft
+from recon.base.namespace import Namespace, to_host
 from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
 from recon.solvers.base import Solver
 from recon.solvers.memory import Storage
 from recon.solvers.sensor_system import SensorSystem
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How a splitting method runs; the defaults need no change.
+
+    Attributes
+    ----------
+    relaxation : float, optional
+        alpha, between 1 and 2; default the method's own.
+    first : float, optional
+        Penalty (ADMM) or step (Douglas-Rachford) to start with; default from operator and data.
+    balance : bool
+        Adapt it while running.
+    kappa : float
+        Penalty of non-negativity relative to that of total variation.
+    drop_empty : bool
+        With l1: leave out planes that stay empty.
+    """
+
+    relaxation: float | None = None
+    first: float | None = None
+    balance: bool = True
+    kappa: float = 1.0
+    drop_empty: bool = True
+
+
+@dataclass(frozen=True)
+class Room:
+    """Where a solver's state lives.
+
+    Attributes
+    ----------
+    xp : module
+        Whose arrays: ``numpy`` or ``cupy``.
+    storage : Storage
+        Memory, or files. (The transfer functions are the operator's.)
+    keep_state : bool
+        False gives the state up when a run ends: one volume less at the peak, and nothing to go on from.
+    """
+
+    xp: Namespace = np
+    storage: Storage = field(default_factory=Storage)
+    keep_state: bool = True
+
+    def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Array:
+        """Return an array of zeros there."""
+        return self.storage.zeros(shape, dtype) if self.xp is np else self.xp.zeros(shape, dtype)
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What one channel of the sensor measured.
+
+    Attributes
+    ----------
+    image : ndarray, (1, height, width)
+    valid : ndarray of bool, (height, width), optional
+        Pixels that were measured; default all.
+    background : BackgroundRemoval, optional
+        A smooth background to be estimated as well, for the same valid pixels.
+    """
+
+    image: Array
+    valid: npt.NDArray[np.bool_] | None = None
+    background: BackgroundRemoval | None = None
+
+    @classmethod
+    def of(cls, data: Array | SensorData) -> SensorData:
+        """Return data as they are, an image as the data of a sensor whose pixels are all valid."""
+        return data if isinstance(data, SensorData) else cls(data)
 
 
 class VolumeSplitting(Solver):
@@ -20,50 +100,57 @@ class VolumeSplitting(Solver):
     ----------
     operator : Convolution3D
         One channel.
-    data : ndarray, (1, height, width)
-    weight : float
-        tau, absolute; 0 leaves non-negativity alone.
-    valid : ndarray of bool, (height, width), optional
-        Pixels that were measured.
-    background : BackgroundRemoval, optional
-        A smooth background to be estimated as well, for the same valid pixels.
+    data : ndarray, (1, height, width), or SensorData
+    tuning : Tuning
+    room : Room
     relaxation : float
-        alpha, between 1 and 2.
-    balance : bool
-        Adapt the penalty or step while running.
-    keep_state : bool
-        False gives the state up when :meth:`run` ends: one volume less at the peak, and nothing to go on
-        from.
-    storage : Storage, optional
-        Where the state lives; default memory. (The transfer functions are the operator's.)
+        The method's own, where ``tuning`` names none.
     """
 
     def __init__(
         self,
         operator: Convolution3D,
-        data: Array,
-        weight: float,
-        *,
-        valid: npt.NDArray[np.bool_] | None,
-        background: BackgroundRemoval | None,
+        data: Array | SensorData,
+        tuning: Tuning | None,
+        room: Room | None,
         relaxation: float,
-        balance: bool,
-        keep_state: bool,
-        storage: Storage | None,
     ) -> None:
         super().__init__()
         if operator.domain_shape[0] != 1:
             raise ValueError(f"One channel at a time, not {operator.domain_shape[0]}.")
         self.operator = operator
-        self.weight = float(weight)
-        self.relaxation = relaxation
-        self.balance = balance
-        self.keep_state = keep_state
+        self.tuning, self.room = tuning or Tuning(), room or Room()
+        self.relaxation = self.tuning.relaxation or relaxation
+        self.balance = self.tuning.balance
+        self.xp = self.room.xp
+        data = SensorData.of(data)
         self.system = SensorSystem(
-            operator.grid_shape, operator.sensor_window, valid, background, dtype=operator.dtype
+            operator.grid_shape,
+            operator.sensor_window,
+            data.valid,
+            data.background,
+            dtype=operator.dtype,
+            xp=self.xp,
         )
-        self.data = self.system.masked(np.array(data, operator.dtype).reshape(operator.sensor_shape))
-        self._storage = storage or Storage()
+        image = np.array(data.image, operator.dtype).reshape(operator.sensor_shape)
+        self.data = self.system.masked(self.xp.asarray(image))
+
+    def _forward(self, x: Array) -> Array:
+        """Return what the sensor sees of a volume (n_z, height, width), masked as the data are."""
+        if self.xp is np:
+            return self.system.masked(self.operator.forward(x)[0])
+        return self.system.from_spectrum((self._transfer * fft.rfft(x)).sum(axis=0))
+
+    @property
+    def _transfer(self) -> Array:
+        """Transfer functions on the device, (n_z, grid_height, grid_width // 2 + 1)."""
+        if self.xp is np:
+            return self.operator.channel_spectrum(0)
+        if self._on_device is None:
+            self._on_device = self.xp.asarray(self.operator.channel_spectrum(0))
+        return self._on_device
+
+    _on_device: Array | None = None
 
     @property
     def _tolerance(self) -> float:
@@ -74,5 +161,41 @@ class VolumeSplitting(Solver):
     def _tolerance(self, value: float) -> None:
         self.system.tolerance = value
 
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, in the host's memory."""
+        state = super().checkpoint(copy=copy)
+        return (
+            state
+            if self.xp is np
+            else {k: to_host(v) if hasattr(v, "shape") else v for k, v in state.items()}
+        )
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
+        if self.xp is np:
+            super().restore(state)
+            return
+        for name in ("iteration", *self.state_names):
+            value = state[name]
+            setattr(self, name, self.xp.asarray(value) if isinstance(value, np.ndarray) else value)
+
     def _start(self) -> Array | None:
-        return None
+        return None  # zeros will do: a copy of a volume is too much to pay for a fall-back
+
+
+def squares(a: Array) -> float:
+    """Sum of squares, in float64."""
+    return float((a * a).sum(dtype=np.float64))
+
+
+def is_due(iteration: int) -> bool:
+    """Tell whether to balance after this iteration (counted from 0): 2, 4, 6, 8, 12, 16, 24, 32, 48, ...
+
+    Ever more seldom: a method whose penalty changes finitely often in any stretch that grows converges, and a
+    bad guess is still put right late in a long run.
+    """
+    if iteration in (2, 4, 6):
+        return True
+    while iteration > 6 and iteration % 2 == 0:
+        iteration //= 2
+    return iteration in (4, 6)

@@ -1,42 +1,23 @@
-"""Lean ADMM for total variation in a volume (the default for depth stacks).
+"""The compiled sweeps of the volumes' ADMM for total variation without negatives; which solver a prior gets.
 
-Solves ``min_{x >= 0} 1/2 ||b - A x||^2 + tau ||Psi x||_1`` (Kuo 2020, Eq. 4.2), as the dissertation's ADMM
-(Eq. 4.5, A.3) does, with three changes that leave the minimiser as it is:
-
-* The data term is not split. ``v = M x`` of Eq. 4.5 is a volume of which only one plane meets the data; the
-  others act as a brake. Here the update of x solves the cropped data term exactly, on the sensor plane
-  (:class:`~recon.solvers.sensor_system.SensorSystem`), so that mu_1 is gone.
-* Depth is not transformed. Per lateral spatial frequency ``T = Psi^T Psi + kappa`` is tridiagonal in z and is
-  solved as such: no wrap-around between first and last plane, two-dimensional transforms only, and weights
-  that may differ from plane to plane (voxels grow with depth).
-* Split variable and multiplier are kept as one state. With ``s = Psi x + eta / mu``, ``u = shrink(s)`` and
-  ``eta / mu = s - u``, an over-relaxed iteration is ``s <- s + alpha (Psi x - u)``.
-
-An iteration is one sweep over planes (states, right-hand side r, transform R, sum with ``conj(g)``),
-one solve on the sensor plane, and one sweep over spectral rows, ``X <- T^-1 R + g E``, where
-``g = T^-1 M^H``. Six volumes are kept: X (which R overwrites), g and four states.
-
-Only the common penalty mu is adapted, by balancing the relative residuals (Wohlberg 2017): it scales ``g``
-and ``q`` and costs nothing. kappa, the ratio of the penalties of non-negativity and TV, is fixed.
+An iteration is one sweep over planes (states, right-hand side r, transform R, sum with ``conj(g)``), one
+solve on the sensor plane, and one sweep over spectral rows, ``X <- T^-1 R + g E``. Six volumes are kept: X
+(which R overwrites), g and four states.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
-import numpy.typing as npt
 
 from recon.base import fft
 from recon.base.threads import get_threads, in_blocks
-from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
-from recon.solvers.balance import is_due
-from recon.solvers.memory import Storage
-from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import VolumeSplitting
-from recon.solvers.stopping import IterationRecord
+from recon.priors.base import Prior
+from recon.priors.total_variation import TotalVariation
+from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
+from recon.solvers.splitting import Room, SensorData, Tuning
+from recon.solvers.volume_admm import VolumeAdmm, split_volume_prior
 
 _POSITIVE = 3
 """Which of the four states is that of non-negativity."""
@@ -44,76 +25,28 @@ _TILE = 256
 """Spectral columns solved together: all planes of a tile fit a core's second-level cache."""
 
 
-class LeanTotalVariation(VolumeSplitting):
-    """ADMM for one channel of a volume with total variation and non-negativity.
+class LeanTotalVariation(VolumeAdmm):
+    """ADMM for one channel of a volume with total variation and non-negativity, on the processor.
 
-    Parameters
-    ----------
-    operator, data, weight, valid, background, relaxation, keep_state, storage
-        As :class:`~recon.solvers.splitting.VolumeSplitting`; ``weight`` is tau of Eq. 4.2.
-    axis_weights : ndarray, (3,) or (n_z, 3)
-        Weights of the z, y and x differences, at each plane where they differ; z is not x.
-    isotropic : bool
-        Length of the gradient instead of the sum of its components.
-    initial : ndarray, (1, n_z, grid_height, grid_width), optional
-        Starting point; default zeros.
-    penalty : float, optional
-        mu to start with. Default: ``_PENALTY`` of the mean over frequencies of ``sum_z |H_z|^2``, the
-        curvature of the data term: independent of exposure, size and tau.
-    kappa : float
-        Penalty of non-negativity relative to that of TV.
-    balance : bool
-        Adapt mu to the residuals.
+    Parameters and attributes are those of :class:`~recon.solvers.volume_admm.VolumeAdmm`, and so is every
+    iteration but for rounding; the state ``S`` is (n_z, grid_height, 4, grid_width).
     """
 
-    state_names: ClassVar[tuple[str, ...]] = (
-        "X",
-        "S",
-        "e",
-        "penalty",
-        "_used_penalty",
-        "_misfit",
-        "_tolerance",
-    )
+    @staticmethod
+    def knows(prior: Prior) -> bool:
+        """Whether a prior is total variation (of any weight) with non-negativity, and nothing else."""
+        _, separable, others = split_volume_prior(prior)
+        bounds = (separable.weight, separable.lower, separable.upper)
+        return not others and bounds == (0.0, 0.0, np.inf)
 
-    def __init__(
-        self,
-        operator: Convolution3D,
-        data: Array,
-        weight: float,
-        *,
-        axis_weights: npt.ArrayLike = (1.0, 1.0, 1.0),
-        isotropic: bool = False,
-        valid: npt.NDArray[np.bool_] | None = None,
-        background: BackgroundRemoval | None = None,
-        initial: Array | None = None,
-        penalty: float | None = None,
-        kappa: float = 1.0,
-        relaxation: float = 1.8,
-        balance: bool = True,
-        keep_state: bool = True,
-        storage: Storage | None = None,
-    ) -> None:
-        super().__init__(
-            operator,
-            data,
-            weight,
-            valid=valid,
-            background=background,
-            relaxation=relaxation,
-            balance=balance,
-            keep_state=keep_state,
-            storage=storage,
-        )
+    def _allocate(self, start: Array | None) -> None:
         from recon.solvers import _tv_kernels
 
         self._kernels = _tv_kernels
-        self.isotropic = isotropic
+        self.splits = ()
+        operator, zeros = self.operator, self.room.zeros
         dtype = operator.dtype
         _, nz, ny, nx = operator.domain_shape
-        self.axis_weights = np.ascontiguousarray(np.broadcast_to(np.asarray(axis_weights, dtype), (nz, 3)))
-        self.kappa = dtype.type(kappa)
-        zeros = self._storage.zeros
         self.g = zeros((nz, *fft.spectrum_shape((ny, nx))), fft.complex_dtype(dtype))
         self._dy2 = (4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype)
         self._dx2 = (4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype)
@@ -121,19 +54,11 @@ class LeanTotalVariation(VolumeSplitting):
         self._prepare_transfer()
         self.X = zeros(self.g.shape, self.g.dtype)
         self.S = zeros((nz, ny, 4, nx), dtype)
-        self.e = self.data.copy()
         self._totals = np.empty((operator.groups.count, *self.g.shape[1:]), self.g.dtype)
         self._statistics = np.zeros((nz, _tv_kernels.STATISTICS))
-        if initial is not None:
-            volume = np.ascontiguousarray(initial, dtype).reshape(operator.domain_shape)
-            self.e -= self.system.masked(operator.forward(volume)[0])
-            fft.rfft(volume[0], out=self.X)
-            np.maximum(volume[0], 0, out=self.S[:, :, _POSITIVE])
-        if penalty is None:
-            penalty = _PENALTY * float(operator.power().mean())
-        self.penalty = float(penalty)
-        self._used_penalty = self.penalty
-        self._misfit = 0.5 * float(np.vdot(self.e, self.e))
+        if start is not None:
+            fft.rfft(start[0], out=self.X)
+            np.maximum(start[0], 0, out=self.S[:, :, _POSITIVE])
 
     def _prepare_transfer(self) -> None:
         k = self._kernels
@@ -155,50 +80,7 @@ class LeanTotalVariation(VolumeSplitting):
         """The split variable that is not negative: what is empty is zero, not nearly so. A copy."""
         return np.asarray(np.maximum(self.S[:, :, _POSITIVE], 0))[None]
 
-    def _end(self) -> Array:
-        if not self.keep_state:
-            del self.X, self.g
-        return self.solution
-
-    def step(self) -> IterationRecord:
-        """Do one iteration. ``objective`` is that of the iterate before, negative parts aside."""
-        self._sweep_planes()
-        total = self._totals[0]
-        for other in self._totals[1:]:
-            total += other
-        mu = self.penalty
-        self.system.set_curvature(self._q / self._q.dtype.type(mu))
-        self.system.solve(self.data - self.system.from_spectrum(total), self.e)
-        E = self.system.spectrum_of(self.e)
-        E /= self._q.dtype.type(mu)
-        self._solve_rows(E)
-        self._used_penalty = mu
-        record = self._record()
-        self.system.follow(max(record.primal_residual, record.dual_residual))
-        return record
-
-    def _record(self) -> IterationRecord:
-        tv, primal, dual, kx, y, primal_p, dual_p, xx, y_p = self._statistics.sum(axis=0)
-        kappa = float(self.kappa)
-        # Relative to both sides of the constraint, in the metric of the augmented Lagrangian.
-        primal_residual = float(np.sqrt((primal + kappa * primal_p) / max(kx + kappa * xx, 1e-300)))
-        dual_residual = float(np.sqrt((dual + kappa * dual_p) / max(y + kappa * y_p, 1e-300)))
-        objective = self._misfit + self.weight * float(tv)
-        self._misfit = 0.5 * float(np.vdot(self.e, self.e))
-        if self.balance and is_due(self.iteration) and dual_residual > 0:
-            ratio = np.sqrt(primal_residual / dual_residual)
-            self.penalty *= float(np.clip(ratio, 0.2, 5.0))
-        return IterationRecord(
-            0,
-            0.0,
-            objective,
-            residual_norm(self.e),
-            primal_residual,
-            dual_residual,
-            change=float(np.sqrt(dual_p / max(xx, 1e-300))),
-        )
-
-    def _sweep_planes(self) -> None:
+    def _sweep(self) -> tuple[Array, Array]:
         k = self._kernels
         dtype = self.operator.dtype
         ny, nx = self.operator.grid_shape
@@ -226,6 +108,10 @@ class LeanTotalVariation(VolumeSplitting):
                 )  # fmt: skip
 
         in_blocks(worker, workers)
+        total = self._totals[0]
+        for other in self._totals[1:]:
+            total += other
+        return total, np.asarray(self._statistics.sum(axis=0))
 
     def _boundaries(self, starts: list[int], p: Array) -> tuple[dict[int, Array], dict[int, Array]]:
         """Return the estimate at each worker's first plane, and the z reflections of the plane before it."""
@@ -245,7 +131,7 @@ class LeanTotalVariation(VolumeSplitting):
             )  # fmt: skip
         return first, before
 
-    def _solve_rows(self, E: Array) -> None:
+    def _update(self, E: Array) -> None:
         k = self._kernels
         dtype = self.operator.dtype
         X, g, E = self.X.view(dtype), self.g.view(dtype), E.view(dtype)
@@ -257,4 +143,32 @@ class LeanTotalVariation(VolumeSplitting):
         in_blocks(job, len(self._dy2))
 
 
-_PENALTY = 0.5
+def volume_solver(
+    operator: Convolution3D,
+    data: Array | SensorData,
+    prior: Prior,
+    *,
+    initial: Array | None = None,
+    tuning: Tuning | None = None,
+    room: Room | None = None,
+) -> VolumeAdmm | DouglasRachford:
+    """Return the solver of one channel of a volume, or of a picture of one plane, for its prior and device.
+
+    Parameters are those of :class:`~recon.solvers.volume_admm.VolumeAdmm`. Total variation, and sums without
+    a common prox, are ADMM's; any other prior is Douglas-Rachford's. Both have compiled sweeps for what they
+    are used for most.
+
+    Raises
+    ------
+    StructureError
+        When the prior's prox is not that of its value.
+    """
+    compiled = room is None or room.xp is np
+    _, separable, others = split_volume_prior(prior)
+    varies = any(isinstance(term, TotalVariation) and term not in others for term in prior.terms())
+    kind: type[VolumeAdmm | DouglasRachford]
+    if varies or len(others) > 1 or (others and not separable.is_zero):
+        kind = LeanTotalVariation if compiled and LeanTotalVariation.knows(prior) else VolumeAdmm
+    else:
+        kind = SparseDouglasRachford if compiled and SparseDouglasRachford.knows(prior) else DouglasRachford
+    return kind(operator, data, prior, initial=initial, tuning=tuning, room=room)

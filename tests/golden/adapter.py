@@ -99,8 +99,8 @@ def numpy_as_device() -> Iterator[None]:
     with ExitStack() as patched:
         for name, value in (
             ("recon.reconstruction.part.array_namespace", lambda _device: twin),
-            ("recon.solvers.gpu_total_variation.require_memory", lambda *_: None),
-            ("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None),
+            ("recon.solvers.volume_admm.require_memory", lambda *_: None),
+            ("recon.solvers.douglas_rachford.require_memory", lambda *_: None),
         ):
             patched.enter_context(mock.patch(name, value))
         yield

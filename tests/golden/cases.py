@@ -382,10 +382,10 @@ _add("hologram-double", adapter.hologram, shown, SLM, precise=True, within=1e-6)
 
 # A chart and a map ---------------------------------------------------------------------------------------
 _add("chart", adapter.chart, "sparse-picture", 32, [
-    {"method": "wiener", "model": "convolution", "prior": "nonnegative"},
-    {"method": "admm", "model": "convolution", "prior": "tv"},
-    {"method": "admm-sensor", "model": "convolution", "prior": "l1"},
-    {"method": "fista", "model": "convolution", "prior": "tv-haar"},
-    {"method": "volume", "model": "convolution", "prior": "l1", "background": True},
+    {"solver": "wiener", "model": "convolution", "prior": "nonnegative"},
+    {"solver": "admm", "model": "convolution", "prior": "tv"},
+    {"solver": "admm-sensor", "model": "convolution", "prior": "l1"},
+    {"solver": "fista", "model": "convolution", "prior": "tv-haar"},
+    {"solver": "admm", "model": "convolution", "prior": "l1", "background": True},
 ], [3, 10, 20], within=CHAOTIC)  # fmt: skip
 _add("stability-map", adapter.stability_map, "light-dense", ["wiener"], within=CHAOTIC)

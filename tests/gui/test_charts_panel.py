@@ -226,4 +226,4 @@ def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel,
         read_chart(path)
     path.write_text("no JSON")
     panel.open(path)
-    qtbot.waitUntil(lambda: "cannot be read as JSON" in panel._note.toolTip(), timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: "is no valid JSON" in panel._note.toolTip(), timeout=WAIT_MS)

@@ -443,5 +443,6 @@ def test_a_registered_loss_can_be_chosen(qtbot: QtBot, make_session, monkeypatch
     LOSSES.register(Own())
     panel = HologramsPanel(make_session())
     qtbot.addWidget(panel, before_close_func=lambda p: p.shutdown())
-    assert panel.loss.findText("own") >= 0
-    assert panel.loss.currentText() == "frequency"
+    loss = panel.form.widgets["loss"]
+    assert loss.itemData(loss.findText("own"), Qt.ItemDataRole.ToolTipRole) == Own.help
+    assert loss.currentText() == "frequency"

@@ -104,12 +104,13 @@ def test_brightness_that_was_pulled_before_stop_is_not_sent_after_it(
 def test_an_expansion_that_is_no_square_is_refused_at_its_field(qtbot: QtBot, window: MainWindow) -> None:
     panel = window.show_panel("holograms")
     assert isinstance(panel, HologramsPanel)
-    panel.expansion.setFocus()
-    qtbot.keyClicks(panel.expansion, "7")
-    qtbot.keyClick(panel.expansion, Qt.Key.Key_Tab)
-    panel.expansion.check()
-    assert panel.expansion.property("refused")
-    assert "must be a square" in panel.expansion.toolTip()
+    expansion = panel.form.widgets["expansion"]
+    expansion.setFocus()
+    qtbot.keyClicks(expansion, "7")
+    qtbot.keyClick(expansion, Qt.Key.Key_Tab)
+    expansion.submit()
+    assert expansion.property("refused")
+    assert "must be a square" in expansion.toolTip()
 
 
 def test_a_calibration_that_cannot_be_loaded_leaves_words_for_what_to_do(

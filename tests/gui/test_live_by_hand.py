@@ -85,8 +85,8 @@ def test_a_recording_is_ended_by_its_key_whatever_number_is_wrong(qtbot: QtBot, 
 
 
 def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: QtBot, live: LivePanel) -> None:
-    _type_only(qtbot, live.form.exposure, "7.5")
-    qtbot.keyClick(live.form.exposure, Qt.Key.Key_K, CTRL)
+    _type_only(qtbot, live.form.widgets["exposure_ms"], "7.5")
+    qtbot.keyClick(live.form.widgets["exposure_ms"], Qt.Key.Key_K, CTRL)
     qtbot.waitUntil(lambda: live.photograph is not None, timeout=WAIT_MS)
     assert live.session.bench.newest_frame is not None
     assert live.session.bench.newest_frame.metadata.exposure_ms == 7.5

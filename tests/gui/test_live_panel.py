@@ -49,28 +49,27 @@ def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> N
 
 
 def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
-    _type(qtbot, live.form.exposure, "3.21 ms")
+    _type(qtbot, live.form.widgets["exposure_ms"], "3.21 ms")
     qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 3.21, timeout=WAIT_MS)
-    qtbot.waitUntil(lambda: live.form.exposure.text() == "3.21 ms", timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: live.form.widgets["exposure_ms"].text() == "3.21 ms", timeout=WAIT_MS)
     assert live.session.live.is_running
 
 
 def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel) -> None:
     before = live.session.bench.camera.exposure_ms
-    _type(qtbot, live.form.exposure, "1e9")
-    assert live.form.exposure.property("refused")
-    assert "outside" in live.form.exposure.toolTip()
+    _type(qtbot, live.form.widgets["exposure_ms"], "1e9")
+    assert live.form.widgets["exposure_ms"].property("refused")
+    assert "outside" in live.form.widgets["exposure_ms"].toolTip()
     assert "outside" in live._note.text()
-    assert live.form.exposure.text() == "1e9"
+    assert live.form.widgets["exposure_ms"].text() == "1e9"
     assert live.session.bench.camera.exposure_ms == before
-    _type(qtbot, live.form.exposure, "2.5")
+    _type(qtbot, live.form.widgets["exposure_ms"], "2.5")
     qtbot.waitUntil(lambda: live.session.bench.camera.exposure_ms == 2.5, timeout=WAIT_MS)
-    assert not live.form.exposure.property("refused")
+    assert not live.form.widgets["exposure_ms"].property("refused")
 
 
 def test_binning_pauses_the_stream_and_goes_on(qtbot: QtBot, live: LivePanel) -> None:
-    live.form.binning.setCurrentIndex(1)
-    live.form.binning.activated.emit(1)
+    live.form.widgets["binning"].setCurrentIndex(1)
     qtbot.waitUntil(
         lambda: live._shown is not None and live._shown.image.shape == (120, 160), timeout=WAIT_MS
     )
@@ -87,13 +86,13 @@ def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -
     qtbot.mouseClick(live.whole_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.height == 240, timeout=WAIT_MS)
     qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
-    _type(qtbot, live.form.region, "8, 16, 100, 200")
+    _type(qtbot, live.form.widgets["roi"], "8, 16, 100, 200")
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.as_tuple() == (8, 16, 100, 200), timeout=WAIT_MS)
     qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
-    _type(qtbot, live.form.region, "8, 16, many")
-    assert "four whole numbers" in live.form.region.toolTip()
-    _type(qtbot, live.form.region, "0, 0, 9999, 9999")
-    qtbot.waitUntil(lambda: "cannot read the region" in live.form.region.toolTip(), timeout=WAIT_MS)
+    _type(qtbot, live.form.widgets["roi"], "8, 16, many")
+    assert "four whole numbers" in live.form.widgets["roi"].toolTip()
+    _type(qtbot, live.form.widgets["roi"], "0, 0, 9999, 9999")
+    qtbot.waitUntil(lambda: "cannot read the region" in live.form.widgets["roi"].toolTip(), timeout=WAIT_MS)
     assert live.session.is_open("camera")
 
 

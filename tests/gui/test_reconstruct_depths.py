@@ -78,7 +78,7 @@ def test_the_depth_is_asked_for_at_its_field_and_one_is_chosen_by_keys(
     assert z_mm.text() == "38.938"
     z_mm.submit()
     assert not z_mm.property("refused")
-    assert form.request().z_um == pytest.approx(38938)
+    assert form.request().options.z_um == pytest.approx(38938)
 
 
 def test_with_one_depth_nothing_is_asked_and_a_calibration_that_was_named_stays(
@@ -90,7 +90,7 @@ def test_with_one_depth_nothing_is_asked_and_a_calibration_that_was_named_stays(
     panel.take(photograph)
     qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
     assert panel.form.text("calibration") == str(mine)
-    assert panel.form.request().z_um is None
+    assert panel.form.request().options.z_um is None
     panel.form.options.set_values(
         {"calibration": Path("/nowhere")}
     )  # no calibration: no depths, and no mistake of their own
@@ -113,7 +113,7 @@ def test_the_depths_are_those_of_the_calibration_that_was_chosen_in_the_dialogue
     dialogue.fileSelected.emit(str(one))
     dialogue.close()
     qtbot.waitUntil(lambda: "which one" not in z_mm.placeholderText(), timeout=WAIT_MS)
-    assert form.request().z_um is None
+    assert form.request().options.z_um is None
 
 
 def test_depths_of_a_calibration(tmp_path: Path) -> None:

@@ -234,7 +234,7 @@ def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
     more.setFocus()
     qtbot.keyClick(more, Qt.Key.Key_Space)
     assert widgets["allow_saturated"].isVisible()
-    assert not widgets["positive_background"].isVisible()  # of volumes
+    assert not widgets["volume"].isVisible()  # of volumes
     assert "bit depth" in widgets["allow_mixed_depth"].toolTip()
     choose(panel, mosaic=None, rotate_deg="90", precision="float64")
     put(panel, "tolerance", "1e-9")
@@ -242,10 +242,10 @@ def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
     put(panel, "checkpoint", tmp_path / "kept")
     put(panel, "out", tmp_path / "plain.tif")
     request = form.request()
-    assert request.allow_saturated
-    assert request.settings.mosaic is None
-    assert request.settings.tolerance == 1e-9
-    assert request.settings.precision == "float64"
+    assert request.inputs.allow_saturated
+    assert request.inputs.mosaic is None
+    assert request.options.tolerance == 1e-9
+    assert request.options.precision == "float64"
     run(qtbot, panel)
     assert list((tmp_path / "kept").iterdir())  # five iterations are not its end
     put(panel, "checkpoint", tmp_path / "kept-by-script")
@@ -266,12 +266,12 @@ def test_what_is_folded_away_reaches_the_work_and_the_copied_lines(
 def test_zero_is_a_tolerance_and_what_is_one_shot_has_none(panel: ReconstructionsPanel, files) -> None:
     fill(panel, PSF, files, "psf.tif")
     put(panel, "tolerance", "0")
-    assert panel.form.request().settings.tolerance == 0
+    assert panel.form.request().options.tolerance == 0
     choose(panel, solver="wiener")
     assert not panel.form.widgets["tolerance"].isEnabled()
     assert "one shot" in panel.form.widgets["tolerance"].toolTip()
-    settings = panel.form.request().settings
-    assert (settings.tolerance, settings.iterations) == (None, None)
+    asked = panel.form.request().options
+    assert (asked.tolerance, asked.iterations) == (None, None)
 
 
 def test_choices_of_a_volume_are_those_of_the_command_line(
@@ -285,16 +285,14 @@ def test_choices_of_a_volume_are_those_of_the_command_line(
     form.widgets["stop_at_noise"].click()
     request = form.request()
     assert isinstance(request, VolumeRequest)
-    assert request.settings.wishes == Wishes(binning=1, planes=(0, 1, 3))
-    assert request.positive_background
-    assert request.settings.stop_at_noise
+    assert request.options.choose == Wishes(binning=1, planes=(0, 1, 3))
+    assert request.options.positive_background
+    assert request.options.stop_at_noise
     names: dict = {}
     exec(form.as_python().split("job = ")[0], names)
     assert names["request"] == request
     put(panel, "checkpoint", tmp_path / "kept")
-    qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
-    assert panel.job is None
-    assert "--checkpoint" in panel._note.toolTip()
+    assert form.work().kept_in == tmp_path / "kept"  # everything is chosen with a checkpoint, too
     form.widgets["choose"].setText("size=3")
     qtbot.mouseClick(form.start, Qt.MouseButton.LeftButton)
     assert panel.job is None

@@ -40,7 +40,7 @@ def test_the_live_view_is_whole_on_a_small_screen(qtbot: QtBot, small: MainWindo
         small.stop_button,
         live.live_button,
         live.light_buttons.buttons()[-1],
-        live.form.exposure,
+        live.form.widgets["exposure_ms"],
         live.view,
         live.record_bar.button,
         live.record_bar.gauge,

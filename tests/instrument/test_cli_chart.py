@@ -74,7 +74,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
 
     def cut(problem, setting, limit_s):
         curve = whole(problem, setting, limit_s)
-        shorter = setting.method != "wiener"
+        shorter = setting.solver != "wiener"
         return recon_chart.Curve(curve.points[:1], False) if shorter else curve
 
     out = tmp_path / "chart"
@@ -429,3 +429,11 @@ def test_a_damaged_chart_is_refused_by_name(quick, tmp_path, content):
     assert "chart.json" in str(result.exception)
     assert not quick
     assert (tmp_path / "chart.json").read_text() == content
+
+
+def test_settings_of_older_charts_have_their_names_of_now():
+    from instrument.evaluation.chart_job import _renamed
+
+    assert _renamed("volume local tv background") == "admm local tv background"
+    assert _renamed("admm-gpu convolution l1") == "admm convolution l1 gpu"
+    assert _renamed("admm-sensor convolution tv") == "admm-sensor convolution tv"

@@ -99,7 +99,7 @@ def test_refuses_in_words(files, arguments, words, run):
 
 
 @pytest.mark.parametrize(
-    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--solver", "admm-sensor")]
+    "options", [("--rotate", "180"), ("--allow-saturated",), ("--mixed-depth",), ("--figure", "fig.png")]
 )
 def test_an_option_for_pictures_is_refused_not_ignored(files, run, options):
     folder, image, out = files
@@ -118,12 +118,20 @@ def test_noise_is_passed_on_and_reduced_by_binning(files, run):
     assert json.loads(out.with_suffix(".json").read_text())["provenance"]["noise_deviation"] == [4.0]
 
 
-@pytest.mark.parametrize("option", [("--scratch", ".")])
-def test_memory_is_a_matter_of_volumes(files, run, option):
+@pytest.mark.parametrize(
+    "option", [("--scratch", "."), ("--memory", "4"), ("--background",), ("--no-background",)]
+)
+def test_memory_and_background_are_asked_for_in_pictures_too(files, run, option):
     folder, image, out = files
-    code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, *option)
+    code, output = run("--psf", folder / "psf0.tif", "--image", image, "--out", out, "-n", "2", *option)
+    assert code == 0, output
+
+
+def test_a_solver_that_does_not_take_volumes_says_so(files, run):
+    folder, image, out = files
+    code, output = run("--volume", folder, "--image", image, "--out", out, "--solver", "admm-sensor")
     assert code == 2
-    assert f"do not apply: {option[0]} (for a volume)" in output
+    assert "The solver admm-sensor does not take this: it is for one depth." in output
 
 
 def test_a_picture_with_the_local_model(tmp_path, run):

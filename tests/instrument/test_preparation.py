@@ -14,6 +14,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
 from instrument.reconstruction.erasures import erasures_of, reduce_valid
 from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
     Crop,
     auto_binning,
@@ -168,7 +169,9 @@ def test_a_few_saturated_pixels_are_a_warning_and_a_single_bright_one_is_none() 
 def test_job_from_files_says_what_was_chosen(tmp_path: Path) -> None:
     write_image(tmp_path / "psf.tif", psf_pixels())
     write_image(tmp_path / "raw.tif", psf_pixels(offset=134))
-    job = job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", crop=Crop.parse("40x40"), binning=2)
+    job = job_from_files(
+        tmp_path / "psf.tif", tmp_path / "raw.tif", InputOptions(crop=Crop.parse("40x40"), binning=2)
+    )
     assert job.measurement.shape == (20, 20)
     assert job.calibration.psfs.shape == (1, 1, 20, 20)
     assert job.calibration.psfs.min() == 0
@@ -182,13 +185,13 @@ def test_a_psf_that_vanishes_with_the_dark_is_refused(tmp_path: Path) -> None:
     write_image(tmp_path / "psf.tif", psf_pixels())
     write_image(tmp_path / "raw.tif", psf_pixels())
     with pytest.raises(FileError, match="nothing of the PSF is left"):
-        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=60000.0)
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", InputOptions(dark=60000.0))
     write_image(tmp_path / "dark.tif", np.zeros((9, 9), np.uint16))
     with pytest.raises(FileError, match=r"dark frame is 9 x 9"):
-        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=tmp_path / "dark.tif")
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", InputOptions(dark=tmp_path / "dark.tif"))
     write_image(tmp_path / "dark.tif", np.zeros_like(psf_pixels(), np.uint8))
     with pytest.raises(FileError, match=r"the dark frame has 8 bit, but the image .* has 16 bit"):
-        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", dark=tmp_path / "dark.tif")
+        job_from_files(tmp_path / "psf.tif", tmp_path / "raw.tif", InputOptions(dark=tmp_path / "dark.tif"))
 
 
 def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
@@ -200,13 +203,13 @@ def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
     run, demo = tmp_path / "demo" / "run", tmp_path / "demo"
     assert find_calibration(demo) == find_calibration(run) == find_calibration(run / "calibration")
     write_image(tmp_path / "raw.tif", psf_pixels())
-    job = job_from_calibration(run, tmp_path / "raw.tif", binning=2)
+    job = job_from_calibration(run, tmp_path / "raw.tif", InputOptions(binning=2))
     assert job.measurement.shape == job.calibration.psfs.shape[-2:] == (15, 20)
     np.testing.assert_allclose(job.measurement, job.calibration.psfs[0, 0], atol=1e-3)
     assert job.calibration.geometry.pixel_pitch_um == 8.0
     write_image(tmp_path / "other.tif", psf_pixels(shape=(50, 80)))
     with pytest.raises(FileError, match="no whole binning"):
-        job_from_calibration(run, tmp_path / "other.tif")
+        job_from_calibration(run, tmp_path / "other.tif", InputOptions())
     save_calibration(calibration, tmp_path / "demo" / "second" / "calibration")
     with pytest.raises(FileError, match="holds 2 calibrations"):
         find_calibration(demo)
@@ -216,7 +219,7 @@ def test_an_image_is_binned_to_its_calibration(tmp_path: Path) -> None:
 def test_a_folder_without_a_calibration_is_refused(tmp_path: Path, name: str, pattern: str) -> None:
     write_image(tmp_path / "raw.tif", psf_pixels())
     with pytest.raises(FileError, match=pattern):
-        job_from_calibration(tmp_path / name, tmp_path / "raw.tif")
+        job_from_calibration(tmp_path / name, tmp_path / "raw.tif", InputOptions())
 
 
 def test_saturated_pixels_are_erased_when_asked_and_counted() -> None:

@@ -9,8 +9,10 @@ from scipy.signal import fftconvolve
 
 from instrument.cli import main
 from instrument.files.errors import BenchError
-from instrument.reconstruction.request import PictureRequest, Settings, VolumeRequest
+from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.errors import InputError
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.overrides import Wishes
 
 SIZE = 48
@@ -52,8 +54,8 @@ def decision(choice, name):
 
 
 def test_a_raw_frame_of_a_mosaic_is_reconstructed_unmerged(picture_files):
-    settings = Settings(mosaic="RGGB", iterations=5)
-    request = PictureRequest(**picture_files, settings=settings)
+    raw = InputOptions(mosaic="RGGB")
+    request = PictureRequest(**picture_files, inputs=raw, options=ReconstructionOptions(iterations=5))
     result = request.solve(request.prepare())
     assert result.image.shape == (SIZE, SIZE, 3)
     assert np.isfinite(result.image).all()
@@ -61,16 +63,15 @@ def test_a_raw_frame_of_a_mosaic_is_reconstructed_unmerged(picture_files):
     assert channels.value == "all 3"
     assert "only 0 of 2304 pixels tell all colours" in channels.why
     assert not request.explain(request.prepare()).merged
-    merged = PictureRequest(
-        **picture_files, settings=Settings(mosaic="RGGB", wishes=Wishes(channels="merged"))
-    )
+    wished = ReconstructionOptions(choose=Wishes(channels="merged"))
+    merged = PictureRequest(**picture_files, inputs=raw, options=wished)
     with pytest.raises(InputError, match="cannot be merged"):
         merged.solve(merged.prepare())
 
 
 def test_a_positive_background_needs_no_other_word(volume_files):
-    settings = Settings(iterations=2)
-    request = VolumeRequest(**volume_files, positive_background=True, settings=settings)
+    options = ReconstructionOptions(iterations=2, positive_background=True)
+    request = VolumeRequest(**volume_files, options=options)
     job = request.prepare()
     solved = request.solve(job).choice
     explained = request.explain(job)
@@ -78,14 +79,14 @@ def test_a_positive_background_needs_no_other_word(volume_files):
     assert decision(explained, "background").value == decision(solved, "background").value == "estimated"
     assert decision(explained, "background").overruled
     with pytest.raises(BenchError, match="exclude each other"):
-        VolumeRequest(**volume_files, positive_background=True, estimate_background=False).prepare()
+        VolumeRequest(**volume_files, options=replace(options, estimate_background=False)).prepare()
 
 
 def test_the_tolerance_that_was_asked_for_is_explained_and_kept(picture_files, volume_files):
-    settings = Settings(iterations=2, tolerance=3e-2)
+    options = ReconstructionOptions(iterations=2, tolerance=3e-2)
     for request in (
-        PictureRequest(**picture_files, settings=settings),
-        VolumeRequest(**volume_files, settings=settings),
+        PictureRequest(**picture_files, options=options),
+        VolumeRequest(**volume_files, options=options),
     ):
         job = request.prepare()
         for choice in (request.explain(job), request.solve(job).choice):
@@ -95,31 +96,31 @@ def test_the_tolerance_that_was_asked_for_is_explained_and_kept(picture_files, v
 
 @pytest.mark.parametrize("model", ["auto", "convolution"])
 def test_the_precision_that_was_asked_for_is_computed_in(picture_files, volume_files, model):
-    for precision in ("float64", None):
-        settings = Settings(model=model, precision=precision, iterations=2)
+    for precision in ("float64", "auto"):
+        options = ReconstructionOptions(model=model, precision=precision, iterations=2)
         for request in (
-            PictureRequest(**picture_files, settings=settings),
-            VolumeRequest(**volume_files, settings=settings),
+            PictureRequest(**picture_files, options=options),
+            VolumeRequest(**volume_files, options=options),
         ):
             job = request.prepare()
             result = request.solve(job)
-            assert result.provenance["precision"] == (precision or "float32")
+            expected = "float32" if precision == "auto" else precision
+            assert result.provenance["precision"] == expected
             if model == "auto":
-                assert request.explain(job).precision == (precision or "float32")
-                assert decision(result.choice, "precision").overruled == (precision is not None)
+                assert request.explain(job).precision == expected
+                assert decision(result.choice, "precision").overruled == (precision != "auto")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--precision", "double"], "must be one of auto, float32, float64"),
+        (["--precision", "double"], "--precision must be one of auto, float32, float64"),
         (["--precision", "float64", "--choose", "precision=float32"], "the same twice"),
-        (["--precision", "float64", "--video"], "do not apply: --precision"),
+        (["--precision", "float64", "--video"], "do not apply: --precision (for a picture"),
     ],
 )
 def test_a_precision_that_is_not_understood_is_refused(picture_files, capsys, arguments, said):
-    image = [] if "--video" in arguments else ["--image", str(picture_files["image"])]
-    assert main(["reconstruct", "--psf", str(picture_files["psf"]), *image, *arguments]) == 2
+    assert main(["reconstruct", "--psf", str(picture_files["psf"]), *arguments]) == 2
     assert said in capsys.readouterr().err
 
 
@@ -134,14 +135,14 @@ def test_a_picture_of_one_convolution_says_the_field_and_the_end_that_it_has(pic
 
 
 def test_wishes_are_refused_where_a_model_was_asked_for(picture_files, volume_files):
-    asked = Settings(model="convolution", wishes=Wishes(binning=2))
+    asked = ReconstructionOptions(model="convolution", choose=Wishes(binning=2))
     for request in (
-        PictureRequest(**picture_files, settings=asked),
-        VolumeRequest(**volume_files, settings=asked),
+        PictureRequest(**picture_files, options=asked),
+        VolumeRequest(**volume_files, options=asked),
     ):
         with pytest.raises(BenchError, match=r"--choose .* with --model convolution"):
             request.prepare()
-        plain = replace(request, settings=Settings(model="convolution"))
+        plain = replace(request, options=ReconstructionOptions(model="convolution"))
         with pytest.raises(BenchError, match=r"--explain .* with --model convolution"):
             plain.explain(plain.prepare())
 
@@ -157,15 +158,17 @@ def test_a_checkpoint_leaves_everything_to_choose(picture_files, option, tmp_pat
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"settings": Settings(tau=-1.0)}, "tau must be"),
-        ({"settings": Settings(noise=-1.0)}, "noise must be"),
-        ({"settings": Settings(iterations=0)}, "iterations must be a whole number"),
-        ({"settings": Settings(tolerance=-1.0)}, "tolerance must be"),
-        ({"settings": Settings(prior="tb")}, "'tb' is not known"),
-        ({"z_um": -5e3}, "distance must be above 0 mm and finite, not -5 mm"),
+        ({"tau": -1.0}, "tau must be"),
+        ({"iterations": 0}, "iterations must be a whole number"),
+        ({"tolerance": -1.0}, "tolerance must be"),
+        ({"prior": "tb"}, "prior must be one of tv.*not 'tb'"),
+        ({"z_um": -5e3}, r"z_um must be a number, above 0 \(um\), not -5000"),
+        ({"inputs": InputOptions(noise=-1.0)}, "noise must be"),
     ],
 )
 def test_options_are_checked_before_any_file_is_read(tmp_path, changes, said):
     missing = {"image": tmp_path / "none.tif", "psf": tmp_path / "none too.tif"}
+    changes = dict(changes)
+    inputs = changes.pop("inputs", InputOptions())
     with pytest.raises((InputError, BenchError), match=said):
-        PictureRequest(**missing, **changes).prepare()
+        PictureRequest(**missing, inputs=inputs, options=ReconstructionOptions(**changes)).prepare()

@@ -39,52 +39,54 @@ def decode_image(data: bytes) -> np.ndarray:
     return _decompress(body, width, height, enhanced=kind == 2)
 
 
-def _decompress(body: bytes, width: int, height: int, *, enhanced: bool) -> np.ndarray:
-    out = bytearray()
-    at = 0
+class _Codes:
+    """The bytes of a compressed image, read one after the other."""
 
-    def byte() -> int:
-        nonlocal at
-        if at >= len(body):
+    def __init__(self, body: bytes, *, enhanced: bool) -> None:
+        self.body, self.enhanced, self.at = body, enhanced, 0
+
+    def byte(self) -> int:
+        if self.at >= len(self.body):
             raise BadImageError("ends within a code")
-        at += 1
-        return body[at - 1]
+        self.at += 1
+        return self.body[self.at - 1]
 
-    def length(first: int) -> int:
-        return first if not enhanced or first < 128 else (first & 0x7F) | byte() << 7
+    def length(self, first: int) -> int:
+        return first if not self.enhanced or first < 128 else (first & 0x7F) | self.byte() << 7
 
-    def pixels(n: int) -> bytes:
-        nonlocal at
-        at += 3 * n
-        if at > len(body):
+    def pixels(self, n: int) -> bytes:
+        self.at += 3 * n
+        if self.at > len(self.body):
             raise BadImageError("ends within pixels")
-        return body[at - 3 * n : at]
+        return self.body[self.at - 3 * n : self.at]
 
+
+def _decompress(body: bytes, width: int, height: int, *, enhanced: bool) -> np.ndarray:
+    out, codes = bytearray(), _Codes(body, enhanced=enhanced)
     while True:
         if len(out) > 3 * width * height:
             raise BadImageError("too many pixels")
-        control = byte()
-        if control:
-            n = length(control)
-            out += pixels(1) * n
+        if control := codes.byte():
+            n = codes.length(control)
+            out += codes.pixels(1) * n
             continue
-        control = byte()
+        control = codes.byte()
         if control == 0:  # end of line
             if len(out) % (3 * width):
                 raise BadImageError("a line ends early or late")
             if not enhanced:
-                at += -at % 4
+                codes.at += -codes.at % 4
         elif control == 1:
-            n = byte() if enhanced else 0
+            n = codes.byte() if enhanced else 0
             if n == 0:
                 break
-            n = length(n)
+            n = codes.length(n)
             above = len(out) - 3 * width
             if above < 0:
                 raise BadImageError("no line above")
             out += out[above : above + 3 * n]
         else:
-            out += pixels(length(control))
+            out += codes.pixels(codes.length(control))
     if len(out) != 3 * width * height:
         raise BadImageError(f"{len(out) // 3} pixels of {width * height}")
     return np.frombuffer(bytes(out), np.uint8).reshape(height, width, 3)

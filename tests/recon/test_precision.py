@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from recon.reconstruction import solvers as offered
 from recon.reconstruction.overrides import Wishes
 from recon.reconstruction.part import Part
 from recon.reconstruction.solvers import SOLVERS
+from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.volume_admm import VolumeAdmm
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +75,7 @@ def test_a_picture_with_varying_psfs_is_solved_in_float64():
 
 
 @pytest.mark.parametrize("kind", ["tv", "l1"])
-def test_the_plain_solvers_of_a_device_follow_the_precision(scene, kind):
+def test_the_solvers_of_a_device_follow_the_precision(scene, kind, monkeypatch):
     """On a GPU the same lines run on CuPy's arrays."""
     problem = recon.Problem.of(
         recon.Measurement(scene.measurement, scene.noise, erasures=scene.erasures),
@@ -84,7 +87,13 @@ def test_the_plain_solvers_of_a_device_follow_the_precision(scene, kind):
     )  # fmt: skip
     part = Part(problem, slice(0, 1))
     part.weight = 1.0
-    solver = offered._on_device(part, part.camera, None)
-    assert solver.camera.dtype == np.float64
+    twin = types.ModuleType("twin")
+    twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
+    part.namespace = twin
+    for module in ("volume_admm", "douglas_rachford"):
+        monkeypatch.setattr(f"recon.solvers.{module}.require_memory", lambda *_: None)
+    solver = offered._admm(part, None)
+    assert type(solver) in (VolumeAdmm, DouglasRachford)
     solver.step()
+    assert solver.data.dtype == np.float64
     assert solver.solution.dtype == np.float64

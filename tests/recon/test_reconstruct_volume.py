@@ -8,8 +8,7 @@ import pytest
 
 from recon import Calibration, Geometry, InputError, NoiseModel, reconstruct
 from recon.camera.camera_model import choose_model, members_of_depths, sort_by_depth
-from recon.reconstruction import solvers as offered
-from recon.solvers import StopReason, memory
+from recon.solvers import StopReason, memory, tv_admm_volume
 
 SIZE, DEPTHS, SPAN = 40, 8, 0.4
 PITCH_UM, DISTANCE_MM = 10.0, 5.0
@@ -325,15 +324,15 @@ def test_settings_without_a_meaning_are_refused(wrong):
 @pytest.mark.parametrize("prior", ["tv", "l1"])
 def test_being_called_back_costs_no_volume_more_at_the_end(monkeypatch, prior):
     solvers = []
-    made = offered._exact
+    made = tv_admm_volume.volume_solver
 
-    def noted(*args):
-        solvers.append(made(*args))
+    def noted(*args, **options):
+        solvers.append(made(*args, **options))
         return solvers[-1]
 
-    monkeypatch.setattr(offered, "_exact", noted)
+    monkeypatch.setattr(tv_admm_volume, "volume_solver", noted)
     reconstruct(measurement(), calibration(), prior=prior, iterations=1, on_progress=lambda *_: None)
-    assert not solvers[-1].keep_state
+    assert not solvers[-1].room.keep_state
 
 
 def test_depths_of_a_stage_that_repeats_imperfectly_are_one():

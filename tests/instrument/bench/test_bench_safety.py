@@ -175,12 +175,13 @@ def test_a_photograph_ends_at_once_when_the_led_array_is_lost() -> None:
     assert isinstance(leds, MockDevice)
     taken: list[int] = []
 
-    def lose(count: int) -> None:
+    def lose(count: int, of: int) -> None:
+        assert of == 80
         taken.append(count)
         leds._open = count < 2
 
     with pytest.raises(DeviceLostError, match=r"led_array \(mock\): was lost") as caught, bench:
-        bench.snap(average=80, on_frame=lose)
+        bench.snap(average=80, on_progress=lose)
     assert taken == [1, 2]
     assert "The light may be on" in "".join(caught.value.__notes__)
 

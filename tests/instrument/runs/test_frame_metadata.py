@@ -20,10 +20,10 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
-from instrument.plan import Part, Plan
+from instrument.plan import OFF, Light, Part, Plan, PlanError, SourceGrid
 from instrument.runs.acquire import acquire
 from instrument.runs.recorder import record
-from instrument.runs.run import LOG, Run
+from instrument.runs.run import LOG, PLAN, PROVENANCE, STATE, Run
 from instrument.runs.snapshot import LightState, read_snapshot, write_snapshot
 
 BENCH = """
@@ -150,3 +150,43 @@ def test_an_image_from_elsewhere_is_no_photograph_of_ours(tmp_path: Path) -> Non
     write_image(tmp_path / "a.png", np.zeros((2, 3), np.uint8))
     with pytest.raises(FileError, match="tells not how it was photographed"):
         read_snapshot(tmp_path / "a.png")
+
+
+def test_a_run_of_a_newer_version_opens(
+    tmp_path: Path, bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Fields that it added anywhere in the folder are left out, and those of the plan are told."""
+    positions = SourceGrid(z_um=(bench.source_position_um[2],))
+    part = Part(label="dark", repeats=2, positions=positions, light=(Light(kind="single"), OFF))
+    assert bench.stage is not None
+    bench.stage.home()
+    run = acquire(bench, Plan(label="few", parts=(part,)), tmp_path)
+
+    def add(name: str, *way: int | str) -> None:
+        record = json.loads((run.path / name).read_text())
+        inner = record
+        for step in way:
+            inner = inner[step]
+        inner["novelty"] = {"a": [1]}
+        (run.path / name).write_text(json.dumps(record))
+
+    for name in (STATE, PROVENANCE, PLAN):
+        add(name)
+    for way in (("parts", 0), ("parts", 0, "positions"), ("parts", 0, "light", 0)):
+        add(PLAN, *way)
+    lines = [json.loads(line) for line in (run.path / LOG).read_text().splitlines()]
+    lines = [*({**line, "novelty": 1} for line in lines), {"kind": "novelty", "utc": "now"}]
+    (run.path / LOG).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    caplog.clear()
+    again = Run.open(run.path)
+    assert again.plan == run.plan
+    assert again.provenance["novelty"] == {"a": [1]}
+    assert [again.metadata(i) for i in again.records] == [run.metadata(i) for i in run.records]
+    assert len(again.records) == 4
+    for place in ("'novelty'", "'parts.0.novelty'", "parts.0.positions", "parts.0.light.0.novelty"):
+        assert place in caplog.text
+    plan = json.loads((run.path / PLAN).read_text())
+    plan["parts"][0]["average"] = "many"
+    (run.path / PLAN).write_text(json.dumps(plan))
+    with pytest.raises(PlanError, match=r"plan\.json: 1 problem"):
+        _ = Run.open(run.path).plan

@@ -22,7 +22,7 @@ from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.plan import Part, Plan
 from instrument.reconstruction import video_block as block_module
-from instrument.reconstruction.request import Settings
+from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
@@ -39,6 +39,7 @@ from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
 from recon.errors import InputError
+from recon.reconstruction.options import ReconstructionOptions
 from tests.mocks.recordings import write_recording
 
 SHAPE = (40, 52)
@@ -72,12 +73,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def request(recording: Path, folder: Path, **changes: object) -> VideoRequest:
-    settings = Settings(dark=20.0, binning=1, iterations=25)
     given = VideoRequest(
         run=recording,
         out=folder / "v.ome.zarr",
         psf=recording.parent / "psf.npy",
-        settings=settings,
+        inputs=InputOptions(dark=20.0, binning=1),
+        options=ReconstructionOptions(iterations=25),
         block=4,
         warm_iterations=5,
     )
@@ -266,7 +267,7 @@ def test_another_noise_or_a_changed_calibration_file_is_another_video(
     np.save(psf, lens)
     wanted = request(recording, tmp_path, psf=psf)
     prepare_video(wanted)
-    noisier = replace(wanted, settings=replace(wanted.settings, noise=9.0))
+    noisier = replace(wanted, inputs=replace(wanted.inputs, noise=9.0))
     with pytest.raises(FileError, match="noise_deviation"):
         prepare_video(noisier)
     assert prepare_video(noisier, force=True).job.plan.settings["noise_deviation"] == [9.0]
@@ -302,7 +303,7 @@ def test_blocks_solved_together_hold_no_other_solver(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(block_module, "VideoSolver", None)
-    wanted = request(recording, tmp_path, over_time="tv", settings=Settings(dark=20.0, iterations=2))
+    wanted = request(recording, tmp_path, over_time="tv", options=ReconstructionOptions(iterations=2))
     assert solved(wanted)
 
 
@@ -447,8 +448,8 @@ def test_with_a_prior_over_time(recording: Path, video: Path, tmp_path: Path, ov
 
 
 def test_turned_cropped_binned(recording: Path, tmp_path: Path) -> None:
-    settings = Settings(dark=20.0, binning=2, iterations=3)
-    solved(request(recording, tmp_path, rotate_deg=90, film=False, settings=settings, warm_iterations=1))
+    how = {"inputs": InputOptions(dark=20.0, binning=2), "options": ReconstructionOptions(iterations=3)}
+    solved(request(recording, tmp_path, rotate_deg=90, film=False, warm_iterations=1, **how))
     assert pictures(tmp_path).shape == (11, 26, 20)
     assert not (tmp_path / "v.mp4").exists()
 
@@ -456,9 +457,8 @@ def test_turned_cropped_binned(recording: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"settings": Settings(tolerance=1e-3)}, "--warm"),
-        ({"settings": Settings(prior="tb")}, "'tb' is not known"),
-        ({"settings": Settings(model="local")}, "several places of the field"),
+        ({"options": ReconstructionOptions(tolerance=1e-3)}, "--warm"),
+        ({"options": ReconstructionOptions(model="local")}, "several places of the field"),
         ({"out": Path("v.tif")}, "OME-Zarr"),
         ({"out": Path("/nowhere/v.ome.zarr")}, "does not exist"),
         ({"run": Path("/nowhere")}, "no such folder"),

@@ -14,13 +14,12 @@ from recon.camera.local_convolution import FieldOfPsfs, local_convolution
 from recon.camera.low_rank import low_rank
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.gpu_camera import DepthCamera
-from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-from recon.solvers.gpu_total_variation import PlainTotalVariation
+from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.operator_admm import OperatorAdmm
+from recon.solvers.splitting import SensorData
 from recon.solvers.stopping import IterationRecord
 from recon.solvers.tv_admm_volume import LeanTotalVariation
+from recon.solvers.volume_admm import VolumeAdmm
 from tests.recon.solvers.literal_admm import LiteralAdmm
 from tests.recon.solvers.literal_volume import LiteralAdmm as LiteralVolume
 
@@ -47,13 +46,6 @@ def central():
     return Convolution3D(FIELD[0].psfs[:1], SENSOR, dtype=np.float64)
 
 
-def plain():
-    camera = volume_camera()
-    return DepthCamera(
-        np, camera.channel_spectrum(0), camera.grid_shape, camera.sensor_window, VALID[0], None
-    )
-
-
 def varying(kind):
     model = local_convolution if kind == "local" else low_rank
     options = {} if kind == "local" else {"error": 0.1}
@@ -61,6 +53,8 @@ def varying(kind):
 
 
 SPARSE = L1(0.02) + NonNegativity()
+VOLUME_TV = TotalVariation.of_volume(0.02) + NonNegativity()
+LATERAL = TotalVariation(0.02, axis_weights=(0, 1, 1), wrap=(False,) * 3) + NonNegativity()
 
 SOLVERS = {
     "FISTA": (picture_camera, lambda A, b, x: Fista(A, b, TV, initial=x)),
@@ -70,11 +64,11 @@ SOLVERS = {
     "literal ADMM": (picture_camera, lambda A, b, x: LiteralAdmm(A, b, TV, (0.3, 3.0, 3.0), initial=x)),
     "lean TV": (
         volume_camera,
-        lambda A, b, x: LeanTotalVariation(A, b, 0.02, valid=VALID[0], initial=x),
+        lambda A, b, x: LeanTotalVariation(A, SensorData(b, VALID[0]), VOLUME_TV, initial=x),
     ),
     "Douglas-Rachford": (
         volume_camera,
-        lambda A, b, x: DouglasRachford(A, b, 0.02, valid=VALID[0], initial=x),
+        lambda A, b, x: SparseDouglasRachford(A, SensorData(b, VALID[0]), SPARSE, initial=x),
     ),
     "literal volume": (
         volume_camera,
@@ -82,19 +76,19 @@ SOLVERS = {
     ),
     "lean TV by namespace": (
         volume_camera,
-        lambda A, b, x: PlainTotalVariation(plain(), b[0], 0.02, initial=x),
+        lambda A, b, x: VolumeAdmm(A, SensorData(b, VALID[0]), VOLUME_TV, initial=x),
     ),
     "Douglas-Rachford by namespace": (
         volume_camera,
-        lambda A, b, x: PlainDouglasRachford(plain(), b[0], 0.02, initial=None if x is None else x[0]),
+        lambda A, b, x: DouglasRachford(A, SensorData(b, VALID[0]), SPARSE, initial=x),
     ),
     "local model": (
         lambda: varying("local"),
-        lambda A, b, x: OperatorAdmm(A, central(), b, 0.02, axis_weights=(0.0, 1.0, 1.0), initial=x),
+        lambda A, b, x: OperatorAdmm(A, central(), b, LATERAL, initial=x),
     ),
     "low-rank model": (
         lambda: varying("low rank"),
-        lambda A, b, x: OperatorAdmm(A, central(), b, 0.02, initial=x),
+        lambda A, b, x: OperatorAdmm(A, central(), b, SPARSE, initial=x),
     ),
 }  # fmt: skip
 PROXIMAL_GRADIENT = ("FISTA", "ISTA")

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from recon.base.registry import Registry
 from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution3d import Convolution3D
 from recon.camera.erasures import Erasures
+from recon.camera.local_convolution import FieldOfPsfs, local_convolution
 from recon.errors import InputError, StructureError
-from recon.priors import PRIORS, HaarTotalVariation, NamedPrior, NonNegativity, Prior, TotalVariation, Zero
+from recon.priors import (
+    L1,
+    PRIORS,
+    Box,
+    HaarTotalVariation,
+    NamedPrior,
+    NonNegativity,
+    Prior,
+    TotalVariation,
+    Zero,
+)
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules
+from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
+from recon.solvers.operator_admm import OperatorAdmm
+from recon.solvers.splitting import SensorData
+from recon.solvers.tv_admm_volume import LeanTotalVariation, volume_solver
+from recon.solvers.volume_admm import VolumeAdmm
 
 
 class Ridge(Prior):
@@ -158,3 +177,86 @@ def test_names_are_objects_in_one_registry():
     registry.register(own)
     assert registry.names()[-1] == "ridge"
     assert registry["ridge"](0.5).weight == 0.5
+
+
+def volume_problem():
+    rng = np.random.default_rng(1)
+    camera = Convolution3D(rng.random((3, 1, 5, 6)), (9, 8), dtype=np.float64)
+    x = np.maximum(rng.standard_normal(camera.domain_shape), 0)
+    data = camera.forward(x) + 0.1 * rng.standard_normal(camera.range_shape)
+    valid = rng.random((9, 8)) > 0.1
+    return camera, Erasures(valid, data.shape, np.float64) @ camera, SensorData(data, valid)
+
+
+def varying_problem():
+    rng = np.random.default_rng(2)
+    points = np.array([(y, x) for y in (-4.0, 4.0) for x in (-4.0, 4.0)])
+    fields = [FieldOfPsfs(rng.random((4, 1, 5, 6)), points) for _ in range(2)]
+    central = Convolution3D(np.stack([f.psfs[0] for f in fields]), (9, 8), dtype=np.float64)
+    camera = local_convolution(fields, (9, 8), grid_shape=central.grid_shape, dtype=np.float64)
+    data = camera.forward(np.maximum(rng.standard_normal(camera.domain_shape), 0))
+    valid = rng.random((9, 8)) > 0.1
+    operator = Erasures(valid, data.shape, np.float64) @ camera
+    return lambda data, prior: OperatorAdmm(camera, central, data, prior), operator, SensorData(data, valid)
+
+
+SUMS = {
+    "a prox of its own": PositiveRidge(0.5),
+    "with the bound beside it": Ridge(0.5) + NonNegativity(),
+    "with total variation": Ridge(0.5) + NonNegativity() + TotalVariation.of_volume(0.3),
+}
+
+
+@pytest.mark.parametrize("prior", SUMS.values(), ids=SUMS)
+@pytest.mark.parametrize("camera", ["convolutions", "varying"])
+def test_volume_solvers_reach_the_minimiser(camera, prior):
+    if camera == "convolutions":
+        convolutions, operator, measured = volume_problem()
+        make = partial(volume_solver, convolutions)
+    else:
+        make, operator, measured = varying_problem()
+    found = make(measured, prior).run(StoppingRules(iterations=800, tolerance=1e-7)).solution
+    assert found.min() >= -1e-9
+
+    def value(x):
+        misfit = operator.forward(x) - operator.outer.forward(measured.image)
+        return 0.5 * float(np.sum(misfit**2)) + prior.value(np.maximum(x, 0))
+
+    # No small move lowers it, in any of many directions that stay within the bounds.
+    best, rng = value(found), np.random.default_rng(0)
+    for scale in (1e-3, 1e-2):
+        for _ in range(60):
+            step = rng.standard_normal(found.shape) * (rng.random(found.shape) < rng.random())
+            assert value(np.maximum(found + scale * step, 0)) >= best * (1 - 1e-6)
+    assert value(np.maximum(found * 0.99, 0)) >= best * (1 - 1e-6)
+    assert value(np.maximum(found * 1.01, 0)) >= best * (1 - 1e-6)
+
+
+@pytest.mark.parametrize("prior", SUMS.values(), ids=SUMS)
+def test_a_volume_goes_on_from_a_checkpoint(prior):
+    camera, _, measured = volume_problem()
+    rules = StoppingRules(iterations=14, tolerance=0)
+    whole = volume_solver(camera, measured, prior).run(rules).solution
+    first, second = (volume_solver(camera, measured, prior) for _ in range(2))
+    first.run(StoppingRules(iterations=6, tolerance=0))
+    second.restore(first.checkpoint())
+    np.testing.assert_allclose(second.run(rules).solution, whole, atol=1e-12)
+
+
+def test_each_prior_has_its_solver():
+    camera, _, measured = volume_problem()
+    tv, sparse = TotalVariation.of_volume(1.0), L1(1.0)
+    expected = (
+        (tv + NonNegativity(), LeanTotalVariation),
+        (tv, VolumeAdmm),
+        (tv + Box(0, 2), VolumeAdmm),
+        (sparse + NonNegativity(), SparseDouglasRachford),
+        (sparse, SparseDouglasRachford),
+        (sparse + Box(0, 2), DouglasRachford),
+        (PositiveRidge(1.0), DouglasRachford),
+        (Ridge(1.0) + NonNegativity(), VolumeAdmm),
+    )
+    for prior, kind in expected:
+        assert type(volume_solver(camera, measured, prior)) is kind
+    with pytest.raises(StructureError, match="HaarTotalVariation"):
+        volume_solver(camera, measured, HaarTotalVariation(1.0))

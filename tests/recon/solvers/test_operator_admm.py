@@ -13,6 +13,7 @@ from recon.camera.local_convolution import FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
 from recon.solvers.operator_admm import OperatorAdmm
+from recon.solvers.splitting import SensorData
 
 POINTS = np.array([(y, x) for y in (-6, 0, 6) for x in (-6, 0, 6)], float)
 SENSOR = (14, 13)
@@ -74,10 +75,7 @@ def test_reaches_the_minimiser_that_fista_reaches(kind, harder):
             )
             + NonNegativity()
         )
-    solver = OperatorAdmm(
-        camera, central, data, weight, axis_weights=weights, isotropic=kind == "tv-isotropic", valid=valid,
-        background=removal,
-    )  # fmt: skip
+    solver = OperatorAdmm(camera, central, SensorData(data, valid, removal), prior)
     outcome = solver.run(StoppingRules(iterations=250, tolerance=1e-6))
     best = Fista(operator, reduced, prior).run(StoppingRules(iterations=700, tolerance=1e-7)).solution
 
@@ -91,9 +89,8 @@ def test_reaches_the_minimiser_that_fista_reaches(kind, harder):
 
 def solver(data=None, **options):
     camera, central, clean = problem()
-    return OperatorAdmm(
-        camera, central, clean if data is None else data, 0.5, axis_weights=(0.5, 1.0, 1.0), **options
-    )
+    prior = TotalVariation(0.5, axis_weights=(0.5, 1.0, 1.0), wrap=(False,) * 3) + NonNegativity()
+    return OperatorAdmm(camera, central, clean if data is None else data, prior, **options)
 
 
 def test_goes_on_from_a_checkpoint():
@@ -137,6 +134,6 @@ def test_needs_a_tenth_of_the_iterations_of_fista():
     def value(x):
         return 0.5 * float(np.sum((camera.forward(x) - data) ** 2)) + prior.value(x)
 
-    few = OperatorAdmm(camera, central, data, weight).run(StoppingRules(iterations=60, tolerance=0))
+    few = OperatorAdmm(camera, central, data, prior).run(StoppingRules(iterations=60, tolerance=0))
     many = Fista(camera, data, prior).run(StoppingRules(iterations=600, tolerance=0))
     assert value(few.solution) <= value(many.solution) * 1.001

@@ -1,4 +1,4 @@
-"""The solvers by array namespace, run on NumPy: against the compiled ones, iteration by iteration."""
+"""The solvers of any device, run on NumPy: against their compiled sweeps, iteration by iteration."""
 
 import sys
 import types
@@ -13,14 +13,21 @@ from recon.base.namespace import array_namespace, require_memory
 from recon.camera.background import BackgroundRemoval
 from recon.camera.convolution3d import Convolution3D
 from recon.errors import InputError
+from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import StoppingRules
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.gpu_camera import DepthCamera
-from recon.solvers.gpu_douglas_rachford import PlainDouglasRachford
-from recon.solvers.gpu_total_variation import PlainTotalVariation
+from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
+from recon.solvers.splitting import Room, SensorData
 from recon.solvers.tv_admm_volume import LeanTotalVariation
+from recon.solvers.volume_admm import VolumeAdmm
 
 SENSOR = (12, 11)
+
+
+@pytest.fixture(autouse=True)
+def any_memory(monkeypatch):
+    """The twin has no memory of its own to ask for."""
+    for module in ("volume_admm", "douglas_rachford"):
+        monkeypatch.setattr(f"recon.solvers.{module}.require_memory", lambda *_: None)
 
 
 @pytest.fixture(autouse=True)
@@ -44,9 +51,17 @@ def problem(dtype=np.float64, n_z=5):
     return operator, data
 
 
-def camera_of(operator, valid=None, background=None, xp=np):
-    window = operator.sensor_window
-    return DepthCamera(xp, operator.channel_spectrum(0), operator.grid_shape, window, valid, background)
+# Another module than numpy, with its functions: what a GPU's is to the code.
+TWIN = types.ModuleType("twin")
+TWIN.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
+
+
+def tv(weight, **options):
+    return TotalVariation.of_volume(weight, **options) + NonNegativity()
+
+
+def l1(weight):
+    return L1(weight) + NonNegativity()
 
 
 @pytest.fixture(params=[False, True], ids=["all pixels", "erased and background"])
@@ -57,27 +72,14 @@ def masks(request):
     return valid, BackgroundRemoval((1, *SENSOR), (3, 3), valid, dtype=np.float64)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_camera_is_its_adjoints_adjoint_and_the_compiled_one(dtype, masks):
-    valid, background = masks
-    operator, _ = problem(dtype)
-    camera = camera_of(operator, valid, background)
-    rng = np.random.default_rng(2)
-    x, y = rng.random(camera.domain_shape).astype(dtype), rng.random(camera.range_shape).astype(dtype)
-    tolerance = 1e-4 if dtype is np.float32 else 1e-11
-    assert camera.forward(x).dtype == dtype
-    assert np.vdot(camera.forward(x), y) == pytest.approx(np.vdot(x, camera.adjoint(y)), rel=tolerance)
-    if valid is None:
-        np.testing.assert_allclose(camera.forward(x), operator.forward(x[None])[0], rtol=10 * tolerance)
-
-
 @pytest.mark.parametrize("n_z", [1, 5])
 def test_l1_does_what_the_compiled_solver_does(n_z, masks):
     operator, data = problem(n_z=n_z)
     valid, background = masks
     weight = 0.02 * float(np.abs(operator.adjoint(data)).max())
-    plain = PlainDouglasRachford(camera_of(operator, valid, background), data[0], weight)
-    compiled = DouglasRachford(operator, data, weight, valid=valid, background=background)
+    measured = SensorData(data, valid, background)
+    plain = DouglasRachford(operator, measured, l1(weight))
+    compiled = SparseDouglasRachford(operator, measured, l1(weight))
     rules = StoppingRules(iterations=60, tolerance=0)
     one, other = plain.run(rules), compiled.run(rules)
     assert one.solution.max() > 0
@@ -94,8 +96,9 @@ def test_total_variation_does_what_the_compiled_solver_does(n_z, isotropic, mask
     weights = np.random.default_rng(3).uniform(0.5, 2, (n_z, 3))
     weight = 0.002 * float(np.abs(operator.adjoint(data)).max())
     options = {"axis_weights": weights, "isotropic": isotropic}
-    plain = PlainTotalVariation(camera_of(operator, valid, background), data[0], weight, **options)
-    compiled = LeanTotalVariation(operator, data, weight, valid=valid, background=background, **options)
+    measured = SensorData(data, valid, background)
+    plain = VolumeAdmm(operator, measured, tv(weight, **options))
+    compiled = LeanTotalVariation(operator, measured, tv(weight, **options))
     rules = StoppingRules(iterations=60, tolerance=0)
     one, other = plain.run(rules), compiled.run(rules)
     np.testing.assert_allclose(one.solution, other.solution, atol=1e-3 * other.solution.max())
@@ -103,10 +106,10 @@ def test_total_variation_does_what_the_compiled_solver_does(n_z, isotropic, mask
         assert mine.objective == pytest.approx(theirs.objective, rel=1e-3)
 
 
-@pytest.mark.parametrize("solver", [PlainDouglasRachford, PlainTotalVariation])
-def test_goes_on_from_a_checkpoint_to_the_last_bit(solver):
+@pytest.mark.parametrize(("solver", "prior"), [(DouglasRachford, l1(1.0)), (VolumeAdmm, tv(1.0))])
+def test_goes_on_from_a_checkpoint_to_the_last_bit(solver, prior):
     operator, data = problem(np.float32)
-    whole, first, second = (solver(camera_of(operator), data[0], 1.0) for _ in range(3))
+    whole, first, second = (solver(operator, data, prior, room=Room(TWIN)) for _ in range(3))
     whole.run(StoppingRules(iterations=14, tolerance=0))
     first.run(StoppingRules(iterations=7, tolerance=0))
     second.restore(first.checkpoint())
@@ -117,13 +120,11 @@ def test_goes_on_from_a_checkpoint_to_the_last_bit(solver):
 def test_a_start_is_where_it_begins():
     operator, data = problem()
     rules = StoppingRules(iterations=300, tolerance=0)
-    converged = PlainTotalVariation(camera_of(operator), data[0], 1.0).run(rules).solution[0]
-    cold, warm = (
-        PlainTotalVariation(camera_of(operator), data[0], 1.0, initial=start) for start in (None, converged)
-    )
+    converged = VolumeAdmm(operator, data, tv(1.0)).run(rules).solution
+    cold, warm = (VolumeAdmm(operator, data, tv(1.0), initial=start) for start in (None, converged))
     for solver in (cold, warm):
         solver.run(StoppingRules(iterations=3, tolerance=0))
-    errors = [np.linalg.norm(s.solution[0] - converged) for s in (cold, warm)]
+    errors = [np.linalg.norm(s.solution - converged) for s in (cold, warm)]
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -150,11 +151,9 @@ def test_on_a_gpu_as_on_the_host():
     if cupy.cuda.runtime.getDeviceCount() == 0:
         pytest.skip("no GPU")
     operator, data = problem(np.float32)
-    for solver in (PlainDouglasRachford, PlainTotalVariation):
-        results = [
-            solver(camera_of(operator, xp=xp), data[0], 1.0).run(StoppingRules(iterations=40, tolerance=0))
-            for xp in (np, cupy)
-        ]
+    for solver, prior in ((DouglasRachford, l1(1.0)), (VolumeAdmm, tv(1.0))):
+        rules = StoppingRules(iterations=40, tolerance=0)
+        results = [solver(operator, data, prior, room=Room(xp)).run(rules) for xp in (np, cupy)]
         largest = results[0].solution.max()
         np.testing.assert_allclose(results[1].solution, results[0].solution, atol=1e-3 * largest)
 
@@ -165,8 +164,7 @@ def test_a_picture_on_the_device_is_that_of_the_host_or_says_what_to_install(mon
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):
             recon.reconstruct(shot.measurement, shot.psf, device="gpu")
-    monkeypatch.setattr("recon.solvers.gpu_total_variation.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: np)
+    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: TWIN)
     plain = recon.reconstruct(shot.measurement, shot.psf, device="gpu")
     assert plain.image.dtype == np.float32
     assert psnr(plain.image, shot.truth) > 26
@@ -195,12 +193,7 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
             recon.reconstruct(measurement, calibration, prior=prior, device="gpu")
     options = {"prior": prior, "iterations": 40, "tolerance": 0, "model": "convolution"}
     host = recon.reconstruct(measurement, calibration, drop_empty=False, **options)
-    # Another module than numpy, with its functions: what a GPU's is to the code.
-    twin = types.ModuleType("twin")
-    twin.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
-    monkeypatch.setattr("recon.solvers.gpu_total_variation.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.solvers.gpu_douglas_rachford.require_memory", lambda *_: None)
-    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: twin)
+    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda _device: TWIN)
     device = recon.reconstruct(measurement, calibration, device="gpu", **options)
     assert host.volume.max() > 0
     np.testing.assert_allclose(device.volume, host.volume, atol=2e-3 * host.volume.max())

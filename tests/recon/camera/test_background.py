@@ -6,8 +6,10 @@ from scipy.fft import dctn
 
 from recon.camera.background import BackgroundRemoval
 from recon.camera.convolution3d import Convolution3D
+from recon.priors import L1, NonNegativity
 from recon.solvers import StoppingRules
-from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.splitting import SensorData
 
 
 @pytest.mark.parametrize("erased", [0.0, 0.3])
@@ -49,9 +51,9 @@ def test_background_is_recovered():
     data = clean + background + 0.02 * rng.standard_normal(clean.shape)
     removal = BackgroundRemoval(data.shape, (5, 5), dtype=np.float64)
     weight = 0.02 * float(np.abs(camera.adjoint(removal.forward(data))).max())
-    rules = StoppingRules(iterations=300)
-    found = DouglasRachford(camera, data, weight, background=removal).run(rules).solution
-    blind = DouglasRachford(camera, data, weight).run(rules).solution
+    rules, prior = StoppingRules(iterations=300), L1(weight) + NonNegativity()
+    found = SparseDouglasRachford(camera, SensorData(data, None, removal), prior).run(rules).solution
+    blind = SparseDouglasRachford(camera, data, prior).run(rules).solution
 
     def error(x):
         return np.linalg.norm(x - truth) / np.linalg.norm(truth)

@@ -7,9 +7,10 @@ import pytest
 
 from recon.base import threads
 from recon.camera.convolution3d import Convolution3D
-from recon.priors import L1, NonNegativity
+from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
-from recon.solvers.douglas_rachford import DouglasRachford
+from recon.solvers.douglas_rachford import SparseDouglasRachford
+from recon.solvers.splitting import Room, SensorData, Tuning
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 from tests.recon.solvers.literal_volume import LiteralAdmm
 
@@ -81,6 +82,14 @@ def dense_minimiser(operator, data, weight, weights, isotropic, valid, iteration
     return u[-n:].reshape(shape)
 
 
+def tv(weight, **options):
+    return TotalVariation.of_volume(weight, **options) + NonNegativity()
+
+
+def l1(weight):
+    return L1(weight) + NonNegativity()
+
+
 @pytest.mark.parametrize("isotropic", [False, True], ids=["anisotropic", "isotropic"])
 @pytest.mark.parametrize("erased", [0.0, 0.4])
 def test_lean_tv_reaches_the_minimiser(isotropic, erased):
@@ -90,7 +99,7 @@ def test_lean_tv_reaches_the_minimiser(isotropic, erased):
     valid = np.random.default_rng(1).random(operator.sensor_shape) >= erased
     expected = dense_minimiser(operator, data, weight, weights, isotropic, valid)
     solver = LeanTotalVariation(
-        operator, data, weight, axis_weights=weights, isotropic=isotropic, valid=valid
+        operator, SensorData(data, valid), tv(weight, axis_weights=weights, isotropic=isotropic)
     )
     found = solver.run(LONG).solution
     values = [objective(operator, data, weight, weights, isotropic, x, valid) for x in (found, expected)]
@@ -104,7 +113,7 @@ def test_lean_tv_reaches_the_minimiser_of_the_literal_admm(n_z):
     operator, data = problem(n_z)
     weight = tau(operator, data, 0.005)
     weights = np.tile([0.0, 1.0, 1.0], (n_z, 1))
-    found = LeanTotalVariation(operator, data, weight, axis_weights=weights).run(LONG).solution
+    found = LeanTotalVariation(operator, data, tv(weight, axis_weights=weights)).run(LONG).solution
     mu = 10 * weight / found.max()
     literal = LiteralAdmm(operator, data, weight, axis_weights=(0, 1, 1), penalties=(0.03, mu, mu))
     expected = literal.run(StoppingRules(iterations=4000, tolerance=0)).solution
@@ -117,7 +126,7 @@ def test_douglas_rachford_reaches_the_same_minimiser(other):
     operator, data = problem()
     weight = tau(operator, data, 0.02)
     prior = L1(weight) + NonNegativity()
-    solver = DouglasRachford(operator, data, weight)
+    solver = SparseDouglasRachford(operator, data, l1(weight))
     found = solver.run(LONG).solution
     if other == "FISTA":
         reference = Fista(operator, data, prior).run(StoppingRules(iterations=20000, tolerance=1e-9))
@@ -135,9 +144,9 @@ def test_douglas_rachford_reaches_the_same_minimiser(other):
 def solvers(dtype=np.float64):
     operator, data = problem(dtype=dtype)
     weight = tau(operator, data, 0.01)
-    yield lambda **options: LeanTotalVariation(operator, data, weight, **options)
-    yield lambda **options: LeanTotalVariation(operator, data, weight, isotropic=True, **options)
-    yield lambda **options: DouglasRachford(operator, data, weight, **options)
+    yield lambda **options: LeanTotalVariation(operator, data, tv(weight), **options)
+    yield lambda **options: LeanTotalVariation(operator, data, tv(weight, isotropic=True), **options)
+    yield lambda **options: SparseDouglasRachford(operator, data, l1(weight), **options)
 
 
 KINDS = pytest.mark.parametrize("kind", [0, 1, 2], ids=["TV", "isotropic TV", "l1"])
@@ -193,9 +202,9 @@ def test_stops_on_nan_and_on_request(kind):
     bad = data.copy()
     bad[0, 3, 3] = np.nan
     kinds = (
-        lambda d: LeanTotalVariation(operator, d, 1.0),
-        lambda d: LeanTotalVariation(operator, d, 1.0, isotropic=True),
-        lambda d: DouglasRachford(operator, d, 1.0),
+        lambda d: LeanTotalVariation(operator, d, tv(1.0)),
+        lambda d: LeanTotalVariation(operator, d, tv(1.0, isotropic=True)),
+        lambda d: SparseDouglasRachford(operator, d, l1(1.0)),
     )
     lost = kinds[kind](bad).run(StoppingRules(iterations=20))
     assert lost.stop_reason is StopReason.NOT_FINITE
@@ -211,12 +220,14 @@ def test_stops_on_nan_and_on_request(kind):
 def test_result_without_kept_state_is_the_same(kind):
     make = list(solvers())[kind]
     rules = StoppingRules(iterations=6, tolerance=0)
-    np.testing.assert_array_equal(make(keep_state=False).run(rules).solution, make().run(rules).solution)
+    np.testing.assert_array_equal(
+        make(room=Room(keep_state=False)).run(rules).solution, make().run(rules).solution
+    )
 
 
 def test_total_variation_leaves_what_is_empty_at_zero():
     operator, data = problem()
-    solver = LeanTotalVariation(operator, data, tau(operator, data, 0.02))
+    solver = LeanTotalVariation(operator, data, tv(tau(operator, data, 0.02)))
     found = solver.run(StoppingRules(iterations=40, tolerance=0)).solution
     assert found.max() > 0.5
     # Not the x of the data term, which is nowhere exactly zero.
@@ -226,13 +237,13 @@ def test_total_variation_leaves_what_is_empty_at_zero():
 def test_total_variation_begins_at_its_start():
     operator, data = problem()
     start = np.random.default_rng(5).standard_normal(operator.domain_shape)
-    solver = LeanTotalVariation(operator, data, 1.0, initial=start)
+    solver = LeanTotalVariation(operator, data, tv(1.0), initial=start)
     np.testing.assert_array_equal(solver.solution, np.maximum(start, 0))
 
 
 def test_residual_is_that_of_the_solution():
     operator, data = problem()
-    solver = DouglasRachford(operator, data, tau(operator, data, 0.01))
+    solver = SparseDouglasRachford(operator, data, l1(tau(operator, data, 0.01)))
     outcome = solver.run(LONG)
     residual = np.linalg.norm(operator.forward(outcome.solution) - data)
     assert outcome.history[-1].data_residual == pytest.approx(residual, rel=1e-4)
@@ -253,8 +264,8 @@ def thin_scene(n_z=12):
 def test_empty_planes_are_left_out_with_a_certificate():
     operator, data, weight = thin_scene()
     rules = StoppingRules(iterations=3000, tolerance=1e-6)
-    solver = DouglasRachford(operator, data, weight)
-    whole = DouglasRachford(operator, data, weight, drop_empty=False)
+    solver = SparseDouglasRachford(operator, data, l1(weight))
+    whole = SparseDouglasRachford(operator, data, l1(weight), tuning=Tuning(drop_empty=False))
     found, expected = solver.run(rules), whole.run(rules)
     assert found.stop_reason is StopReason.CONVERGED
     assert len(solver.empty.planes) >= 8
@@ -270,11 +281,11 @@ def test_empty_planes_are_left_out_with_a_certificate():
 
 def test_a_plane_left_out_by_mistake_comes_back():
     operator, data, weight = thin_scene()
-    solver = DouglasRachford(operator, data, weight)
+    solver = SparseDouglasRachford(operator, data, l1(weight))
     solver.watch.active[[2, 3, 5]] = False
     solver._regroup()
     outcome = solver.run(StoppingRules(iterations=3000, tolerance=1e-6))
-    expected = DouglasRachford(operator, data, weight, drop_empty=False)
+    expected = SparseDouglasRachford(operator, data, l1(weight), tuning=Tuning(drop_empty=False))
     best = expected.run(StoppingRules(iterations=3000, tolerance=1e-6)).solution
     assert 3 not in solver.empty.planes
     np.testing.assert_allclose(outcome.solution, best, atol=1e-3 * best.max())
@@ -282,7 +293,7 @@ def test_a_plane_left_out_by_mistake_comes_back():
 
 def test_a_run_cut_short_says_that_nothing_is_certain():
     operator, data, weight = thin_scene()
-    solver = DouglasRachford(operator, data, weight)
+    solver = SparseDouglasRachford(operator, data, l1(weight))
     solver.watch.active[3] = False
     solver._regroup()
     solver.run(StoppingRules(iterations=1))
@@ -293,7 +304,7 @@ def test_a_run_cut_short_says_that_nothing_is_certain():
 
 def test_planes_left_out_are_part_of_the_checkpoint():
     operator, data, weight = thin_scene()
-    whole, first, second = (DouglasRachford(operator, data, weight) for _ in range(3))
+    whole, first, second = (SparseDouglasRachford(operator, data, l1(weight)) for _ in range(3))
     whole.run(StoppingRules(iterations=60, tolerance=0))
     first.run(StoppingRules(iterations=45, tolerance=0))
     assert not first.watch.active.all()

@@ -1,0 +1,302 @@
+"""ADMM with the exact data term for volumes, on any device and with any prior.
+
+Solves ``min_x 1/2 ||b - A x||^2 + tau ||Psi x||_1 + sum_i p_i(x)`` (Kuo 2020, Eq. 4.2, with non-negativity
+and whatever else has a prox for ``p_i``), as the dissertation's ADMM (Eq. 4.5, A.3) does, with three changes
+that leave the minimiser as it is:
+
+* The data term is not split. ``v = M x`` of Eq. 4.5 is a volume of which only one plane meets the data; the
+  others act as a brake. Here the update of x solves the cropped data term exactly, on the sensor plane
+  (:class:`~recon.solvers.sensor_system.SensorSystem`), so that mu_1 is gone.
+* Depth is not transformed. Per lateral spatial frequency ``T = Psi^T Psi + kappa`` is tridiagonal in z and is
+  solved as such: no wrap-around between first and last plane, two-dimensional transforms only, and weights
+  that may differ from plane to plane (voxels grow with depth).
+* Split variable and multiplier are kept as one state. With ``s = Psi x + eta / mu``, ``u = shrink(s)`` and
+  ``eta / mu = s - u``, an over-relaxed iteration is ``s <- s + alpha (Psi x - u)``.
+
+An iteration makes the right-hand side r from x, its transform R and the sum over planes of ``conj(g) R``,
+solves once on the sensor plane, and updates ``X <- T^-1 R + g E``, where ``g = T^-1 M^H``. Only the common
+penalty mu is adapted, by balancing the relative residuals (Wohlberg 2017): it scales ``g`` and ``q`` and
+costs nothing. kappa, the ratio of the other splits' penalties to TV's, is fixed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from recon.base import fft
+from recon.base.namespace import require_memory, to_host
+from recon.camera.base import Array
+from recon.camera.convolution3d import Convolution3D
+from recon.priors.base import Prior
+from recon.priors.simple import Separable
+from recon.priors.total_variation import TotalVariation
+from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
+from recon.solvers.sensor_system import residual_norm
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
+from recon.solvers.stopping import IterationRecord
+
+FIRST_PENALTY = 0.5
+"""First penalty relative to the mean of ``sum_z |H_z|^2``."""
+_VOLUMES = 16
+"""X, H, g, the tridiagonal factors, four states, and what an update of them passes through."""
+
+
+def split_volume_prior(prior: Prior) -> tuple[TotalVariation, Separable, tuple[Prior, ...]]:
+    """Take a prior of a volume apart: total variation without wrap-around in depth, bounds and l1, others.
+
+    Raises
+    ------
+    StructureError
+        When a prior's prox is not that of its value.
+    """
+    tv, separable, others = None, Separable(), []
+    for term in prior.terms():
+        if isinstance(term, Separable):
+            separable = separable.with_separable(term)
+        elif tv is None and isinstance(term, TotalVariation) and _is_lateral_periodic(term):
+            tv = term
+        else:
+            others.append(term)
+    require_exact(*others)
+    return tv or TotalVariation(0.0, axis_weights=(0.0, 0.0, 0.0)), separable, tuple(others)
+
+
+def _is_lateral_periodic(tv: TotalVariation) -> bool:
+    """Whether differences wrap around as this solver's do: in the plane only."""
+    axes = np.shape(tv.axis_weights)[-1]
+    wrap = (True,) * axes if tv.wrap is None else tv.wrap
+    return axes in (2, 3) and wrap == (False, True, True)[3 - axes :]
+
+
+class VolumeAdmm(VolumeSplitting):
+    """ADMM for one channel of a volume, or of a picture as a volume of one plane.
+
+    Parameters
+    ----------
+    operator : Convolution3D
+        One channel.
+    data : ndarray, (1, height, width), or SensorData
+    prior : Prior
+        Total variation (periodic in the plane, not in depth; ``axis_weights`` (3,) or (n_z, 3)), separable
+        priors, and any other with an exact prox; they see arrays (1, n_z, height, width).
+    initial : ndarray, (1, n_z, grid_height, grid_width), optional
+        Starting point; default zeros.
+    tuning, room
+        As :class:`~recon.solvers.splitting.VolumeSplitting`. The first penalty is by default
+        ``FIRST_PENALTY`` of the mean over frequencies of ``sum_z |H_z|^2``, the curvature of the data
+        term: independent of exposure, size and tau.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = (
+        "X", "S", "e", "penalty", "_used_penalty", "_misfit", "_tolerance",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        operator: Convolution3D,
+        data: Array | SensorData,
+        prior: Prior,
+        *,
+        initial: Array | None = None,
+        tuning: Tuning | None = None,
+        room: Room | None = None,
+    ) -> None:
+        super().__init__(operator, data, tuning, room, 1.8)
+        dtype, (_, nz, _, _) = operator.dtype, operator.domain_shape
+        tv, self.separable, self._others = split_volume_prior(prior)
+        self.weight, self.isotropic = tv.weight, tv.isotropic
+        weights = np.asarray(tv.axis_weights, dtype)
+        if weights.shape[-1] == 2:
+            weights = np.concatenate([np.zeros_like(weights[..., :1]), weights], axis=-1)
+        self.axis_weights = np.ascontiguousarray(np.broadcast_to(weights, (nz, 3)))
+        self.kappa = dtype.type(self.tuning.kappa)
+        start = (
+            None if initial is None else np.ascontiguousarray(initial, dtype).reshape(operator.domain_shape)
+        )
+        self.e = self.data.copy()
+        self._allocate(start)
+        if start is not None:
+            self.e -= self._forward(self.xp.asarray(start[0]))
+        first = self.tuning.first
+        self.penalty = FIRST_PENALTY * float(operator.power().mean()) if first is None else float(first)
+        self._used_penalty = self.penalty
+        self._misfit = 0.5 * squares(self.e)
+
+    # Steps that compiled code replaces ---------------------------------------------------------------
+    def _allocate(self, start: Array | None) -> None:
+        """Make the state and what it is updated with: X, S, g, q."""
+        xp, operator = self.xp, self.operator
+        domain = operator.domain_shape
+        require_memory(
+            xp, (_VOLUMES + 3 * len(self._others)) * operator.dtype.itemsize * int(np.prod(domain))
+        )
+        zeros = xp.zeros(domain, operator.dtype) if start is None else xp.asarray(start)
+        self.splits = tuple(ProxSplit(term, zeros) for term in (self.separable, *self._others))
+        self._weights = xp.asarray(np.ascontiguousarray(self.axis_weights.T)[:, :, None, None])
+        self._factorise()
+        H = self._transfer
+        self.g = self._solve_depths(xp.conj(H))
+        self._q = (H * self.g).real.sum(axis=0)
+        self.S = xp.zeros((3, *domain[1:]), operator.dtype)
+        self.X = fft.rfft(zeros[0])
+
+    def _factorise(self) -> None:
+        """Eliminate along depth once for all: ``T`` is tridiagonal in z for every lateral frequency."""
+        xp, dtype = self.xp, self.operator.dtype
+        ny, nx = self.operator.grid_shape
+        rows = xp.asarray((4 * np.sin(np.pi * np.arange(ny) / ny) ** 2).astype(dtype))[:, None]
+        columns = xp.asarray((4 * np.sin(np.pi * np.arange(nx // 2 + 1) / nx) ** 2).astype(dtype))[None]
+        squared = self.axis_weights**2
+        self._deeper = [float(w) for w in squared[:-1, 0]]
+        shape = (len(squared), ny, nx // 2 + 1)
+        self._inverse, self._ratio = xp.empty(shape, dtype), xp.empty(shape, dtype)
+        pixels = self.kappa * dtype.type(len(self.splits))
+        for z, (_, wy, wx) in enumerate(squared):
+            after = self._deeper[z] if z < len(self._deeper) else 0.0
+            before = self._deeper[z - 1] if z else 0.0
+            diagonal = pixels + dtype.type(after + before) + wy * rows + wx * columns
+            if z:
+                diagonal = diagonal - dtype.type(before) * self._ratio[z - 1]
+            self._inverse[z] = 1 / diagonal
+            self._ratio[z] = dtype.type(after) * self._inverse[z]
+
+    def _solve_depths(self, R: Array) -> Array:
+        """``T^-1 R`` by Thomas' algorithm along z, without wrap-around. A new array."""
+        R = R.copy()
+        R[0] *= self._inverse[0]
+        for z in range(1, len(R)):
+            R[z] += self.operator.dtype.type(self._deeper[z - 1]) * R[z - 1]
+            R[z] *= self._inverse[z]
+        for z in range(len(R) - 2, -1, -1):
+            R[z] += self._ratio[z] * R[z + 1]
+        return R
+
+    def _differences(self, x: Array) -> Array:
+        xp = self.xp
+        d: Array = xp.empty((3, *x.shape), x.dtype)
+        d[0, :-1] = x[1:] - x[:-1]
+        d[0, -1] = 0
+        d[1] = xp.roll(x, -1, 1) - x
+        d[2] = xp.roll(x, -1, 2) - x
+        d *= self._weights
+        return d
+
+    def _multiplier(self, s: Array, threshold: float) -> Array:
+        """Return the part of the differences' states that shrinking takes away."""
+        xp, t = self.xp, self.operator.dtype.type(threshold)
+        if self.isotropic:
+            least = max(t, xp.finfo(s.dtype).tiny)
+            taken: Array = s * (t / xp.maximum(xp.sqrt((s * s).sum(axis=0)), least))
+        else:
+            taken = xp.clip(s, -t, t)
+        return taken
+
+    def _sweep(self) -> tuple[Array, Array]:
+        """Update the states from x and put the next right-hand side's transform R in the place of X.
+
+        Returns
+        -------
+        ndarray, (grid_height, grid_width // 2 + 1)
+            ``sum_z conj(g_z) R_z``.
+        ndarray, (9,)
+            TV; squared primal residual, dual residual, size of ``Psi x`` and of the multipliers; those four
+            of the splits of x itself.
+        """
+        xp, f = self.xp, self.operator.dtype.type
+        mu, used = self.penalty, self._used_penalty
+        relax, dual_scale = f(self.relaxation if self.iteration else 1.0), f(used / mu)
+        x = fft.irfft(self.X, self.operator.grid_shape[1])
+        d = self._differences(x)
+        tv = xp.sqrt((d * d).sum(axis=0)) if self.isotropic else abs(d)
+        c = self._multiplier(self.S, self.weight / used)
+        u = self.S - c
+        self.S = u + dual_scale * c + relax * (d - u)
+        c = self._multiplier(self.S, self.weight / mu)
+        split = self.S - c
+        sums = [
+            float(tv.sum(dtype=np.float64)),
+            squares(d - split),
+            squares(split - u),
+            squares(d),
+            squares(c),
+        ]
+        v = self._weights * (split - c)
+        r = xp.roll(v[1], 1, 1) - v[1] + xp.roll(v[2], 1, 2) - v[2] - v[0]
+        r[1:] += v[0, :-1]
+        pixels = np.zeros(4)
+        for one in self.splits:
+            one.set_penalty(mu * float(self.kappa))
+            one.meet(x[None], float(relax))
+            r += self.kappa * (2 * one.split - one.state)[0]
+            primal, change, _, multiplier = one.sums
+            pixels += (primal, change, squares(x), multiplier)
+        self.X = fft.rfft(r)
+        return (xp.conj(self.g) * self.X).sum(axis=0), np.array([*sums, *pixels])
+
+    def _update(self, E: Array) -> None:
+        """``X <- T^-1 R + g E``, from R in the place of X."""
+        self.X = self._solve_depths(self.X) + self.g * E
+
+    # -------------------------------------------------------------------------------------------------
+    def step(self) -> IterationRecord:
+        """Do one iteration. ``objective`` is that of the iterate before, negative parts aside."""
+        total, sums = self._sweep()
+        mu = self.penalty
+        f = self.operator.dtype.type
+        self.system.set_curvature(self._q / f(mu))
+        self.system.solve(self.data - self.system.from_spectrum(total), self.e)
+        E = self.system.spectrum_of(self.e)
+        E /= f(mu)
+        self._update(E)
+        self._used_penalty = mu
+        record = self._record(sums)
+        self.system.follow(max(record.primal_residual, record.dual_residual))
+        return record
+
+    def _record(self, sums: Array) -> IterationRecord:
+        tv, primal, dual, kx, y, primal_p, dual_p, xx, y_p = sums
+        kappa = float(self.kappa)
+        # Relative to both sides of the constraint, in the metric of the augmented Lagrangian.
+        primal_residual = float(np.sqrt((primal + kappa * primal_p) / max(kx + kappa * xx, 1e-300)))
+        dual_residual = float(np.sqrt((dual + kappa * dual_p) / max(y + kappa * y_p, 1e-300)))
+        objective = self._misfit + self.weight * float(tv) + self._value()
+        self._misfit = 0.5 * float(self.xp.vdot(self.e, self.e))
+        if self.balance and is_due(self.iteration) and dual_residual > 0:
+            ratio = np.sqrt(primal_residual / dual_residual)
+            self.penalty *= float(np.clip(ratio, 0.2, 5.0))
+        return IterationRecord(
+            0,
+            0.0,
+            objective,
+            residual_norm(self.e),
+            primal_residual,
+            dual_residual,
+            change=float(np.sqrt(dual_p / max(xx, 1e-300))),
+        )
+
+    def _value(self) -> float:
+        """Value of the priors other than total variation, of their split variables."""
+        return sum(one.prior.value(one.split) for one in self.splits)
+
+    @property
+    def solution(self) -> Array:
+        """The split variable that obeys the bounds (without any, the first other prior's), in host memory."""
+        first = self.splits[1 if self.separable.is_zero and len(self.splits) > 1 else 0]
+        return np.array(to_host(first.split))
+
+    def _end(self) -> Array:
+        solution = self.solution
+        if not self.room.keep_state:
+            del self.X, self.g
+        return solution
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with that of the priors' splits."""
+        return {**super().checkpoint(copy=copy), **kept_splits(self.splits)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
+        super().restore(state)
+        restore_splits(self.splits, state)
