@@ -151,7 +151,7 @@ class ReconstructionOptions:
         flags=("--background/--no-background",),
         label="Smooth background",
         group=_CHOICE,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "video"),
     )
     positive_background: bool = option(
         False,

@@ -190,3 +190,18 @@ def test_a_name_that_ends_in_ome_zarr_writes_that(files, run):
     assert code == 2
     assert "exists already" in output
     assert run(*arguments, "--force")[0] == 0
+
+
+def test_what_volumes_are_asked_for_pictures_are_asked_for_as_well(files, run):
+    """A device, a background, a limit of memory: one path takes them all."""
+    folder, image, out = files
+    common = ("--psf", folder / "psf0.tif", "--image", image, "--out", out, "-n", "2", "--force")
+    assert run(*common, "--background", "--model", "convolution")[0] == 0
+    assert json.loads(out.with_suffix(".json").read_text())["background_estimated"]
+    assert run(*common, "--memory", "4")[0] == 0
+    code, output = run(*common, "--memory", "0.00001")
+    assert code == 2
+    assert "Bin the images" in output
+    code, output = run(*common, "--method", "admm-gpu")
+    assert code == 2
+    assert "--device gpu" in output

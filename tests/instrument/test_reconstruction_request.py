@@ -114,13 +114,14 @@ def test_the_precision_that_was_asked_for_is_computed_in(picture_files, volume_f
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--precision", "double"], "--precision must be one of auto, float32, float64"),
+        (["--precision", "double"], "must be one of auto, float32, float64"),
         (["--precision", "float64", "--choose", "precision=float32"], "the same twice"),
-        (["--precision", "float64", "--video"], "do not apply: --precision (for a picture"),
+        (["--precision", "float64", "--video"], "do not apply: --precision"),
     ],
 )
 def test_a_precision_that_is_not_understood_is_refused(picture_files, capsys, arguments, said):
-    assert main(["reconstruct", "--psf", str(picture_files["psf"]), *arguments]) == 2
+    image = [] if "--video" in arguments else ["--image", str(picture_files["image"])]
+    assert main(["reconstruct", "--psf", str(picture_files["psf"]), *image, *arguments]) == 2
     assert said in capsys.readouterr().err
 
 
