@@ -142,7 +142,7 @@ def _iterations(result: Reconstruction) -> int:
 def _write_picture(outputs: Outputs, result: Reconstruction, job: Job, rotate_deg: int) -> None:
     write_reconstruction(outputs, result, job, rotate_deg=rotate_deg)
     if outputs.figure is not None:
-        from instrument.reconstruction.result_figure import (
+        from instrument.reconstruction.result_figures import (
             write_figure,  # matplotlib, only where it is wanted
         )
 

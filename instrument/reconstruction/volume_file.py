@@ -31,7 +31,7 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     FileError, OSError
         When a file cannot be written, naming it.
     """
-    from instrument.reconstruction.volume_figure import volume_figure
+    from instrument.reconstruction.result_figures import volume_figure
 
     if is_zarr_name(outputs.image):
         about = {"simulated": job.simulated, "record": outputs.record.name}
