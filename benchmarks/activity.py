@@ -107,7 +107,7 @@ def solve(psf: np.ndarray, frames: list[np.ndarray], warm: int) -> np.ndarray:
     return np.stack(pictures)
 
 
-def neurons(
+def neurons(  # noqa: PLR0913 - what its table varies
     frames: int,
     *,
     photons: float,

@@ -118,7 +118,7 @@ def _l1_right_side(x, S, t, mu2, mu3, z0, z1):
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def _solve(X, V, M, dz2, dy2, dx2, mu1, mu2, mu3, z0, z1):
+def _solve(X, V, M, dz2, dy2, dx2, mu1, mu2, mu3, z0, z1):  # noqa: PLR0913 - compiled
     """``X <- (X + conj(M) V) / (mu1 |M|^2 + mu2 |Psi|^2 + mu3)``; ``V <- M X``."""
     for z in range(z0, z1):
         for y in range(X.shape[1]):

@@ -176,8 +176,6 @@ class VolumeRequest:
         options, inputs = self.options, self.inputs
         _require_known(inputs, options)
         _require_volume_prior(options.prior or "tv")
-        if options.positive_background and options.estimate_background is False:
-            raise BenchError("--positive-background and --no-background exclude each other.")
         return volume_job(self.psfs, self.image, self.inputs)
 
     def solve(
@@ -243,5 +241,7 @@ def done_share(options: ReconstructionOptions, record: IterationRecord) -> float
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:
     """Check what can be checked before any file is read; InputError or BenchError says what is wrong."""
     require_options(noise=None if isinstance(inputs.noise, str) else inputs.noise)
+    if options.positive_background and options.estimate_background is False:
+        raise BenchError("--positive-background and --no-background exclude each other.")
     if options.choose is not None:
         _require_choice("--choose", options.model)

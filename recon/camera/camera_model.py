@@ -13,6 +13,7 @@ from recon.base.checks import select_psf
 from recon.camera.field_registration import shown
 from recon.camera.local_convolution import FieldOfPsfs
 from recon.camera.low_rank import principal_psfs
+from recon.camera.offered import CAMERAS
 from recon.camera.registration import moved
 from recon.camera.registration_cache import remembered_field
 from recon.errors import InputError
@@ -172,10 +173,17 @@ def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
     )
 
 
+def model_names() -> tuple[str, ...]:
+    """Return the camera models that can be asked for, those of others among them."""
+    return (*MODELS, *CAMERAS)
+
+
 def choose_model(depths: Depths, wanted: ModelName) -> tuple[ModelName, str]:
     """Return the model to use and the reason in words, without comparing what the models cost."""
-    if wanted not in MODELS:
-        raise InputError(f"The model {wanted!r} is not known. Choose one of {', '.join(MODELS)}.")
+    if wanted not in model_names():
+        raise InputError(f"The model {wanted!r} is not known. Choose one of {', '.join(model_names())}.")
+    if wanted in CAMERAS and (reason := CAMERAS[wanted].refuses(depths)) is not None:
+        raise InputError(f"The {wanted} model does not take this calibration: {reason}.")
     if wanted in ("local", "lowrank") and not depths.varies:
         raise InputError(
             f"The {wanted} model needs PSFs from several places of the field; this calibration has one "

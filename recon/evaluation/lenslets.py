@@ -47,7 +47,7 @@ def stamp(image, y, x, sigma, light):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _cast(image, points, facets, pitch, distance, width, power, aberration, fall_off, spot):  # type: ignore[no-untyped-def]
+def _cast(image, points, facets, pitch, distance, width, power, aberration, fall_off, spot):  # type: ignore[no-untyped-def]  # noqa: PLR0913 - compiled
     height, columns = image.shape
     for p in range(points.shape[0]):
         x, y, z, light = points[p]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from recon.base.namespace import Device, array_namespace
 from recon.camera.camera_model import MODELS, ModelName, members_of_depths
+from recon.camera.offered import CAMERAS
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS
@@ -190,7 +191,8 @@ def own_methods(*, volume: bool) -> tuple[str, ...]:
 
 
 def _all(problem: ChartProblem) -> Iterator[Setting]:
-    models = [m for m in MODELS if m != "auto" and (_varies(problem) or m == "convolution")]
+    own = [m for m in MODELS if m != "auto" and (_varies(problem) or m == "convolution")]
+    models: list[ModelName] = [*own, *CAMERAS]  # type: ignore[list-item]
     devices: list[Device] = ["cpu", "gpu"] if _has_gpu() else ["cpu"]
     for solver, model, prior, binning, background, precision, device in product(
         SOLVERS, models, PRIORS, binnings_of(problem), (False, True), PRECISIONS, devices

@@ -202,7 +202,7 @@ class ScatteringDisplay:
 
 
 @compiled
-def _resample(
+def _resample(  # noqa: PLR0913 - compiled
     slm: Complex,
     field: Complex,
     pitch_um: float,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.base.declare import option
 from recon.base.namespace import DEVICES, Device
-from recon.camera.camera_model import MODELS, ModelName
+from recon.camera.camera_model import ModelName, model_names
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
 from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
@@ -131,7 +131,7 @@ class ReconstructionOptions:
     model: ModelName = option(
         "auto",
         help="local, lowrank: PSFs that vary over the field; auto: the smallest that explains the data.",
-        choices=MODELS,
+        choices=model_names,
         group=_CHOICE,
         applies=("picture", "volume", "video"),
     )

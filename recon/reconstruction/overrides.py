@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from recon.camera.camera_model import MODELS, ModelName
+from recon.camera.camera_model import ModelName, model_names
 from recon.errors import InputError
 
 Precision = Literal["float32", "float64"]
@@ -57,7 +57,7 @@ class Wishes:
             Which wish is not known, and what is.
         """
         known: dict[str, dict[str, Any] | None] = {
-            "model": {m: m for m in MODELS if m != "auto"},
+            "model": {m: m for m in model_names() if m != "auto"},
             "planes": None,
             "between": {"on": True, "off": False},
             "binning": None,

@@ -17,6 +17,7 @@ from recon.camera.convolution3d import Convolution3D
 from recon.camera.erasures import Erasures
 from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
 from recon.camera.low_rank import low_rank
+from recon.camera.offered import CAMERAS
 from recon.camera.patterned import PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
 from recon.errors import InputError
@@ -144,6 +145,8 @@ class Part:
             )
             self._require_memory(plane)
             return OfOnePlane(plane)
+        if problem.model in CAMERAS:
+            return CAMERAS[problem.model].make(self.central, problem.depths)
         scale = np.float32(1 / float(energy[0]))
         if not problem.varies:
             return self._convolution(psfs[:, own] * scale)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.camera.offered import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
@@ -27,7 +28,7 @@ from recon.solvers.base import Callback, Keeper
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.empty_planes import EmptyPlanes
 from recon.solvers.stopping import IterationRecord
-from recon.verdict.collect import evidence_of, not_judged, unsettled_by
+from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
 
@@ -340,6 +341,8 @@ def _verdict(
         )
         if not own
     ]
+    if problem.model in CAMERAS:
+        foreign.append(f"the camera model {problem.model}")
     if problem.patterned:
         foreign.append("patterned light")
     if foreign:
@@ -348,10 +351,7 @@ def _verdict(
         picture = problem.n_planes == 1
         # One plane is a picture: it fails as pictures do, by a wrong depth for one.
         evidence = evidence_of(
-            problem.measurement.image,
-            problem.data,
-            problem.valid,
-            problem.noise,
+            observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
             result.volume,
             problem.depths.central,
             _residuals(result, problem),

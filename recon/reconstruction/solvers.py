@@ -135,7 +135,6 @@ def _admm_refuses(problem: Problem) -> str | None:
 
 def _admm(part: Part, start: Array | None) -> Runs:
     from recon.camera.convolution3d import Convolution3D
-    from recon.camera.spatially_varying import SpatiallyVarying
     from recon.solvers.admm import Admm
     from recon.solvers.splitting import Room, SensorData, Tuning
     from recon.solvers.tv_admm_volume import volume_solver
@@ -143,9 +142,8 @@ def _admm(part: Part, start: Array | None) -> Runs:
     problem, camera = part.problem, part.camera
     if problem.together:
         return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
-    if isinstance(camera, SpatiallyVarying):
+    if not isinstance(camera, Convolution3D):
         return _varying_admm(part, camera, start)
-    assert isinstance(camera, Convolution3D)
     data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(problem.axis_weights, (False, True, True))
     tuning = Tuning(drop_empty=problem.options.drop_empty)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from recon.base.checks import as_channels, saturated_share
 from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
-from recon.verdict.evidence import Evidence, averaged, measure
+from recon.verdict.evidence import Evidence, Observation, averaged, measure
 
 Array = npt.NDArray[Any]
 
@@ -19,11 +19,30 @@ DIVERGED = 1e3
 LIMITS = (StopReason.ITERATIONS, StopReason.TIME, StopReason.CANCELLED)
 
 
+def observations(
+    measurement: npt.ArrayLike, data: Array, valid: npt.NDArray[np.bool_], noise: Array
+) -> list[Observation]:
+    """Return what the camera saw, a channel each.
+
+    Parameters
+    ----------
+    measurement : array
+        As it came: (height, width[, n_channels]).
+    data : ndarray, (n_channels, height, width)
+        Background subtracted, in units of the noise.
+    valid : ndarray of bool, shape of ``data``
+    noise : ndarray, (n_channels,)
+        Deviations, counts.
+    """
+    counts = as_channels(measurement, "measurement")
+    return [
+        Observation(d, v, float(n), saturated_share(c[v]))
+        for d, v, n, c in zip(data, valid, noise, counts, strict=False)
+    ]
+
+
 def evidence_of(
-    measurement: npt.ArrayLike,
-    data: Array,
-    valid: npt.NDArray[np.bool_],
-    noise: Array,
+    seen: Sequence[Observation],
     volume: Array,
     psfs: Array,
     residuals: Sequence[float],
@@ -35,13 +54,8 @@ def evidence_of(
 
     Parameters
     ----------
-    measurement : array
-        As it came: (height, width[, n_channels]).
-    data : ndarray, (n_channels, height, width)
-        Background subtracted, in units of the noise.
-    valid : ndarray of bool, shape of ``data``
-    noise : ndarray, (n_channels,)
-        Deviations, counts.
+    seen : sequence of Observation
+        One a channel.
     volume : ndarray, (n_z, rows, columns[, n_channels])
         The result in measurement units.
     psfs : ndarray, (n_z, 1 or n_channels, height, width)
@@ -52,24 +66,18 @@ def evidence_of(
     points : bool
         Whether to look for the result's bright points as well: of volumes.
     """
-    counts = as_channels(measurement, "measurement")
-    n = len(data)
-    channels = []
-    for c in range(n):
-        residual = residuals[c] if len(residuals) == n else residuals[0] / n**0.5
-        channels.append(
-            measure(
-                data[c],
-                valid[c],
-                volume if volume.ndim == 3 else volume[..., c],
-                psfs[:, min(c, psfs.shape[1] - 1)],
-                float(noise[c]),
-                residual,
-                saturated=saturated_share(counts[c][valid[c]]),
-                unsettled=unsettled,
-                points=points,
-            )
+    n = len(seen)
+    channels = [
+        measure(
+            one,
+            volume if volume.ndim == 3 else volume[..., c],
+            psfs[:, min(c, psfs.shape[1] - 1)],
+            residuals[c] if len(residuals) == n else residuals[0] / n**0.5,
+            unsettled=unsettled,
+            points=points,
         )
+        for c, one in enumerate(seen)
+    ]
     return averaged(channels)
 
 

@@ -83,15 +83,33 @@ class Evidence:
         return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
 
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One channel of what the camera saw.
+
+    Attributes
+    ----------
+    data : ndarray, (height, width)
+        Measurement, background subtracted, in units of its noise.
+    valid : ndarray of bool, (height, width)
+    noise : float
+        Its deviation, counts.
+    saturated : float
+        Share of the valid pixels at full scale.
+    """
+
+    data: Array
+    valid: npt.NDArray[np.bool_]
+    noise: float
+    saturated: float = 0.0
+
+
 def measure(
-    data: Array,
-    valid: npt.NDArray[np.bool_],
+    seen: Observation,
     volume: Array,
     psfs: Array,
-    noise: float,
     residual_norm: float,
     *,
-    saturated: float,
     unsettled: float,
     points: bool = False,
 ) -> Evidence:
@@ -99,24 +117,19 @@ def measure(
 
     Parameters
     ----------
-    data : ndarray, (height, width)
-        Measurement, background subtracted, in units of its noise.
-    valid : ndarray of bool, (height, width)
+    seen : Observation
     volume : ndarray, (n_z, rows, columns)
         The result: ``measurement = sum_z PSF_z * volume_z``.
     psfs : ndarray, (n_z, height, width)
         On-axis PSFs as calibrated.
-    noise : float
-        Its deviation, counts.
     residual_norm : float
         ``||A x - b||`` over the valid pixels, in units of the noise.
-    saturated : float
-        Share of the valid pixels at full scale.
     unsettled : float
     points : bool
         Whether to look for its bright points as well.
     """
-    used = data[valid].astype(np.float64)
+    data, noise = seen.data, seen.noise
+    used = data[seen.valid].astype(np.float64)
     signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
     beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
     lit, edges = lit_and_edges(volume)
@@ -126,7 +139,7 @@ def measure(
         detail=_detail(volume, psfs, noise, len(used)),
         unexplained=float(np.sqrt(beyond2 / signal2)),
         erased=1.0 - len(used) / data.size,
-        saturated=saturated,
+        saturated=seen.saturated,
         lit=lit,
         edges=edges,
         load=min(lit, edges) * volume.size / len(used),

@@ -245,7 +245,7 @@ def command_names() -> list[tuple[str, ...]]:
     return found
 
 
-def hologram(
+def hologram(  # noqa: PLR0913 - what the cases vary
     targets: Sequence[tuple[npt.NDArray[Any], float]],
     slm: tuple[int, int],
     *,

@@ -70,7 +70,7 @@ class RayPropagator(Propagator):
 
 
 @compiled
-def _trace(
+def _trace(  # noqa: PLR0913 - compiled
     light: npt.NDArray[np.float64],
     top: float,
     left: float,

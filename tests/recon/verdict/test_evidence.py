@@ -15,7 +15,7 @@ from recon.camera.light import plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
 from recon.solvers.stopping import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
-from recon.verdict.evidence import _dimming, _similarity, measure
+from recon.verdict.evidence import Observation, _dimming, _similarity, measure
 from recon.verdict.verdict import Region
 
 RNG = np.random.default_rng(1)
@@ -29,7 +29,7 @@ def evidence(scale: float = 1.0, residual: float = 1.0, valid: float = 1.0):
     psf = np.zeros((1, 40, 50))
     psf[0, 20, 25] = 1.0
     norm = residual * np.sqrt(np.count_nonzero(mask))
-    return measure(data, mask, volume, psf, 0.1, norm, saturated=0.0, unsettled=0.0), mask
+    return measure(Observation(data, mask, 0.1), volume, psf, norm, unsettled=0.0), mask
 
 
 def test_signal_and_misfit_are_what_exceeds_the_noise() -> None:
@@ -58,7 +58,7 @@ def test_details_count_in_units_of_the_noise() -> None:
     data, valid = RNG.normal(size=(60, 60)), np.ones((60, 60), bool)
 
     def detail(volume: np.ndarray, noise: float) -> float:
-        return measure(data, valid, volume, psf, noise, 60.0, saturated=0, unsettled=0).detail
+        return measure(Observation(data, valid, noise), volume, psf, 60.0, unsettled=0).detail
 
     assert detail(ring, 0.1) == pytest.approx(10 * detail(ring, 1.0))
     assert detail(ring, 0.1) > 2 * detail(flat, 0.1)
