@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import functools
 import enum
+import functools
 import math
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
