@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import enum
+import functools
 import math
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -232,8 +233,12 @@ def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
 
 def options_of(declared: type | object) -> tuple[Option, ...]:
     """Return the declared fields of an options class or object, in order."""
-    cls = declared if isinstance(declared, type) else type(declared)
-    hints = typing.get_type_hints(cls)
+    return _options_of(declared if isinstance(declared, type) else type(declared))
+
+
+@functools.cache
+def _options_of(cls: type) -> tuple[Option, ...]:
+    hints = typing.get_type_hints(cls)  # takes a millisecond: as long as an iteration of a small picture
     return tuple(
         Option(field.name, hints[field.name], field.default, field.metadata[_KEY])
         for field in dataclasses.fields(cls)
