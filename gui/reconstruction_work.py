@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gui.jobs import JobCancelledError, JobContext
+from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.job import Job as Prepared
-from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from instrument.reconstruction.volume_file import write_volume
@@ -130,7 +130,7 @@ def lines_of(work: ReconstructionWork) -> str:
     if work.kept_in is None:
         lines.append("result = request.solve(job)")
     else:
-        kept = "instrument.reconstruction.kept_request"
+        kept = "instrument.reconstruction.checkpointing"
         imports.names |= {(kept, "checkpoint_for"), (kept, "settle_checkpoint")}
         reasons = "result.stop_reasons" if volume else "[result.stop_reason]"
         lines += [

@@ -22,7 +22,7 @@ from gui.forms.fields import Behaviour
 from gui.forms.options_form import FOLDED, OptionsForm, scrolled
 from gui.reconstruction_work import ReconstructionWork, lines_of
 from instrument.files.errors import BenchError
-from instrument.reconstruction.kept_request import require_kept
+from instrument.reconstruction.checkpointing import require_kept
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, request_of
 from instrument.reconstruction.result_file import Outputs

@@ -155,12 +155,12 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
 
 def _require_auto(asked: _Asked) -> None:
     """Refuse what is about auto's choices where nothing is left to choose."""
-    model, wishes = asked.options.model, asked.options.choose
+    model, overrides = asked.options.model, asked.options.choose
     if asked.output.explain and model != "auto":
         raise BenchError(
             f"--explain says what --model auto chooses; --model {model} leaves nothing to choose."
         )
-    if wishes is not None and model != "auto":
+    if overrides is not None and model != "auto":
         raise BenchError(
             f"--choose overrules what --model auto chooses; it does not go with --model {model}."
         )

@@ -7,8 +7,8 @@ import typer
 from instrument.cli.app import saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.files.volume_zarr import uneven_steps
+from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.job import Job
-from instrument.reconstruction.kept_request import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, iteration_limit

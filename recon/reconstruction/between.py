@@ -13,7 +13,7 @@ from recon.camera.refocus import refocus
 from recon.errors import InputError
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import loss_db
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -26,7 +26,7 @@ TOLD = 0.9
 
 
 def between_of(
-    calibration: Calibration, depths: Depths, planes: tuple[int, ...], wishes: Wishes
+    calibration: Calibration, depths: Depths, planes: tuple[int, ...], overrides: Overrides
 ) -> tuple[tuple[int, ...], Decision]:
     """Decide between which depths a plane is added.
 
@@ -37,7 +37,7 @@ def between_of(
         The calibration's.
     planes : tuple of int
         Depths that take part: nothing is added beside those that are left out.
-    wishes : Wishes
+    overrides : Overrides
 
     Returns
     -------
@@ -52,10 +52,10 @@ def between_of(
     """
     gaps = [k for k in planes if k + 1 in planes]
     prevented = _prevented(calibration, depths)
-    asked = wishes.between is not None
+    asked = overrides.between is not None
     if prevented is not None or not gaps:
         why = prevented or "no two neighbouring depths take part"
-        if wishes.between:
+        if overrides.between:
             raise InputError(f"Planes cannot be added between depths (between=on): {why}.")
         return (), Decision("between", "no planes", why, overruled=asked)
     alike = {k: likeness(depths.central[k], depths.central[k + 1]) for k in gaps}
@@ -64,7 +64,7 @@ def between_of(
     numbers = {"least_likeness": alike[worst]}
     why = f"PSFs of neighbouring depths agree to {alike[worst]:.2f} or more ({UNLIKE:g} is enough)"
     told = True
-    if unlike or wishes.between:
+    if unlike or overrides.between:
         made = refocus(calibration, middle(depths, worst))
         expected = made.expected_similarity
         told = expected is not None and expected >= TOLD
@@ -74,7 +74,7 @@ def between_of(
             f"PSFs of neighbouring depths agree to {alike[worst]:.2f} only ({UNLIKE:g} would be enough); "
             f"those made for depths between are {said} with measured ones ({TOLD:g} is asked of them)"
         )
-    added = (tuple(gaps) if wishes.between else ()) if asked else (unlike if told else ())
+    added = (tuple(gaps) if overrides.between else ()) if asked else (unlike if told else ())
     # An object half way is as far from each neighbour as these are from half way: half of their difference.
     loss = loss_db(0.5 * float(np.sqrt(2 * max(1 - alike[worst], 0.0))))
     n = len(planes)

@@ -12,7 +12,7 @@ from recon.base.noise import estimate_deviation
 from recon.errors import InputError
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import ERROR_SCALE
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]
@@ -130,7 +130,7 @@ def merged_input(
 
 
 def channels_of(
-    data: Array, deviation: Array, valid: Array, psfs: Array, wishes: Wishes
+    data: Array, deviation: Array, valid: Array, psfs: Array, overrides: Overrides
 ) -> tuple[Decision, Colours | None]:
     """Decide whether colour channels are reconstructed as one; also return how they are proportional."""
     n = len(data)
@@ -139,15 +139,15 @@ def channels_of(
     common = int(np.count_nonzero(valid.all(axis=0)))
     if common < max(LEAST_COMMON, LEAST_COMMON_SHARE * valid[0].size):
         why = f"only {common} of {valid[0].size} pixels tell all colours, as with a colour mosaic"
-        if wishes.channels == "merged":
+        if overrides.channels == "merged":
             raise InputError(f"Channels cannot be merged: {why}. Leave channels=merged out.")
-        return Decision("channels", f"all {n}", why, overruled=wishes.channels is not None), None
+        return Decision("channels", f"all {n}", why, overruled=overrides.channels is not None), None
     tint = colours(data, deviation, valid, psfs)
     assert tint is not None
     numbers = {"misfit": tint.misfit, "psf_misfit": tint.psf_misfit}
     alike = tint.misfit <= CHANNEL_NOISE and tint.psf_misfit <= CHANNEL_PSF
-    asked = wishes.channels is not None
-    merge = wishes.channels == "merged" if asked else alike
+    asked = overrides.channels is not None
+    merge = overrides.channels == "merged" if asked else alike
     why = (
         f"channels proportional to one another miss the data by {tint.misfit:.2f} of its noise and the PSFs "
         f"by {tint.psf_misfit:.1%} (up to {CHANNEL_NOISE:g} and {CHANNEL_PSF:.0%} pass for alike)"

@@ -7,7 +7,7 @@ import numpy as np
 from recon.camera.camera_model import Depths, ModelName
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import ERROR_SCALE, left_out_db, loss_db
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.probe import ACCEPTED, acceptance_px, psf_window, resolution_px
 
 LEAST_SIDE = 20
@@ -17,15 +17,15 @@ SAMPLES = 7.0
 dB: priors bring back more than the PSF's width says."""
 
 
-def binning_of(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
+def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision:
     """Decide how many pixels are averaged; ``whole``: none is erased."""
     sharpest = min(resolution_px(p) for psfs in depths.central for p in psfs)
     side = max(depths.central.shape[2:])
     if not np.isfinite(sharpest):
         sharpest = float(side)
     fitting = min(max(1, int(sharpest / SAMPLES)), max(1, side // LEAST_SIDE))
-    asked = wishes.binning is not None
-    binning = wishes.binning or (fitting if whole else 1)
+    asked = overrides.binning is not None
+    binning = overrides.binning or (fitting if whole else 1)
     why = (
         f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, and "
         f"{SAMPLES:g} (binned) pixels over that width are enough"
@@ -50,14 +50,14 @@ def binning_of(depths: Depths, wishes: Wishes, *, whole: bool) -> Decision:
 
 
 def field_of(
-    depths: Depths, wishes: Wishes, model: ModelName, *, haze: bool
+    depths: Depths, overrides: Overrides, model: ModelName, *, haze: bool
 ) -> tuple[tuple[int, int], float | None, Decision]:
     """Decide how far from the axis the object is modelled.
 
     Parameters
     ----------
     depths : Depths
-    wishes : Wishes
+    overrides : Overrides
     model : str
         One convolution takes the whole field at no more cost than a part of it.
     haze : bool
@@ -73,7 +73,7 @@ def field_of(
     Decision
     """
     height, width = depths.central.shape[2:]
-    asked = wishes.field == "all"
+    asked = overrides.field == "all"
     window = (height, width) if asked else psf_window(depths)
     reach = None if asked else acceptance_px(depths)
     full = (2 * height - 1) * (2 * width - 1)

@@ -14,7 +14,7 @@ from recon.base.namespace import DEVICES, Device
 from recon.camera.camera_model import ModelName, model_names
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
-from recon.reconstruction.overrides import PRECISIONS, Precision, Wishes
+from recon.reconstruction.overrides import PRECISIONS, Overrides, Precision
 
 Field = Literal["sensor", "full"]
 
@@ -37,7 +37,7 @@ def _replaced() -> Mapping[str, str]:
     return REPLACED
 
 
-def _wishes(words: Sequence[str]) -> Wishes:
+def _overrides(words: Sequence[str]) -> Overrides:
     """Read ``NAME=VALUE`` each."""
     pairs = {}
     for word in words:
@@ -45,7 +45,7 @@ def _wishes(words: Sequence[str]) -> Wishes:
         if not equals:
             raise InputError(f"{word!r} is not understood; write NAME=VALUE, say binning=1.")
         pairs[name.strip()] = value.strip()
-    return Wishes.parse(pairs)
+    return Overrides.parse(pairs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,13 +135,13 @@ class ReconstructionOptions:
         group=_CHOICE,
         applies=("picture", "volume", "video"),
     )
-    choose: Wishes | None = option(
+    choose: Overrides | None = option(
         None,
         help="Overrule one of auto's choices (repeatable): model=, planes=all|0-3,7, between=on|off, "
         "field=all, binning=N, channels=all|merged, background=on|off, precision=float32|float64.",
         metavar="NAME=VALUE",
         group=_CHOICE,
-        parse_all=_wishes,
+        parse_all=_overrides,
         applies=("picture", "volume"),
     )
     estimate_background: bool | None = option(

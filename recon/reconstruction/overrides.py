@@ -15,7 +15,7 @@ PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wishes:
+class Overrides:
     """Choices that the caller makes; None leaves them to the program.
 
     Attributes
@@ -48,13 +48,13 @@ class Wishes:
     tolerance: float | None = None
 
     @classmethod
-    def parse(cls, text: Mapping[str, str]) -> Wishes:
-        """Read wishes from words: ``{"model": "local", "binning": "1", "background": "off"}``.
+    def parse(cls, text: Mapping[str, str]) -> Overrides:
+        """Read overrides from words: ``{"model": "local", "binning": "1", "background": "off"}``.
 
         Raises
         ------
         InputError
-            Which wish is not known, and what is.
+            Which choice is not known, and what is.
         """
         known: dict[str, dict[str, Any] | None] = {
             "model": {m: m for m in model_names() if m != "auto"},

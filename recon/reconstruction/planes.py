@@ -12,20 +12,20 @@ from recon.camera.camera_model import Depths
 from recon.errors import InputError
 from recon.reconstruction.choice import Choice, Decision, Option
 from recon.reconstruction.estimates import left_out_db
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.probe import CoarsePass
 
 LEFT_OUT = 0.02
 """Share of the coarse pass's light, of any channel, that all planes together that are left out may hold."""
 
 
-def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple[int, ...], Decision]:
+def planes_of(passed: CoarsePass, depths: Depths, overrides: Overrides) -> tuple[tuple[int, ...], Decision]:
     """Decide which depths take part, by where a coarse pass finds light."""
     n = len(depths.z_um)
     everything = tuple(range(n))
     if n == 1:
-        if isinstance(wishes.planes, tuple):
-            _within(wishes.planes, n)
+        if isinstance(overrides.planes, tuple):
+            _within(overrides.planes, n)
         return everything, Decision("planes", "1", "one depth was calibrated")
     lit = np.any([_most_of(light) for light in passed.light], axis=0)
     # The coarse pass may take a plane for its neighbour: those of lit planes stay.
@@ -35,10 +35,10 @@ def planes_of(passed: CoarsePass, depths: Depths, wishes: Wishes) -> tuple[tuple
     near[:-1] |= lit[order][1:]
     kept = np.zeros(n, bool)
     kept[order] = near
-    asked = wishes.planes is not None
+    asked = overrides.planes is not None
     planes = tuple(int(z) for z in np.flatnonzero(kept))
-    if wishes.planes is not None:
-        planes = _within(wishes.planes, n) if isinstance(wishes.planes, tuple) else everything
+    if overrides.planes is not None:
+        planes = _within(overrides.planes, n) if isinstance(overrides.planes, tuple) else everything
         kept = np.isin(np.arange(n), planes)
     lost = _share(passed.light, ~kept)
     channel = " of any colour" if len(passed.light) > 1 else ""
@@ -95,10 +95,10 @@ def put_back(choice: Choice, signs: Sequence[float], *, everything: bool) -> Cho
     return replace(choice, planes=planes, decisions=decisions)
 
 
-def _within(wished: tuple[int, ...], n: int) -> tuple[int, ...]:
-    if max(wished) >= n:
-        raise InputError(f"planes={_ranges(wished)}: the calibrated depths are numbered from 0 to {n - 1}.")
-    return wished
+def _within(asked: tuple[int, ...], n: int) -> tuple[int, ...]:
+    if max(asked) >= n:
+        raise InputError(f"planes={_ranges(asked)}: the calibrated depths are numbered from 0 to {n - 1}.")
+    return asked
 
 
 def _most_of(light: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon.reconstruction.choice import Decision, Option
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.verdict.failure import PRECISION
 from recon.verdict.shipped import shipped_maps
 
@@ -34,24 +34,24 @@ def drift(iterations: int, pixels: int) -> float:
     return float(error.max() * np.exp(grown))
 
 
-def precision_of(wishes: Wishes, iterations: int, pixels: int) -> Decision:
+def precision_of(overrides: Overrides, iterations: int, pixels: int) -> Decision:
     """Decide in which precision to compute.
 
     Parameters
     ----------
-    wishes : Wishes
+    overrides : Overrides
     iterations, pixels : int
         How many are usual, and the longest side.
     """
     expected = drift(iterations, pixels)
-    asked = wishes.precision is not None
+    asked = overrides.precision is not None
     why = (
         f"by the stability map float32 differs from float64 by at most {expected:.0e} of the picture after "
         f"{iterations} iterations on {pixels} pixels ({PRECISION:.0%} is a failure)"
     )
     loss = 0.0 - 10 * float(np.log10(1 + expected**2))
     numbers = {"expected_difference": expected}
-    value = wishes.precision or ("float64" if expected > PRECISION else "float32")
+    value = overrides.precision or ("float64" if expected > PRECISION else "float32")
     if value == "float64":
         down = Option("float32", 1 / DOUBLE_COST, loss)
         return Decision("precision", value, why, 0.0, None, down, asked, numbers)

@@ -153,8 +153,8 @@ def put_planes_back(problem: Problem, result: Reconstruction, rounds: int) -> Pr
     """Return the problem with planes that what is left of the data shows light in; None where none does."""
     reduction = problem.reduction
     assert reduction is not None
-    wishes = reduction.given.options.choose
-    if rounds >= MORE_ROUNDS or (wishes is not None and wishes.planes is not None):
+    overrides = reduction.given.options.choose
+    if rounds >= MORE_ROUNDS or (overrides is not None and overrides.planes is not None):
         return None
     signs = result.provenance.get("light_in_planes_left_out", [])
     more = put_back(reduction.choice, signs, everything=rounds == MORE_ROUNDS - 1)

@@ -9,7 +9,7 @@ from recon.camera.local_convolution import FieldOfPsfs
 from recon.camera.low_rank import principal_psfs
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import loss_db
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.solving import USUAL_ITERATIONS
 
 VARYING_COST = 3.0
@@ -27,14 +27,14 @@ def candidates(depths: Depths) -> tuple[ModelName, ...]:
 
 
 def model_of(
-    depths: Depths, wishes: Wishes, contrast: float | None, pixels: Callable[[ModelName], int]
+    depths: Depths, overrides: Overrides, contrast: float | None, pixels: Callable[[ModelName], int]
 ) -> tuple[ModelName, str, float]:
     """Return the camera model, why, and by how much PSFs vary over the field.
 
     Parameters
     ----------
     depths : Depths
-    wishes : Wishes
+    overrides : Overrides
     contrast : float or None
         Standard deviation of the data in units of its noise, of a volume with total variation; None: of
         anything else.
@@ -42,8 +42,8 @@ def model_of(
         Pixels that a model transforms in one forward and adjoint: its cost.
     """
     variation = depths.field_error if depths.varies else 0.0
-    if wishes.model is not None:
-        return choose_model(depths, wishes.model)[0], "as asked", variation
+    if overrides.model is not None:
+        return choose_model(depths, overrides.model)[0], "as asked", variation
     model, why = choose_model(depths, "auto")
     if model == "convolution":
         return model, why, variation
@@ -73,13 +73,13 @@ def model_decision(
     variation: float,
     depths: Depths,
     times: Mapping[ModelName, float],
-    wishes: Wishes,
+    overrides: Overrides,
 ) -> Decision:
     """Add the neighbours on the scale convolution, low-rank, local."""
     scale = candidates(depths)
     numbers = {"psf_variation": variation, "tolerated": TOLERATED}
     if len(scale) == 1:
-        return Decision("model", model, why, numbers=numbers, overruled=wishes.model is not None)
+        return Decision("model", model, why, numbers=numbers, overruled=overrides.model is not None)
     low = principal_psfs(_densest(depths), error=LOW_RANK_ERROR)
     numbers |= {"rank": float(len(low.components)), "rank_error": low.error}
     loss = {"convolution": loss_db(variation), "lowrank": loss_db(low.error), "local": 0.0}
@@ -96,4 +96,4 @@ def model_decision(
         other = scale[place]
         return Option(other, cost(other) / cost(model), loss[other] - loss[model])
 
-    return Decision("model", model, why, loss[model], step(1), step(-1), wishes.model is not None, numbers)
+    return Decision("model", model, why, loss[model], step(1), step(-1), overrides.model is not None, numbers)

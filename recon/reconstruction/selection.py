@@ -18,7 +18,7 @@ from recon.reconstruction.colours import channels_of, merged
 from recon.reconstruction.extent import binning_of, field_of
 from recon.reconstruction.measurement import Measurement, require_same_channels
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.planes import planes_of
 from recon.reconstruction.precision import precision_of
 from recon.reconstruction.probe import (
@@ -74,7 +74,7 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
     if options is not None:
         problem = replace(problem, options=options)
     if problem.model != "auto":
-        if problem.options.choose not in (None, Wishes()):
+        if problem.options.choose not in (None, Overrides()):
             raise InputError(
                 f"Choices are about what model='auto' chooses; they do not go with model={problem.model!r}. "
                 "Leave one of the two out."
@@ -86,13 +86,13 @@ def choose(problem: Problem, options: ReconstructionOptions | None = None) -> Pr
 def choice_for(problem: Problem) -> Choice:
     """Choose what to reconstruct a problem with; errors as :func:`choose`."""
     began = time.perf_counter()
-    wishes, held = _held(problem, _settled(problem))
+    overrides, held = _held(problem, _settled(problem))
     measurement, calibration = problem.measurement, problem.calibration
     counts = measurement.counts()
     data, valid = counts.data, counts.valid
     require_same_channels(calibration.psfs, data)
     deviation = measurement.deviations(counts)
-    merge, tint = channels_of(data, deviation, valid, calibration.psfs, wishes)
+    merge, tint = channels_of(data, deviation, valid, calibration.psfs, overrides)
     if tint is not None and merge.value == "merged":
         data, valid, calibration = merged(data, valid, calibration, tint)
     whole = bool(valid.all())
@@ -106,25 +106,25 @@ def choice_for(problem: Problem) -> Choice:
     picture = problem.n_planes == 1
     costs = {m: camera_cost(coarse[0], m) for m in candidates(depths)}
     contrast = None if kind == "l1" or picture else _contrast(data, valid, deviation)
-    model, why, variation = model_of(depths, wishes, contrast, lambda m: costs[m].fft_pixels)
+    model, why, variation = model_of(depths, overrides, contrast, lambda m: costs[m].fft_pixels)
     # One convolution a depth: quick, and good enough to see where light is and whether there is stray light.
     sparse = coarse_passes(coarse, "l1", background=True)
     light = _smooth_light(coarse, sparse, kind, model)
     given = measurement.background is not None
-    smooth = background_of(light, kind, wishes, given=given)
+    smooth = background_of(light, kind, overrides, given=given)
     estimated = smooth.value == "estimated"
-    planes, dropped = planes_of(sparse, depths, wishes)
-    between, added = between_of(calibration, depths, planes, wishes)
-    binning = binning_of(depths, wishes, whole=whole)
+    planes, dropped = planes_of(sparse, depths, overrides)
+    between, added = between_of(calibration, depths, planes, overrides)
+    binning = binning_of(depths, overrides, whole=whole)
     # A background of a few numbers takes what light from beyond the field has of them, not all of it.
     haze = is_stray(light.share) and not given and not (estimated and kind == "l1")
-    window, reach, field = field_of(depths, wishes, model, haze=haze)
+    window, reach, field = field_of(depths, overrides, model, haze=haze)
     usual = USUAL_ITERATIONS["convolution" if model == "convolution" else "varying"]
     side = max(data.shape[1:]) // int(binning.numbers["binning"])
-    precise = precision_of(wishes, usual, side)
-    tolerance, end = iterations_of(model, wishes, picture=picture, merged=merge.value == "merged")
+    precise = precision_of(overrides, usual, side)
+    tolerance, end = iterations_of(model, overrides, picture=picture, merged=merge.value == "merged")
     decisions = (
-        model_decision(model, why, variation, depths, {m: c.seconds for m, c in costs.items()}, wishes),
+        model_decision(model, why, variation, depths, {m: c.seconds for m, c in costs.items()}, overrides),
         dropped,
         *([added] if len(depths.z_um) > 1 else []),
         field,
@@ -152,34 +152,34 @@ def choice_for(problem: Problem) -> Choice:
         seconds=0.0,
     )
     if picture and model == "convolution" and not estimated:
-        choice = _plain(choice, problem, wishes)
+        choice = _plain(choice, problem, overrides)
     return replace(choice, seconds=time.perf_counter() - began)
 
 
-def _settled(problem: Problem) -> Wishes:
+def _settled(problem: Problem) -> Overrides:
     """Return the choices that the caller makes: those asked for, and what the other options say."""
     options = problem.options
-    wishes = options.choose or Wishes()
+    overrides = options.choose or Overrides()
     if options.precision != "auto":
-        if wishes.precision not in (None, options.precision):
+        if overrides.precision not in (None, options.precision):
             raise InputError(
-                f"precision={options.precision} and the choice precision={wishes.precision} contradict each "
-                "other: leave one of them out."
+                f"precision={options.precision} and the choice precision={overrides.precision} contradict "
+                "each other: leave one of them out."
             )
-        wishes = replace(wishes, precision=options.precision)
-    if wishes.background is None:
+        overrides = replace(overrides, precision=options.precision)
+    if overrides.background is None:
         asked = True if options.positive_background else options.estimate_background
-        wishes = replace(wishes, background=asked)
-    if wishes.tolerance is None:
-        wishes = replace(wishes, tolerance=options.tolerance)
+        overrides = replace(overrides, background=asked)
+    if overrides.tolerance is None:
+        overrides = replace(overrides, tolerance=options.tolerance)
     if options.field == "full":  # what can reach the sensor is asked for, on its pixels
-        wishes = replace(wishes, field="all", binning=1)
+        overrides = replace(overrides, field="all", binning=1)
     if options.axis_weights is not None and np.ndim(options.axis_weights) == 2:  # one row a depth
-        wishes = replace(wishes, planes="all", between=False)
-    return wishes
+        overrides = replace(overrides, planes="all", between=False)
+    return overrides
 
 
-def _held(problem: Problem, wishes: Wishes) -> tuple[Wishes, dict[str, str]]:
+def _held(problem: Problem, overrides: Overrides) -> tuple[Overrides, dict[str, str]]:
     """Settle what the solver and its device leave no choice in; return why, by the decisions' names."""
     options = problem.options
     require_solver(options.solver)
@@ -191,18 +191,18 @@ def _held(problem: Problem, wishes: Wishes) -> tuple[Wishes, dict[str, str]]:
         return None if None in reasons else str(reasons[0])
 
     held = {}
-    smooth = bool(wishes.background)
-    if wishes.model is None and candidates(problem.depths) != ("convolution",):
+    smooth = bool(overrides.background)
+    if overrides.model is None and candidates(problem.depths) != ("convolution",):
         reason = refused("local", smooth) or refused("lowrank", smooth)
         if reason is not None:
-            wishes = replace(wishes, model="convolution")
+            overrides = replace(overrides, model="convolution")
             held["model"] = f"one PSF a depth, as of the solver: {reason}"
-    if wishes.background is None:
-        reason = refused(wishes.model or "convolution", True)
+    if overrides.background is None:
+        reason = refused(overrides.model or "convolution", True)
         if reason is not None:
-            wishes = replace(wishes, background=False)
+            overrides = replace(overrides, background=False)
             held["background"] = f"none, as of the solver: {reason}"
-    return wishes, held
+    return overrides, held
 
 
 def _coarse(data: Array, valid: Array, calibration: Calibration, z_um: float | None) -> list[Problem]:
@@ -249,26 +249,26 @@ def _smooth_light(
     return SmoothLight(share, dark, lit)
 
 
-def _plain(choice: Choice, problem: Problem, wishes: Wishes) -> Choice:
+def _plain(choice: Choice, problem: Problem, overrides: Overrides) -> Choice:
     """Return the choice with what the solver of a plain picture does: the whole field, and its own end."""
     height, width = problem.depths.central.shape[2:]
     solved = replace(problem, model="convolution", smooth=False)
-    tolerance = solved.solver.tolerance_for(solved) if wishes.tolerance is None else wishes.tolerance
+    tolerance = solved.solver.tolerance_for(solved) if overrides.tolerance is None else overrides.tolerance
     replaced = {
         "field": Decision(
             "field",
             f"{2 * height - 1} x {2 * width - 1} pixels",
             "one convolution of a picture is quick on everything that can reach the sensor",
-            overruled=wishes.field is not None,
+            overruled=overrides.field is not None,
             numbers={"share_of_largest": 1.0},
         ),
         "iterations": Decision(
             "iterations",
             f"until they change by less than {tolerance:g}",
-            "as asked" if wishes.tolerance is not None else "where this solver stops by default",
+            "as asked" if overrides.tolerance is not None else "where this solver stops by default",
             0.0,
             *steps_of_tolerance(tolerance),
-            overruled=wishes.tolerance is not None,
+            overruled=overrides.tolerance is not None,
             numbers={"tolerance": tolerance},
         ),
     }

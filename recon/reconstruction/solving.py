@@ -7,7 +7,7 @@ from typing import Literal
 
 from recon.camera.camera_model import ModelName
 from recon.reconstruction.choice import Decision, Option
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.probe import CoarsePass
 
 STRAY_SHARE = 0.2
@@ -66,7 +66,9 @@ def is_stray(share: float) -> bool:
     return share >= STRAY_SHARE
 
 
-def background_of(light: SmoothLight, kind: Literal["tv", "l1"], wishes: Wishes, *, given: bool) -> Decision:
+def background_of(
+    light: SmoothLight, kind: Literal["tv", "l1"], overrides: Overrides, *, given: bool
+) -> Decision:
     """Decide whether a smooth background is estimated as well."""
     fall = light.fall
     numbers = {"smooth_share": light.share}
@@ -90,8 +92,8 @@ def background_of(light: SmoothLight, kind: Literal["tv", "l1"], wishes: Wishes,
         )
     else:
         on, why = False, f"{found}; total variation cannot tell a smooth background from a smooth object"
-    asked = wishes.background is not None
-    on = on if wishes.background is None else wishes.background
+    asked = overrides.background is not None
+    on = on if overrides.background is None else overrides.background
     change = _change_db(light, kind)
     # A few more numbers in the solver's equations: the time is the same.
     if on:
@@ -107,21 +109,23 @@ def _change_db(light: SmoothLight, kind: Literal["tv", "l1"]) -> float:
     return -IDLE_BACKGROUND_DB[kind] if told is None or told < least else GAINED_DB[kind] * told
 
 
-def iterations_of(model: ModelName, wishes: Wishes, *, picture: bool, merged: bool) -> tuple[float, Decision]:
+def iterations_of(
+    model: ModelName, overrides: Overrides, *, picture: bool, merged: bool
+) -> tuple[float, Decision]:
     """Say at what change an iteration to stop."""
     kind = "convolution" if model == "convolution" else f"varying {'picture' if picture else 'volume'}"
     if merged and kind == "varying picture":
         kind = "merged"
-    tolerance = SETTLED[kind] if wishes.tolerance is None else wishes.tolerance
+    tolerance = SETTLED[kind] if overrides.tolerance is None else overrides.tolerance
     return tolerance, Decision(
         "iterations",
         f"until they change by less than {tolerance:g}",
         "as asked"
-        if wishes.tolerance is not None
+        if overrides.tolerance is not None
         else "pictures were seen to be within 0.2 dB of the end there",
         0.0,
         *steps_of_tolerance(tolerance),
-        wishes.tolerance is not None,
+        overrides.tolerance is not None,
         {"tolerance": tolerance},
     )
 

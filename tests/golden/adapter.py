@@ -62,9 +62,9 @@ def noise_model(read_noise: float, counts_per_electron: float) -> Any:
 
 def wishes(**wanted: str) -> Any:
     """Return choices that are not left to the program, from words."""
-    from recon.reconstruction.overrides import Wishes
+    from recon.reconstruction.overrides import Overrides
 
-    return Wishes.parse(wanted)
+    return Overrides.parse(wanted)
 
 
 def picture(

@@ -24,7 +24,7 @@ from instrument.files.images import read_image, write_image
 from instrument.files.volume_source import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import open_result
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 
 WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4
@@ -285,7 +285,7 @@ def test_choices_of_a_volume_are_those_of_the_command_line(
     form.widgets["stop_at_noise"].click()
     request = form.request()
     assert isinstance(request, VolumeRequest)
-    assert request.options.choose == Wishes(binning=1, planes=(0, 1, 3))
+    assert request.options.choose == Overrides(binning=1, planes=(0, 1, 3))
     assert request.options.positive_background
     assert request.options.stop_at_noise
     names: dict = {}

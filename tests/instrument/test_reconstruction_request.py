@@ -13,7 +13,7 @@ from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 
 SIZE = 48
 
@@ -63,7 +63,7 @@ def test_a_raw_frame_of_a_mosaic_is_reconstructed_unmerged(picture_files):
     assert channels.value == "all 3"
     assert "only 0 of 2304 pixels tell all colours" in channels.why
     assert not request.explain(request.prepare()).merged
-    wished = ReconstructionOptions(choose=Wishes(channels="merged"))
+    wished = ReconstructionOptions(choose=Overrides(channels="merged"))
     merged = PictureRequest(**picture_files, inputs=raw, options=wished)
     with pytest.raises(InputError, match="cannot be merged"):
         merged.solve(merged.prepare())
@@ -135,7 +135,7 @@ def test_a_picture_of_one_convolution_says_the_field_and_the_end_that_it_has(pic
 
 
 def test_wishes_are_refused_where_a_model_was_asked_for(picture_files, volume_files):
-    asked = ReconstructionOptions(model="convolution", choose=Wishes(binning=2))
+    asked = ReconstructionOptions(model="convolution", choose=Overrides(binning=2))
     for request in (
         PictureRequest(**picture_files, options=asked),
         VolumeRequest(**volume_files, options=asked),

@@ -12,7 +12,7 @@ import recon
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction import solvers as offered
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.part import Part
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.douglas_rachford import DouglasRachford
@@ -50,7 +50,7 @@ def test_volumes_are_solved_in_float64(scene, model, prior, monkeypatch):
 
 def test_what_is_chosen_for_a_volume_may_be_solved_in_float64(scene):
     given = {"prior": "l1", "iterations": 5, "judged": False, "erasures": scene.erasures}
-    wish = Wishes(precision="float64", planes="all")
+    wish = Overrides(precision="float64", planes="all")
     exact = recon.reconstruct(scene.measurement, scene.calibration, choose=wish, **given)
     assert exact.choice is not None
     assert exact.choice.precision == "float64"

@@ -13,7 +13,7 @@ from recon import InputError
 from recon.base.blocks import block_mean, enlarged
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.precision import drift, precision_of
 from recon.reconstruction.reduction import reduced_calibration
@@ -93,7 +93,7 @@ def test_the_sharpest_colour_and_the_widest_decide():
     psfs = np.repeat(scene.calibration.psfs[:, :1], 3, axis=1)
     psfs[:, 2] = make_scene("sparse-picture", size=64, grid=1).calibration.psfs[:, 0]
     apart = replace(scene.calibration, psfs=psfs)
-    assert choose(scene.measurement, apart, choose=Wishes(channels="all")).binning == 1
+    assert choose(scene.measurement, apart, choose=Overrides(channels="all")).binning == 1
 
 
 def test_planes_with_light_that_were_left_out_are_put_back(beads, chosen_beads, monkeypatch):
@@ -148,7 +148,7 @@ def test_planes_that_the_user_left_out_stay_so_and_light_there_is_warned_of(bead
         beads.calibration,
         prior="l1",
         judged=False,
-        choose=Wishes.parse({"planes": "0-2"}),
+        choose=Overrides.parse({"planes": "0-2"}),
     )
     assert result.choice is not None
     assert result.choice.planes == (0, 1, 2)
@@ -172,7 +172,7 @@ def test_unlike_depths_get_planes_between_and_their_light_comes_back_to_the_cali
     scene = make_scene("beads", size=48, depths=3, density=0.3, seed=52)
     fine, coarse = (
         recon.reconstruct(
-            scene.measurement, scene.calibration, prior="l1", judged=False, choose=Wishes(between=between)
+            scene.measurement, scene.calibration, prior="l1", judged=False, choose=Overrides(between=between)
         )
         for between in (None, False)
     )
@@ -203,13 +203,13 @@ def test_like_depths_get_none_and_what_cannot_be_made_is_refused(beads):
     assert choice.between == ()
     assert decision(choice, "between").numbers["least_likeness"] > 0.8
     with pytest.raises(InputError, match="vary over the field"):
-        choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(between=True))
+        choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(between=True))
 
 
 def test_float64_is_offered_everywhere(beads):
     scene = make_scene("sparse-picture", size=32, grid=1)
     usual, exact = (
-        recon.reconstruct(scene.measurement, scene.calibration, choose=Wishes(precision=p), judged=False)
+        recon.reconstruct(scene.measurement, scene.calibration, choose=Overrides(precision=p), judged=False)
         for p in (None, "float64")
     )
     assert usual.choice is not None
@@ -220,7 +220,7 @@ def test_float64_is_offered_everywhere(beads):
     assert exact.state is not None
     assert exact.state.dtype == np.float64
     np.testing.assert_allclose(exact.image, usual.image, atol=1e-3 * float(usual.image.max()))
-    volume = choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(precision="float64"))
+    volume = choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(precision="float64"))
     assert volume.precision == "float64"
 
 
@@ -233,8 +233,8 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
     }}  # fmt: skip
     monkeypatch.setattr("recon.reconstruction.precision.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
-    assert precision_of(Wishes(), 1000, 64).value == "float64"
-    assert precision_of(Wishes(precision="float32"), 1000, 64).value == "float32"
+    assert precision_of(Overrides(), 1000, 64).value == "float64"
+    assert precision_of(Overrides(precision="float32"), 1000, 64).value == "float32"
 
 
 def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
@@ -245,10 +245,10 @@ def test_what_was_chosen_is_as_good_as_everything(beads, chosen_beads):
 
 
 def test_every_choice_says_why_and_can_be_overruled(beads):
-    wishes = Wishes.parse(
+    overrides = Overrides.parse(
         {"model": "local", "planes": "all", "binning": "1", "background": "off", "field": "all"}
     )
-    choice = choose(beads.measurement, beads.calibration, prior="l1", choose=wishes)
+    choice = choose(beads.measurement, beads.calibration, prior="l1", choose=overrides)
     assert (choice.model, choice.planes, choice.background) == ("local", tuple(range(6)), False)
     assert choice.psf_window == (40, 40)
     assert [d.name for d in choice.decisions if d.overruled] == [
@@ -279,7 +279,7 @@ def test_one_psf_that_does_not_vary_takes_a_convolution():
 def test_pictures_of_one_convolution_stop_where_the_choice_says():
     scene = make_scene("sparse-picture", size=40, grid=1)
     usual = recon.reconstruct(scene.measurement, scene.calibration)
-    wished = recon.reconstruct(scene.measurement, scene.calibration, choose=Wishes(tolerance=5e-2))
+    wished = recon.reconstruct(scene.measurement, scene.calibration, choose=Overrides(tolerance=5e-2))
     assert usual.choice is not None
     assert wished.choice is not None
     assert (usual.choice.model, usual.choice.background) == ("convolution", False)
@@ -308,7 +308,7 @@ def test_equal_colours_are_merged_and_different_ones_are_not():
     assert result.choice is not None
     assert result.choice.merged
     assert result.image.shape == (40, 40, 3)
-    apart = recon.reconstruct(grey.measurement, grey.calibration, choose=Wishes(channels="all"))
+    apart = recon.reconstruct(grey.measurement, grey.calibration, choose=Overrides(channels="all"))
     assert score(result.image, grey.truth).psnr_db > score(apart.image, grey.truth).psnr_db - 0.3
     assert result.image.sum() == pytest.approx(apart.image.sum(), rel=0.03)
     colourful = make_scene("sparse-picture", size=40, channels=3, colourful=True)
@@ -364,16 +364,16 @@ def test_fewer_depths_keep_their_psfs(beads):
 
 def test_mistakes_are_named(beads):
     with pytest.raises(InputError, match="no choice 'modle'"):
-        Wishes.parse({"modle": "local"})
+        Overrides.parse({"modle": "local"})
     with pytest.raises(InputError, match="whole number"):
-        Wishes.parse({"binning": "0"})
+        Overrides.parse({"binning": "0"})
     with pytest.raises(InputError, match="counted from 0"):
-        Wishes.parse({"planes": "3-1"})
-    assert Wishes.parse({"planes": "0-2,5"}).planes == (0, 1, 2, 5)
+        Overrides.parse({"planes": "3-1"})
+    assert Overrides.parse({"planes": "0-2,5"}).planes == (0, 1, 2, 5)
     with pytest.raises(InputError, match="numbered from 0 to 5"):
-        choose(beads.measurement, beads.calibration, prior="l1", choose=Wishes(planes=(2, 6)))
+        choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(planes=(2, 6)))
     with pytest.raises(InputError, match="one of on, off"):
-        Wishes.parse({"background": "maybe"})
+        Overrides.parse({"background": "maybe"})
 
 
 def test_wishes_that_would_be_ignored_are_refused():
@@ -381,7 +381,7 @@ def test_wishes_that_would_be_ignored_are_refused():
     for given in (picture.calibration, picture.calibration.psfs[0, 0]):
         with pytest.raises(InputError, match="model='convolution'"):
             recon.reconstruct(
-                picture.measurement, given, choose=Wishes(binning=1), model="convolution", judged=False
+                picture.measurement, given, choose=Overrides(binning=1), model="convolution", judged=False
             )
     # No wish is none that is ignored.
     recon.reconstruct(
@@ -389,7 +389,7 @@ def test_wishes_that_would_be_ignored_are_refused():
         picture.calibration,
         model="convolution",
         iterations=2,
-        choose=Wishes(),
+        choose=Overrides(),
         judged=False,
     )
 

@@ -15,7 +15,7 @@ from recon.camera.field_registration import NOT_ON_AXIS
 from recon.camera.local_convolution import FieldOfPsfs
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Wishes
+from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.part import Part
 
 
@@ -145,12 +145,12 @@ def test_one_psf_put_together_on_the_axis_is_told():
     scene = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=2)
     settings = {"z_um": float(scene.z_um[0]), "iterations": 3}
     result = recon.reconstruct(
-        scene.measurement, scene.calibration, choose=Wishes(model="convolution"), **settings
+        scene.measurement, scene.calibration, choose=Overrides(model="convolution"), **settings
     )
     assert NOT_ON_AXIS in result.warnings
     odd = make_scene("sparse-picture", size=48, seed=1001, z_near=1, z_far=1, fall_off_deg=40.0, grid=3)
     result = recon.reconstruct(
-        odd.measurement, odd.calibration, choose=Wishes(model="convolution"), **settings
+        odd.measurement, odd.calibration, choose=Overrides(model="convolution"), **settings
     )
     assert NOT_ON_AXIS not in result.warnings
 
