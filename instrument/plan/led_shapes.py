@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, Self
@@ -29,7 +30,7 @@ class LedPlaces(Protocol):
 
 
 @dataclass(frozen=True)
-class LedShape:
+class LedShape(ABC):
     """One named pattern; a subclass declares its options and which LEDs it lights.
 
     Registered in :mod:`instrument.plan.patterns`, it can be lit by plans, on the terminal and in the window.
@@ -46,18 +47,18 @@ class LedShape:
     help: ClassVar[str]
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
 
+    @abstractmethod
     def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs of an array are lit, ``(n_leds,)``."""
-        raise NotImplementedError
 
     def series(self, array: LedPlaces) -> Sequence[Self]:
         """Return the patterns of this kind that belong together, in order: all halves, all cells."""
         return (self,)
 
     @property
+    @abstractmethod
     def words(self) -> str:
         """What logs and metadata call it."""
-        raise NotImplementedError
 
     def on(self, array: LedPlaces, rgb: Rgb = WHITE) -> LedPattern:
         """Return the pattern for an array."""

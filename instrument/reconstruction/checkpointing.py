@@ -11,6 +11,7 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.base.declare import identity
+from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.stopping import StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
@@ -23,8 +24,9 @@ def require_kept(request: PictureRequest | VolumeRequest) -> None:
     ------
     BenchError
     """
-    if request.options.solver == "wiener":
-        raise BenchError("wiener is one shot: --checkpoint does not apply to it.")
+    solver = request.options.solver
+    if solver != "auto" and SOLVERS.named(solver).one_step:
+        raise BenchError(f"{solver} is one shot: --checkpoint does not apply to it.")
 
 
 def checkpoint_for(

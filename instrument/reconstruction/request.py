@@ -31,7 +31,7 @@ from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
-from recon.reconstruction.solvers import VOLUME_PRIORS
+from recon.reconstruction.solvers import SOLVERS, volume_priors
 from recon.solvers.base import Keeper
 from recon.solvers.stopping import IterationRecord
 from recon.types import Calibration
@@ -50,8 +50,8 @@ def _require_choice(asked: str, model: ModelName) -> None:
 
 
 def _require_volume_prior(prior: str | Prior) -> None:
-    if isinstance(prior, str) and prior not in VOLUME_PRIORS:
-        raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(VOLUME_PRIORS)}.")
+    if isinstance(prior, str) and prior not in (known := volume_priors()):
+        raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(known)}.")
 
 
 def _require_one_depth(calibration: Calibration, z_um: float | None) -> None:
@@ -100,10 +100,11 @@ class PictureRequest:
         options, inputs = self.options, self.inputs
         _require_known(inputs, options)
         rules = (options.iterations, options.time_s, options.tolerance, options.stop_at_noise or None)
-        if options.solver == "wiener" and rules != (None, None, None, None):
+        one_step = options.solver != "auto" and SOLVERS.named(options.solver).one_step
+        if one_step and rules != (None, None, None, None):
             raise BenchError(
-                "wiener is one shot: --iterations, --time, --tolerance and --stop-at-noise do not apply "
-                "to it."
+                f"{options.solver} is one shot: --iterations, --time, --tolerance and --stop-at-noise do not "
+                "apply to it."
             )
         if self.calibration is not None and self.psf is None:
             job = job_from_calibration(self.calibration, self.image, inputs)
@@ -163,7 +164,7 @@ class VolumeRequest:
         As :func:`instrument.reconstruction.volume_job.volume_job`.
     inputs : InputOptions
     options : ReconstructionOptions
-        Its prior must be one of :data:`recon.reconstruction.solvers.VOLUME_PRIORS`.
+        Its prior must be one of :func:`recon.reconstruction.solvers.volume_priors`.
     """
 
     image: Path

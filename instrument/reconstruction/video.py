@@ -30,6 +30,7 @@ from instrument.reconstruction.video_output import VideoPictures, create_output
 from instrument.reconstruction.video_source import has_light, require_video
 from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
 from instrument.runs.run import Run
+from recon.base.declare import inapplicable
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
@@ -159,6 +160,11 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         tau=options.tau,
         estimate_background=options.estimate_background,
     )
+    if request.over_time is not None and not problem.together:
+        raise BenchError(
+            "--over-time takes one PSF, one depth, no background and the cpu: frames are solved together as "
+            "the channels of one picture. Leave --over-time or the others out."
+        )
     if problem.n_planes > 1:
         raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
     reduction = picture.reduction
@@ -268,6 +274,9 @@ def _check(request: VideoRequest) -> None:
             "--time and --tolerance do not apply to --video: pictures must not depend on the machine. "
             "Use --iterations and --warm."
         )
+    if wrong := inapplicable(given, "video"):
+        names = ", ".join(o.name for o in wrong)
+        raise BenchError(f"{names}: not for a video. Leave it out.")
 
 
 def _first_picture(request: VideoRequest, run: Run, index: int) -> Job:

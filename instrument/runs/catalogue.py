@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from instrument.files.atomic import whole_file
 from instrument.runs.run import STATE, Run, RunCondition, RunError
@@ -26,6 +25,8 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
     FileError
         When ``path`` cannot be written.
     """
+    from matplotlib.figure import Figure
+
     stored = sorted(run.records)
     if not stored:
         raise RunError(run.path, "has no frames to show.")

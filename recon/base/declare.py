@@ -183,6 +183,8 @@ class Option:
             near = difflib.get_close_matches(value, words, 1)
             meant = f"; {near[0]!r}?" if near else "."
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
+        if self.kinds == (bool,) and not isinstance(value, bool):
+            return f"{name} must be True or False, not {value!r}."
         others = tuple(k for k in self.kinds if isinstance(k, type) and k not in (int, float, bool))
         if not {int, float} & set(self.kinds) or isinstance(value, (str, Path, *others)):
             return None

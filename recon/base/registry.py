@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
@@ -50,6 +51,8 @@ class Registry(Mapping[str, T], Generic[T]):
         self._own: dict[str, T] | None = None
         self._foreign: dict[str, T] = {}
         self._broken: dict[str, str] = {}
+        self._loading = threading.RLock()  # a plug-in may register itself while it is loaded
+        self._loaded = False
 
     def register(self, registered: T) -> T:
         """Offer an object under its name, for the rest of the program.
@@ -57,8 +60,13 @@ class Registry(Mapping[str, T], Generic[T]):
         Raises
         ------
         InputError
-            When the project itself has one of that name.
+            When the project itself has one of that name, or it has no name and help.
         """
+        if not all(isinstance(getattr(registered, word, None), str) for word in ("name", "help")):
+            raise InputError(
+                f"A {self.what} is registered as an object with a name and a help in one line; "
+                f"{registered!r} has not both."
+            )
         if registered.name in self._known_own():
             raise InputError(f"There is a {self.what} {registered.name!r} already: take another name.")
         self._foreign[registered.name] = registered
@@ -107,13 +115,17 @@ class Registry(Mapping[str, T], Generic[T]):
         return {**self._known_own(), **self._foreign}
 
     def _known_own(self) -> dict[str, T]:
-        if self._own is None:
-            from importlib.metadata import entry_points  # a tenth of a second: not for an import of recon
+        if self._loaded and self._own is not None:
+            return self._own
+        with self._loading:
+            if self._own is None:
+                from importlib.metadata import entry_points  # a tenth of a second: not for an import of recon
 
-            self._own = {registered.name: registered for registered in self._make_own()}
-            for point in entry_points(group=self.group):
-                self._load(point)
-        return self._own
+                self._own = {registered.name: registered for registered in self._make_own()}
+                for point in entry_points(group=self.group):
+                    self._load(point)
+                self._loaded = True
+            return self._own
 
     def _load(self, point: EntryPoint) -> None:
         package = f"of the installed package {point.dist.name!r}" if point.dist else f"({point.value})"

@@ -80,6 +80,14 @@ class LinearOperator(ABC):
     __array_ufunc__ = None
     """NumPy's numbers leave ``c * A`` to the operator."""
 
+    def __truediv__(self, divisor: object) -> LinearOperator:
+        """Divide by a real number other than 0."""
+        return Scaled(1.0 / float(divisor), self) if isinstance(divisor, Real) else NotImplemented
+
+    def __repr__(self) -> str:
+        """Say what it takes and gives."""
+        return f"<{type(self).__name__} {self.domain_shape} -> {self.range_shape}, {self.dtype}>"
+
     def __neg__(self) -> LinearOperator:
         """Return ``-A``."""
         return Scaled(-1.0, self)

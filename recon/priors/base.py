@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from recon.errors import StructureError
@@ -45,6 +46,12 @@ class Prior(ABC):
     def joined(self, other: Prior) -> Prior | None:
         """Return the sum with one other term as one prior where its prox is known; None where it is not."""
         return None
+
+    def __repr__(self) -> str:
+        """Say what it is and its parameters: the same for the same prior, as records and checkpoints need."""
+        own = {k: v for k, v in vars(self).items() if k != "memory" and not k.startswith("_")}
+        shown = (f"{k}={v.tolist() if isinstance(v, np.ndarray) else v!r}" for k, v in own.items())
+        return f"{type(self).__name__}({', '.join(shown)})"
 
     def __add__(self, other: Prior) -> Prior:
         """Return the sum of two priors: one prior where the prox of the sum is known, else a :class:`Sum`."""

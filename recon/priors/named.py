@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from recon.base.registry import Registry
+from recon.errors import InputError
 from recon.priors.base import Prior
 from recon.priors.simple import L1, NonNegativity, Zero
 from recon.priors.total_variation import HaarTotalVariation, TotalVariation
@@ -32,6 +33,8 @@ class NamedPrior:
         What it counts, which its default weight follows: differences, or light.
     weighted : bool
         Whether it has a weight at all; bounds have none.
+    pictures_only : bool
+        Whether it holds too little for volumes, PSFs that vary and backgrounds.
     accepts : callable
         ``accepts(problem)`` returns why the prior does not fit a problem, in words; None where it does.
     """
@@ -41,11 +44,32 @@ class NamedPrior:
     make: Callable[[float], Prior]
     kind: Literal["tv", "l1"] = "tv"
     weighted: bool = True
+    pictures_only: bool = False
     accepts: Callable[[object], str | None] = _nothing
 
     def __call__(self, weight: float) -> Prior:
-        """Return the prior of a weight."""
-        return self.make(weight)
+        """Return the prior of a weight.
+
+        Raises
+        ------
+        InputError
+            Where what was registered makes none.
+        """
+        try:
+            made = self.make(weight)
+        except TypeError as error:  # as of a class without prox
+            raise InputError(f"The prior {self.name!r} cannot be made: {error}.") from error
+        if not isinstance(made, Prior):
+            raise InputError(
+                f"The prior {self.name!r} is made as a {type(made).__name__}: a subclass of "
+                "recon.priors.Prior with value and prox is expected."
+            )
+        return made
+
+    @property
+    def exact(self) -> bool:
+        """Whether its prox is: a splitting with another would settle elsewhere."""
+        return all(term.exact for term in self(1.0).terms())
 
 
 def _own() -> Iterable[NamedPrior]:
@@ -78,7 +102,9 @@ def _own() -> Iterable[NamedPrior]:
             kind="l1",
             weighted=False,
         ),
-        NamedPrior("none", "Nothing is known.", lambda _: Zero(), kind="l1", weighted=False),
+        NamedPrior(
+            "none", "Nothing is known.", lambda _: Zero(), kind="l1", weighted=False, pictures_only=True
+        ),
     )
 
 

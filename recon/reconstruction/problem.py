@@ -37,7 +37,7 @@ from recon.reconstruction.options import Field, ReconstructionOptions
 from recon.reconstruction.overrides import Precision
 from recon.reconstruction.result import Grid, Reconstruction
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver, solver_for
-from recon.reconstruction.weights import CameraClass, kind_of, name_of, require_prior
+from recon.reconstruction.weights import CameraClass, name_of, require_prior
 from recon.types import Calibration
 
 if TYPE_CHECKING:
@@ -183,7 +183,14 @@ class Problem:
         ----------
         image : array, shaped as the measurement's
             Less its background where the measurement was given without one.
+
+        Raises
+        ------
+        InputError
+            When it is shaped otherwise, or this problem was reduced for its photograph by ``choose``.
         """
+        if self.reduction is not None:
+            raise InputError("This problem was reduced for one photograph: choose anew for another.")
         measurement = replace(self.measurement, image=image)
         counts = measurement.channels()
         if counts.shape != self.data.shape or measurement.flat != self.flat:
@@ -295,7 +302,7 @@ class Problem:
 
         l1 counts light on the sensor: no voxel may be the cheaper explanation.
         """
-        if kind_of(self.prior_name) == "tv" or self.prior_name != "l1" or self.is_plain:
+        if self.prior_name != "l1" or self.is_plain:
             return self.depths, np.ones((1, 1, 1), np.float32)
         return levelled(self.depths, self.sensor_shape, varying=self.varies)
 
@@ -359,8 +366,9 @@ class Problem:
         """
         shape = (self.n_channels, self.n_planes, *grid_shape)
         scale = self.image_scale[channels]
-        if before.state is not None and before.state.shape == shape:
-            return np.asarray(before.state[channels] / scale)
+        same_grid = self.levelled[1].shape[1:] in ((1, 1), grid_shape)
+        if before.state is not None and before.state.shape == shape and same_grid:
+            return np.asarray(before.state[channels] * self.levelled[1] / scale, self.precision)
         rows, columns = self.window
         needed = (self.n_planes, rows.stop - rows.start, columns.stop - columns.start)
         volume = before.volume if before.volume.ndim == 4 else before.volume[..., None]
@@ -437,6 +445,10 @@ def _require(options: ReconstructionOptions) -> None:
         tau=options.tau,
         z_um=options.z_um,
     )
+    if options.tau is not None and isinstance(options.prior, Prior):
+        raise InputError(
+            "tau weighs a prior by name; a prior given as an object has its own weight: leave tau out."
+        )
     if options.positive_background and options.estimate_background is False:
         raise InputError("A positive background cannot be had without estimating one: leave one of them out.")
 

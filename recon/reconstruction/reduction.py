@@ -13,6 +13,7 @@ from recon.base.declare import record
 from recon.base.noise import averaged_noise
 from recon.camera.camera_model import Extent, members_of_depths
 from recon.camera.field_registration import NOT_ON_AXIS
+from recon.errors import InputError
 from recon.reconstruction.between import with_planes_between
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import Colours, merged_input
@@ -188,10 +189,14 @@ def reduced_start(problem: Problem, before: Reconstruction) -> Reconstruction:
     """Return a reconstruction to start from on a smaller problem's pixels, depths and channels."""
     reduction = problem.reduction
     assert reduction is not None
-    choice = reduction.choice
+    choice, given = reduction.choice, reduction.given
     volume = before.volume
+    expected = (*given.grid.shape, *(() if given.flat else (given.n_channels,)))
+    if volume.shape != expected:
+        raise InputError(f"The volume to start from is {volume.shape}; this measurement needs {expected}.")
     if reduction.tint is not None:
-        volume = np.mean(volume / reduction.tint.spread(np.ones(())), axis=-1)
+        colours = reduction.tint.spread(np.ones(()))
+        volume = (volume @ colours) / float(colours @ colours)
     if choice.binning > 1:
         first = volume if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
         first = block_mean(first, choice.binning, about_axis=True) * choice.binning**2

@@ -17,7 +17,7 @@ from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.positive_background import in_turns, is_negative, may_go_on
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reduction import bring_back, put_planes_back, reduced_start
+from recon.reconstruction.reduction import bring_back, places_of, put_planes_back, reduced_start
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
@@ -78,7 +78,7 @@ def solve(
         When the solver has no way for the problem, or it does not fit into memory.
     """
     if options is not None:
-        problem = replace(problem, options=options)
+        problem = _with_options(problem, options)
     if problem.model == "auto":
         problem = choose(problem)
     if problem.reduction is None:
@@ -93,11 +93,16 @@ def solve(
             None if on_progress is None else _shown(problem, on_progress),
             cancel,
             keeper,
-            f"round-{rounds}-" if rounds else "",
+            f"planes-{'_'.join(map(str, places_of(problem.reduction.choice)))}-" if rounds else "",
         )
         spent += result.seconds
-        if best is None or not _cut_short(result) or _objective(result) < _objective(best[0]):
+        lost = StopReason.NOT_FINITE in result.stop_reasons
+        if best is None or (
+            not lost and (not _cut_short(result) or _objective(result) < _objective(best[0]))
+        ):
             best = result, problem
+        if lost:
+            break
         more = put_planes_back(problem, result, rounds)
         out_of_time = limit is not None and spent >= limit
         if more is None or out_of_time or StopReason.CANCELLED in result.stop_reasons:
@@ -189,6 +194,29 @@ def rules_of(problem: Problem, offered: OfferedSolver, runs: int = 1) -> Stoppin
         raise InputError(str(error)) from error
 
 
+_SETTLED = ("model", "z_um", "estimate_background", "positive_background", "precision", "field", "choose")
+"""Options that a problem is made with: others than its own would be ignored."""
+
+
+def _with_options(problem: Problem, options: ReconstructionOptions) -> Problem:
+    """Return a problem that is solved with other options; InputError for those that it was made with."""
+    reduction = problem.reduction
+    made_with = problem.options if reduction is None else reduction.given.options
+    changed = [name for name in _SETTLED if getattr(options, name) != getattr(made_with, name)]
+    if changed and options != problem.options:
+        raise InputError(
+            f"{', '.join(changed)}: a problem is made with these. Make another one by "
+            "Problem.of(measurement, calibration, options)."
+        )
+    if reduction is not None:
+        own = {name: getattr(problem.options, name) for name in _SETTLED}
+        given = replace(
+            reduction.given, options=replace(options, **{n: getattr(made_with, n) for n in _SETTLED})
+        )
+        return replace(problem, options=replace(options, **own), reduction=replace(reduction, given=given))
+    return replace(problem, options=options)
+
+
 def _require_tau(problem: Problem, offered: OfferedSolver) -> None:
     if problem.options.tau is None or offered.one_step or is_weighted(problem.prior_name):
         return
@@ -231,9 +259,10 @@ def _run(
                 part.without(background)
                 return offered.make(part, None)
 
-            outcome, smooth, solver = in_turns(
-                smooth, first, again, part.positive_background, rules, tell, cancel
-            )
+            def nearest(found: Array) -> Array:
+                return part.positive_background(part.lifted(found))
+
+            outcome, smooth, solver = in_turns(smooth, first, again, nearest, rules, tell, cancel)
     solution = part.lifted(outcome.solution)
     signs = None
     if problem.extent.left_out is not None:
@@ -341,6 +370,8 @@ def _verdict(
         )
         if not own
     ]
+    if problem.n_planes > 1 and result.solver != "admm" and not foreign:
+        foreign.append(f"volumes by the solver {result.solver}")
     if problem.model in CAMERAS:
         foreign.append(f"the camera model {problem.model}")
     if problem.patterned:

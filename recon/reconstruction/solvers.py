@@ -87,10 +87,14 @@ class OfferedSolver:
         return self.tolerance(problem) if callable(self.tolerance) else self.tolerance
 
 
-VOLUME_PRIORS = ("tv", "tv-isotropic", "l1", "nonnegative")
-"""Priors by name of volumes, of PSFs that vary over the field, with a background, and on a GPU."""
-SPLITTING_PRIORS = (*VOLUME_PRIORS, "none")
-"""Priors by name that the splittings of pictures have a way for."""
+def splitting_priors() -> tuple[str, ...]:
+    """Return the priors by name that splittings have a way for: those whose prox is exact."""
+    return tuple(name for name, prior in PRIORS.items() if prior.exact)
+
+
+def volume_priors() -> tuple[str, ...]:
+    """Return those of volumes, of PSFs that vary over the field, with a background, and on a GPU."""
+    return tuple(name for name in splitting_priors() if not PRIORS[name].pictures_only)
 
 
 _ONE_LIGHT = "it is for photographs in one light (fista takes patterns)"
@@ -109,13 +113,11 @@ def _plain_only(problem: Problem) -> str | None:
 
 
 def _by_name(problem: Problem, priors: Iterable[str], where: str = "") -> str | None:
-    """Refuse a prior by name that is not among the project's own here, and any whose prox is inexact."""
+    """Refuse a prior by name that is not among these, and any whose prox is inexact."""
     prior = problem.prior
     if not isinstance(prior, Prior):
-        if PRIORS.is_own(prior):
-            refused = f"{where} it takes the priors {', '.join(priors)}, not {prior!r}".strip()
-            return None if prior in priors else refused
-        prior = PRIORS[prior](1.0)
+        refused = f"{where} it takes the priors {', '.join(priors)}, not {prior!r}".strip()
+        return None if prior in priors else refused
     inexact = [type(term).__name__ for term in prior.terms() if not term.exact]
     return f"the prox of {inexact[0]} is inexact: a splitting would settle elsewhere" if inexact else None
 
@@ -129,8 +131,8 @@ def _admm_refuses(problem: Problem) -> str | None:
             f"{problem.options.device}"
         )
     if problem.together:
-        return _by_name(problem, SPLITTING_PRIORS)
-    return _by_name(problem, VOLUME_PRIORS, "for volumes, varying PSFs, backgrounds and a GPU")
+        return _by_name(problem, splitting_priors())
+    return _by_name(problem, volume_priors(), "for volumes, varying PSFs, backgrounds and a GPU")
 
 
 def _admm(part: Part, start: Array | None) -> Runs:
@@ -242,7 +244,7 @@ def _offered() -> tuple[OfferedSolver, ...]:
             name="admm-sensor",
             help="Splitting with the data term solved on the sensor, for dense pictures of many pixels.",
             make=_sensor_admm,
-            refuses=lambda problem: _plain_only(problem) or _by_name(problem, SPLITTING_PRIORS),
+            refuses=lambda problem: _plain_only(problem) or _by_name(problem, splitting_priors()),
             cost=2.0,
         ),
         OfferedSolver(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from recon.errors import InputError
 from recon.priors import PRIORS, Prior
 
 CameraClass = Literal["picture", "planes", "varying", "varying, with a background"]
@@ -80,7 +81,13 @@ def name_of(prior: str | Prior) -> str:
     return prior if isinstance(prior, str) else "+".join(type(t).__name__ for t in prior.terms())
 
 
-def require_prior(prior: str | Prior) -> None:
+def require_prior(prior: object) -> None:
     """Raise InputError for what is neither a prior nor the name of one."""
-    if not isinstance(prior, Prior):
-        PRIORS.named(prior)
+    if isinstance(prior, Prior):
+        return
+    if not isinstance(prior, str):
+        names = ", ".join(PRIORS)
+        raise InputError(
+            f"A prior is a name ({names}) or an object like TotalVariation(0.1); found {prior!r}."
+        )
+    PRIORS.named(prior)

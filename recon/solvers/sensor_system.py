@@ -130,6 +130,8 @@ class SensorSystem:
         while float(xp.linalg.norm(residual)) > target and self.steps < self.max_steps:
             z = self._filtered(residual, self._preconditioner)
             rho, rho_before = float(xp.vdot(residual, z)), rho
+            if not rho > 0:  # what is left is less than the arithmetic can tell
+                break
             direction *= rho / rho_before if self.steps else 0.0
             direction += z
             image = direction + self._bend(direction)

@@ -128,15 +128,20 @@ def solve_together(
             "A prior over time joins frames as the channels of one problem: it takes one PSF, one depth, no "
             "background and the cpu. Leave the prior over time out."
         )
+    if problem.patterned or problem.options.solver not in ("auto", "admm-sensor"):
+        raise InputError(
+            "A prior over time has a solver of its own, for frames in one light: leave the solver or the "
+            "prior over time out."
+        )
     shape = problem.sensor_shape
     part = Part(problem, slice(0, 1))
     part.weigh(problem.options.tau)
     psfs = problem.depths.central[0] / problem.energy[:, None, None]
     operator: LinearOperator = PadCropConvolution(psfs, shape, n_channels=len(frames), dtype=part.dtype)
-    data = frames / problem.noise[:, None, None]
+    data = np.stack([problem.with_data(frame).data[0] for frame in frames])
     if not problem.valid.all():
         valid = np.repeat(problem.valid, len(frames), axis=0)
-        operator, data = Erasures(valid, data.shape, part.dtype) @ operator, np.where(valid, data, 0)
+        operator = Erasures(valid, data.shape, part.dtype) @ operator
     scale = part.weight * (1.0 if weight is None else weight)
     prior_over_time: OverTime = (
         TemporalTotalVariation(scale)

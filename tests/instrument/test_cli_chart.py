@@ -113,7 +113,7 @@ def test_a_chart_tells_noise_erasures_and_truth_apart():
 def test_the_noise_that_the_photograph_tells_is_used():
     from instrument.evaluation.chart_problems import problem_of_job
 
-    calibration = Calibration(np.ones((1, 1, 8, 8), np.float32), np.array([[0, 0, 1e4]]))
+    calibration = Calibration(np.eye(8, dtype=np.float32)[None, None], np.array([[0, 0, 1e4]]))
     grey = Job(np.ones((8, 8), np.float32), calibration, {}, known_noise=NoiseModel(3.0, 0.3))
     assert problem_of_job(grey, None, volume=False)[0].noise == NoiseModel(3.0, 0.3)
     colour = replace(grey, measurement=np.ones((8, 8, 3), np.float32))

