@@ -1,4 +1,4 @@
-"""Holographic displays: ``hologram`` computes what shows a picture; ``etendue`` and ``table7.1`` in figures."""
+"""Holographic displays: ``hologram`` computes what shows a picture; ``etendue``, ``table7.1`` in figures."""
 
 from __future__ import annotations
 
