@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,9 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import load_config
 from instrument.bench.safety import StepsFailedError
 from instrument.cli.app import App, BenchOption, examples, open_and_say
+from instrument.cli.options import Given
 from instrument.cli.progress import keys, one_task, progress_bar
-from instrument.files.errors import BenchError, FileError, duration, size
+from instrument.files.errors import FileError, duration, size
 from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.plan import Plan, check
 from instrument.plan.model import load_plan
@@ -29,8 +30,9 @@ from instrument.runs.inspection import verify as verify_run
 from instrument.runs.run import BENCH_TOML, FinishReason, Run, RunCondition
 from instrument.runs.runner import Runner, RunState, RunStatus
 from instrument.runs.writer import RunWriter
+from recon.base.declare import option
 
-list_app, verify_app, export_app = App(), App(), App()
+run_app, resume_app, list_app, verify_app, export_app = App(), App(), App(), App(), App()
 
 
 @list_app.command(name="list", epilog=examples("diffuserbench list", "diffuserbench list /data/monday"))
@@ -100,6 +102,36 @@ def _advance(bar: Progress, done: int, _total: int) -> None:
     bar.update(bar.task_ids[0], completed=done)
 
 
+def _slice(text: str) -> slice:
+    numbers = [int(part) if part else None for part in text.split(":")]
+    if len(numbers) == 1 and numbers[0] is not None:
+        return slice(numbers[0], numbers[0] + 1)
+    if len(numbers) > 3 or numbers[2:] == [0]:
+        raise ValueError("give A:B, e.g. 0:100, or one number.")
+    return slice(*numbers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Which frames of a run are written, and how fast a film of them plays."""
+
+    label: str | None = option(None, help="Only steps of this label.", applies=("run",))
+    frames: slice | None = option(
+        None,
+        help="Only frames A to B - 1; A:B:C every C-th.",
+        metavar="A:B",
+        applies=("run",),
+        parse=_slice,
+    )
+    frames_per_s: float | None = option(
+        None,
+        help="Frames a second of an MP4.",
+        least=0.1,
+        flags=("--fps",),
+        applies=("run",),
+    )
+
+
 @export_app.command(
     epilog=examples(
         "diffuserbench export RUN psfs.ome.tif --label psf",
@@ -120,33 +152,21 @@ def export(
             "A picture: .tif, .npy, .png; a volume: .tif, .npy, .ome.zarr.",
         ),
     ],
-    label: Annotated[
-        str | None, typer.Option("--label", help="Only steps of this label.", show_default=False)
-    ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            "--frames", metavar="A:B", help="Only frames A to B - 1; A:B:C every C-th.", show_default=False
-        ),
-    ] = None,
-    frames_per_s: Annotated[
-        float | None,
-        typer.Option("--fps", min=0.1, help="Frames a second of an MP4.", show_default=False),
-    ] = None,
+    options: ExportOptions,
+    given: Given,
 ) -> None:
     """Write a run's stored frames, or a reconstruction, for other programs; what is there stays as it is.
 
     Frames that are not there (gaps of a recording, steps not done) are left out, and said.
     """
     if _is_result(run):
-        if (label, frames, frames_per_s) != (None, None, None):
-            raise BenchError("--label, --frames and --fps are for runs; leave them out for a reconstruction.")
+        given.refuse("a reconstruction", "reconstruction")
         _export_result(run, target)
         return
     found = Run.open(run)
-    wanted = set(range(found.n_frames)[_slice(frames)])
-    if label is not None:
-        wanted &= {step.index for step in found.steps(label)}
+    wanted = set(range(found.n_frames)[options.frames or slice(None)])
+    if options.label is not None:
+        wanted &= {step.index for step in found.steps(options.label)}
     indices = [index for index in sorted(found.records) if index in wanted]
     with progress_bar() as bar:
         task = bar.add_task("Frames", total=len(indices), note="")
@@ -154,7 +174,7 @@ def export(
             found,
             target,
             indices,
-            frames_per_s=frames_per_s,
+            frames_per_s=options.frames_per_s,
             on_progress=lambda done, _: bar.update(task, completed=done),
         )
     typer.echo(f"Wrote {len(indices)} frames: {target}")
@@ -181,21 +201,6 @@ def _export_result(path: Path, target: Path) -> None:
     typer.echo(f"Wrote {target}")
     if steps and target.suffix.lower() != ".npy":
         typer.echo(f"{'Planes':<12}{steps}")
-
-
-def _slice(text: str | None) -> slice:
-    if text is None:
-        return slice(None)
-    try:
-        numbers = [int(part) if part else None for part in text.split(":")]
-        if len(numbers) == 1 and numbers[0] is not None:
-            return slice(numbers[0], numbers[0] + 1)
-        return slice(*numbers)
-    except (ValueError, TypeError):
-        raise typer.BadParameter(f"--frames {text!r}: give A:B, e.g. 0:100, or one number.") from None
-
-
-run_app, resume_app = App(), App()
 
 
 @run_app.command(

@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.bench.photograph import Progress
 from instrument.files.errors import FileError
 from instrument.files.record import RecordFormat
 from instrument.plan import Plan, Step
@@ -28,6 +27,8 @@ from instrument.runs.log import FrameRecord, Gap, read_lines
 
 if TYPE_CHECKING:
     import zarr
+
+    from instrument.bench.photograph import Progress
 
 
 PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
