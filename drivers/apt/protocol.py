@@ -2,8 +2,9 @@
 
 A header of six bytes: message number, then either two parameters or the length of the data that follow, then
 destination (its highest bit set when data follow) and source. Little endian. There are no checksums: bytes
-are taken for a message only when number, length and both ends are right. Then: which actuators and controllers
-there are, what a count is, and how far they go.
+are taken for a message only when number, length and both ends are right.
+
+Then: which actuators and controllers there are, what a count is, and how far they go.
 """
 
 from __future__ import annotations
