@@ -139,8 +139,8 @@ _MAX_RLE_RUN = 255
 _END_OF_LINE = b"\x00\x00"
 
 # Pattern images: header (section 2.4.2) and compression (section 2.4.3). A pattern has up to 8 bits a pixel,
-# an image 24: each pixel's level is written to all three bytes, so that the pattern is the same from whichever
-# of the image's bits it is taken.
+# an image 24: each pixel's level is written to all three bytes, so that the pattern is the same from
+# whichever of the image's bits it is taken.
 Levels = npt.NDArray[np.uint8]
 Numbers = npt.NDArray[np.intp]
 
