@@ -42,7 +42,7 @@ from recon.holography import (
     field_of_view_for_eyebox,
     pixels_for,
 )
-from recon.holography.table71 import GRIDS, METHODS, Cell, run_table
+from recon.holography.judge import GRIDS, METHODS, Cell, run_table
 
 hologram_app, etendue_app, table_app = App(), App(), App()
 

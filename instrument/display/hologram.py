@@ -33,9 +33,9 @@ from recon.holography import (
 )
 from recon.holography.display import greatest_defocus_mm
 from recon.holography.judge import compare
-from recon.holography.lowpass import make_band
 from recon.holography.options import Fit
 from recon.holography.pose import NODES, Pose
+from recon.holography.target import make_band
 
 if TYPE_CHECKING:
     from drivers.slm import Slm

@@ -18,8 +18,8 @@ from instrument.files.figures import Convergence, Panel, Summary, save_figure, s
 from instrument.files.images import side_car, write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.holography import Display, HologramOptions
+from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 from recon.holography.losses import loss_of
-from recon.holography.table71 import DISSERTATION, GRIDS, METHODS, Cell, average
 
 CHANNELS = ("red", "green", "blue")
 
@@ -72,10 +72,6 @@ class HologramFiles:
 
     def write(self, number: int, channel: int, result: HologramResult) -> None:
         """Write one hologram's patterns and its preview."""
-        from instrument.display.hologram_files import (
-            write_hologram_figure,  # matplotlib, only where it is drawn
-        )
-
         display = self.displays[channel]
         facts = {
             **result.facts(self.options),
