@@ -22,8 +22,7 @@ import numpy.typing as npt
 from instrument.files.atomic import check_writable, whole_file, write_text
 from instrument.files.errors import FileError
 from instrument.files.record import plain
-from recon.solvers.base import Solver
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Solver
 
 PROBLEM = "problem.json"
 _STATE = "state/"

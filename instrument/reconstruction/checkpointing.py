@@ -12,7 +12,7 @@ from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.base.declare import identity
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 

@@ -15,7 +15,7 @@ from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.volume_source import VolumeSource, open_volume
 from instrument.files.volume_zarr import is_zarr_name
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 from recon.verdict.verdict import Region
 
 

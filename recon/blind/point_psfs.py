@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.base import fft
 from recon.blind.field_functions import FieldFunctions
 from recon.blind.point_step import Points
-from recon.camera.local_convolution import field_of
+from recon.camera.varying_psfs import field_of
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

@@ -17,7 +17,7 @@ from recon.reconstruction.overrides import Overrides
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.precision import drift, precision_of
 from recon.reconstruction.reduction import reduced_calibration
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 
 solving = sys.modules[recon.solve.__module__]
 
