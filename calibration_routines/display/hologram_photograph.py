@@ -23,8 +23,8 @@ from recon.base.declare import option
 from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
-from recon.holography.lowpass import make_band
 from recon.holography.options import Envelope
+from recon.holography.target import make_band
 
 Array = npt.NDArray[Any]
 HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"

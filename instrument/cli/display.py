@@ -18,7 +18,7 @@ from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample
 from recon.base.declare import option
 from recon.base.option_text import size
 from recon.holography import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
-from recon.holography.table71 import GRIDS, METHODS, Cell, run_table
+from recon.holography.judge import GRIDS, METHODS, Cell, run_table
 
 etendue_app, table_app = App(), App()
 

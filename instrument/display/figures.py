@@ -13,7 +13,7 @@ import numpy.typing as npt
 from instrument.display.hologram_job import HologramResult
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
-from recon.holography.table71 import DISSERTATION, GRIDS, METHODS, Cell, average
+from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
 
 _DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
 

@@ -26,8 +26,8 @@ from recon.holography import (
     compute_hologram,
 )
 from recon.holography.judge import compare
-from recon.holography.lowpass import make_band
 from recon.holography.options import Fit
+from recon.holography.target import make_band
 
 Image = npt.NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.blind.point_step import Points
+from recon.blind.points import Points
 from recon.blind.polish import first_psf, offset_of, points_on_grid, polish
 from recon.blind.psf_step import BeadMixer, refuse_what_is_no_beads, solve_psfs
 from recon.camera.registration import shifted

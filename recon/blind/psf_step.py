@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.point_step import Points
+from recon.blind.points import Points
 from recon.camera.base import Array
 from recon.camera.registration import LOCAL_MEAN_PX
 from recon.camera.varying_psfs import field_of

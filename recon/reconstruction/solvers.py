@@ -160,10 +160,9 @@ def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Ru
     from recon.solvers.operator_admm import OperatorAdmm
     from recon.solvers.splitting import SensorData
 
-    problem = part.problem
-    mean = np.broadcast_to(problem.axis_weights, (problem.n_planes, 3)).mean(axis=0)
     data = SensorData(part.data, part.valid[0], part.removal)
-    return OperatorAdmm(camera, part.central, data, part.prior_on(mean, (False,) * 3), initial=start)
+    prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
+    return OperatorAdmm(camera, part.central, data, prior, initial=start)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Runs:

@@ -12,8 +12,7 @@ from recon.camera.registration import displacement, shifted
 from recon.camera.varying_psfs import FieldOfPsfs, field_of, interpolation_weights, local_convolution
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser
-from recon.optics.grid import PixelGrid
-from recon.optics.spectrum import mixed_spectrum
+from recon.optics.grid import PixelGrid, mixed_spectrum
 from tests.recon.optics.rays import RayPropagator
 
 SENSOR, PSF = (16, 18), (7, 5)

@@ -1,4 +1,4 @@
-"""The half-step for the beads as points: each bead's place between pixels and its light, the PSFs fixed.
+"""Beads as points: the half-steps for their places and light, and for smooth PSFs on their support.
 
 On a grid of pixels a bead between them is a blob, and the PSF that fits it too sharp: with spots hardly wider
 than a pixel this model error exceeds the noise. A point with a continuous place has none of it.
@@ -6,16 +6,53 @@ than a pixel this model error exceeds the noise. A point with a continuous place
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.field_functions import FieldFunctions
+from recon.camera.varying_psfs import field_of
 
 Array = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
+Numbers = npt.NDArray[Any]
+
+
+class FieldFunctions:
+    """What PSFs vary with: polynomials of the field's coordinates, orthonormal over the places of the beads.
+
+    PSFs that are combinations of ``k`` images weighted with ``k`` functions have rank ``k`` at most (Kuo
+    2020, Eq. 5.13), and vary over the field no faster than the functions do: 1, 3, 6 for degrees 0, 1, 2.
+    Beyond the rectangle of the beads, where nothing was measured, they stay what they are at its border.
+
+    Parameters
+    ----------
+    degree : int
+    places : ndarray, (n, 2)
+        ``(row, column)`` of the beads; at least as many as functions, not all on a line.
+    """
+
+    def __init__(self, degree: int, places: Floats) -> None:
+        self.degree = degree
+        self._low, self._high = places.min(axis=0), places.max(axis=0)
+        _, upper = np.linalg.qr(self._monomials(places) / np.sqrt(len(places)))
+        # QR leaves the signs open; like this the first function is 1, and its image the mean PSF.
+        self._to_orthonormal = upper * np.sign(np.diag(upper))[:, None]
+        self.count = len(upper)
+
+    def at(self, places: Floats) -> Floats:
+        """Return the functions' values at places (n, 2): (n, count)."""
+        return np.asarray(np.linalg.solve(self._to_orthonormal.T, self._monomials(places).T).T)
+
+    def _monomials(self, places: Floats) -> Floats:
+        middle, half = (self._low + self._high) / 2, np.maximum((self._high - self._low) / 2, 1e-9)
+        row, column = np.clip((places - middle) / half, -1, 1).T
+        powers = [(n - m, m) for n in range(self.degree + 1) for m in range(n + 1)]
+        return np.stack([row**i * column**j for i, j in powers], axis=1)
+
 
 _MARGIN = 4  # pixels around a PSF for the tails of a shift between pixels
 _LARGEST_MOVE_PX = 0.5
@@ -23,6 +60,9 @@ _HALVINGS = 3
 _SAME_PX = 0.7  # points nearer to one another are one
 _WEAKEST = 0.15  # of the median light: what is dimmer is no bead of the slide
 _SURE = 5.0  # times its own noise, for a bead to be believed
+_BLUR_PX = 0.8  # of the image in which the support is found
+_ABOVE_NOISE = 3.0  # standard deviations: fainter pixels would sum to a haze of noise
+_LEAST_PX = 4  # pixels in one piece
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,3 +236,121 @@ def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -
     added = np.array(distant)
     lights = np.array([rolled[int(r) + reach[0], int(c) + reach[1]] for r, c in added])
     return Points(np.concatenate([points.places, added]), np.concatenate([points.light, lights]))
+
+
+class PointMixer:
+    """The map from PSFs to images with points fixed: ``b_i = C sum_b a_b sum_k phi_k(x_b) p_k(u - x_b)``.
+
+    Parameters
+    ----------
+    beads : sequence of Points
+        One an image.
+    functions : FieldFunctions
+        ``phi_k``.
+    psf_shape, sensor_shape : (int, int)
+
+    Attributes
+    ----------
+    lipschitz : float
+        Squared norm without the cropping, which only lessens it: the largest over the frequencies of the
+        squared norm of the matrix (n_images, n_functions) that the map is at each.
+    """
+
+    def __init__(
+        self,
+        beads: Sequence[Points],
+        functions: FieldFunctions,
+        psf_shape: tuple[int, int],
+        sensor_shape: tuple[int, int],
+    ) -> None:
+        self._psf, self._sensor = psf_shape, sensor_shape
+        field_shape, centre = field_of(sensor_shape, psf_shape)
+        self._grid = fft.fast_shape(field_shape)
+        f_y, f_x = np.fft.fftfreq(self._grid[0]), np.fft.rfftfreq(self._grid[1])
+        self._spectra = np.empty((len(beads), functions.count, len(f_y), len(f_x)), np.complex64)
+        for points, out in zip(beads, self._spectra, strict=True):
+            weights = functions.at(points.places) * points.light[:, None]
+            rows = np.exp(-2j * np.pi * np.outer(points.places[:, 0] + centre[0], f_y)).astype(np.complex64)
+            columns = np.exp(-2j * np.pi * np.outer(points.places[:, 1] + centre[1], f_x))
+            for k in range(functions.count):
+                out[k] = rows.T @ (weights[:, k, None] * columns).astype(np.complex64)
+        self.lipschitz = self._largest()
+
+    def forward(self, psfs: Numbers) -> Array:
+        """Return images (n_images, height, width) of PSFs (n_functions, psf height, psf width)."""
+        padded = np.zeros((len(psfs), *self._grid), np.float32)
+        padded[:, : self._psf[0], : self._psf[1]] = psfs
+        spectra = fft.rfft(padded)
+        seen = np.stack([np.einsum("kyx,kyx->yx", row, spectra) for row in self._spectra])
+        return np.ascontiguousarray(fft.irfft(seen, self._grid[1])[self._window])
+
+    def adjoint(self, images: Numbers) -> Array:
+        """Return the exact transpose."""
+        padded = np.zeros((len(images), *self._grid), np.float32)
+        padded[self._window] = images
+        spectra = np.conj(fft.rfft(padded))
+        total = np.zeros(self._spectra.shape[1:], np.complex64)
+        for row, image in zip(self._spectra, spectra, strict=True):
+            total += row * image
+        back = fft.irfft(np.conj(total), self._grid[1])
+        return np.ascontiguousarray(back[:, : self._psf[0], : self._psf[1]])
+
+    @property
+    def _window(self) -> tuple[slice, slice, slice]:
+        (top, left), (height, width) = ((n - 1 for n in self._psf), self._sensor)
+        return slice(None), slice(top, top + height), slice(left, left + width)
+
+    def _largest(self) -> float:
+        largest = 0.0
+        for row in range(self._spectra.shape[2]):  # one row of frequencies at a time: little memory
+            s = self._spectra[:, :, row]
+            gram = np.einsum("nkx,njx->xkj", np.conj(s), s)
+            largest = max(largest, float(np.linalg.eigvalsh(gram)[:, -1].max()))
+        return largest
+
+
+def solve_smooth(
+    mixer: PointMixer, images: Numbers, start: Numbers, support: Numbers | None, iterations: int
+) -> tuple[Array, float]:
+    """Fit the PSFs of all field functions to the images: FISTA with the projection on the support as prox.
+
+    The set is a subspace and the step ``1 / lipschitz``, so it converges to the least squares on it.
+
+    Returns
+    -------
+    ndarray, float32, (n_functions, psf height, psf width)
+    float
+        ``||f - b||``.
+    """
+    kept = np.float32(1) if support is None else support.astype(np.float32)
+    step = np.float32(1 / mixer.lipschitz)
+    x: Array = np.asarray(start * kept, np.float32)
+    y, t = x, 1.0
+    for _ in range(iterations):
+        new = (y - step * mixer.adjoint(mixer.forward(y) - images)) * kept
+        t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
+        y = new + np.float32((t - 1) / t_next) * (new - x)
+        x, t = new, t_next
+    return x, float(np.linalg.norm(mixer.forward(x) - images))
+
+
+def support_of(psf: Numbers) -> npt.NDArray[np.bool_]:
+    """Return where a noisy PSF (height, width) has light: above the noise, in pieces of several pixels.
+
+    The noise is read from the negative values, which light does not have. Elsewhere nothing but noise would
+    be fitted, and the sum of a little noise in many pixels is a haze over every reconstruction.
+    """
+    from scipy import ndimage
+
+    smooth = ndimage.gaussian_filter(np.asarray(psf, np.float32), _BLUR_PX)
+    negative = smooth[smooth < 0]
+    if not negative.size:
+        return np.ones(psf.shape, bool)
+    noise = float(np.sqrt(np.mean(negative**2)))
+    lit = smooth > _ABOVE_NOISE * noise
+    pieces, count = ndimage.label(lit)
+    if not count:
+        return np.ones(psf.shape, bool)
+    sizes = ndimage.sum_labels(lit, pieces, np.arange(count + 1))
+    support: npt.NDArray[np.bool_] = ndimage.binary_dilation(sizes[pieces] >= _LEAST_PX)
+    return support if support.any() else np.ones(psf.shape, bool)
