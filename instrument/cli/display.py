@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -47,8 +46,8 @@ from recon.holography.judge import GRIDS, METHODS, Cell, run_table
 hologram_app, etendue_app, table_app = App(), App(), App()
 
 
-def _pictures(typed: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in typed.split(","))
+def _pictures(typed: str) -> list[str]:
+    names = [name.strip() for name in typed.split(",")]
     if unknown := [name for name in names if name not in SAMPLES]:
         raise ValueError(f"there is no sample picture {unknown[0]!r}. Pictures: {', '.join(SAMPLES)}.")
     return names
@@ -103,7 +102,7 @@ class TableOptions:
         metavar="N",
         parse=_square,
     )
-    pictures: Sequence[str] = option(
+    pictures: list[str] = option(
         DEFAULT_SAMPLES,
         help=f"Of {', '.join(SAMPLES)}; names with commas.",
         default_words=",".join(DEFAULT_SAMPLES),

@@ -29,7 +29,7 @@ from instrument.reconstruction.volume_file import write_volume
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 from recon.verdict.verdict import Verdict
 
 

@@ -27,8 +27,7 @@ from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.base.declare import identity
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.base import Solver
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, Solver, StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 

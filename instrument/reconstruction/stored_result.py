@@ -14,7 +14,7 @@ import numpy.typing as npt
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.volumes import VolumeSource, is_zarr_name, open_volume
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 from recon.verdict.verdict import Region
 
 

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, check_psf, select_psf
-from recon.base.options import require_options
+from recon.base.checks import as_channels, check_psf, require_options, select_psf
 from recon.camera.camera_model import (
     Depths,
     Extent,
     ModelName,
     choose_model,
+    energies,
+    levelled,
     members_of_depths,
     one_depth,
     sort_by_depth,
 )
 from recon.camera.field_registration import one_psf
-from recon.camera.light import energies, levelled
-from recon.camera.local_convolution import field_of
+from recon.camera.varying_psfs import field_of
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from recon.camera.camera_model import LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
-from recon.camera.local_convolution import FieldOfPsfs
-from recon.camera.low_rank import principal_psfs
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
+from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import loss_db
 from recon.reconstruction.overrides import Overrides

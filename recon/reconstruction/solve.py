@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
@@ -24,10 +24,8 @@ from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.reconstruction.unmodelled_planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.weights import is_weighted
 from recon.solvers import Outcome, StoppingRules, StopReason
-from recon.solvers.base import Callback, Keeper
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import Callback, IterationRecord, Keeper
+from recon.solvers.douglas_rachford import DouglasRachford, EmptyPlanes
 from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
