@@ -15,7 +15,7 @@ import numpy.typing as npt
 from drivers.camera import Camera
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedPattern
-from instrument.files.atomic import check_writable
+from instrument.files.atomic import check_writable, require_new
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import check_suffix, read_image, side_car, write_image
 from instrument.files.record import plain, value_of
@@ -178,8 +178,7 @@ def check_photograph_file(target: Path, average: int, *, force: bool = False) ->
     files = [target] if target.suffix.lower() in (".tif", ".tiff") else [target, side_car(target)]
     for file in files:
         check_writable(file)
-        if file.exists() and not force:
-            raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+        require_new(file, overwrite=force)
 
 
 def write_snapshot(

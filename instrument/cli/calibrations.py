@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import App, examples, require_new, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.options import Given
 from instrument.cli.progress import one_task
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
 from recon.analysis import AnalysisSettings, Noise
 from recon.base.declare import option

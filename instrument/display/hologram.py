@@ -17,7 +17,7 @@ from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image
 from instrument.files.record import RecordFormat, plain, value_of
-from recon.base.declare import record
+from recon.base.declare import option, record
 from recon.holography import (
     DcTerm,
     Display,
@@ -42,6 +42,24 @@ if TYPE_CHECKING:
 
 
 Image = npt.NDArray[np.float64]
+
+
+HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"
+"""What options of photographs are about, and their heading."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How a hologram is photographed."""
+
+    average: int = option(4, least=1, help="Photographs a frame.", applies=(HOLOGRAM,), group=PHOTOGRAPHED)
+    refine: int = option(
+        0,
+        least=0,
+        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
+        applies=(HOLOGRAM,),
+        group=PHOTOGRAPHED,
+    )
 
 
 @dataclass(frozen=True, slots=True)

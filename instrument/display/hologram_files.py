@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.display.hologram import HologramResult
-from instrument.files.atomic import whole_file, write_text
+from instrument.files.atomic import require_new, whole_file, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car, write_image
@@ -51,9 +51,8 @@ class HologramFiles:
             raise FileError(self.out, f"{kind} pattern is written as {expected}.")
         if not self.out.parent.is_dir():
             raise FileError(self.out.parent, "there is no such folder.")
-        existing = [file for file in self.files() if file.exists()]
-        if existing and not overwrite:
-            raise FileError(existing[0], "exists already.", "Choose another name, or overwrite with --force.")
+        for file in self.files():
+            require_new(file, overwrite=overwrite)
 
     def label(self, number: int, channel: int) -> str:
         """Return which pattern it is, for bar and report."""

@@ -87,6 +87,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def require_new(path: Path, *, overwrite: bool | None = None) -> None:
+    """Refuse to write over what exists, unless it may be overwritten; None: no option would allow it.
+
+    Raises
+    ------
+    FileError
+    """
+    if path.exists() and not overwrite:
+        remedy = "" if overwrite is None else "Choose another name, or overwrite with --force."
+        raise FileError(path, "exists already and was left as it is.", remedy)
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write UTF-8 text; errors as ``whole_file``."""
     write_bytes(path, text.encode())

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import tifffile
 
 from instrument.bench.photograph import Progress
-from instrument.files.atomic import check_writable, whole_file
+from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
 from instrument.runs.run import Run, RunError
 
@@ -87,8 +87,7 @@ def export(
         raise FileError(
             target, f"no known format. Choose a name ending in {', '.join(writers)}, or a folder."
         )
-    if target.exists():
-        raise FileError(target, "exists already and was left as it is.")
+    require_new(target)
     check_writable(target, 0 if name.endswith(".mp4") else sum(run.records[i].n_bytes for i in indices))
     with whole_file(target) as temporary:
         writer(temporary)
@@ -182,8 +181,7 @@ def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) ->
     digits = len(str(max(indices)))
     for index, image in zip(indices, images, strict=True):
         path = folder / f"frame-{index:0{digits}d}.png"
-        if path.exists():
-            raise FileError(path, "exists already and was left as it is.")
+        require_new(path)
         shown = image[..., ::-1] if image.ndim == 3 else image
         done, data = cv2.imencode(".png", np.ascontiguousarray(shown))
         if not done:
