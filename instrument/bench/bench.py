@@ -40,7 +40,6 @@ class Bench:
 
     Parameters
     ----------
-    config : BenchConfig
     ask : callable, optional
         Asks the operator to light or darken something by hand, with a sentence to show; returns when done.
     """

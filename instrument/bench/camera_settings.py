@@ -42,19 +42,7 @@ class CameraOptions:
 
 @dataclass(frozen=True, slots=True)
 class CameraState:
-    """What a camera says of itself now, and what it offers.
-
-    Attributes
-    ----------
-    exposure_ms, gain, black_level, binning, roi, pixel_format
-        As read back.
-    exposure_limits_ms, gain_limits, binnings, pixel_formats, sensor_shape
-        What it offers.
-    temperature_c : float or None
-        Of the sensor or the camera, where it has a thermometer; degrees Celsius.
-    settings : mapping
-        All of its settings, by name.
-    """
+    """What a camera says of itself now, and what it offers."""
 
     exposure_ms: float
     gain: float
@@ -62,13 +50,17 @@ class CameraState:
     binning: int
     roi: Roi
     pixel_format: str
+    """As read back."""
     exposure_limits_ms: tuple[float, float]
     gain_limits: tuple[float, float]
     binnings: tuple[int, ...]
     pixel_formats: tuple[str, ...]
     sensor_shape: tuple[int, int]
+    """What it offers."""
     temperature_c: float | None
+    """Of the sensor or the camera, where it has a thermometer; degrees Celsius."""
     settings: Mapping[str, Setting]
+    """All of its settings, by name."""
 
 
 def read_camera(camera: Camera) -> CameraState:

@@ -30,22 +30,15 @@ Progress = Callable[[int, int], object]
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """One photograph: a frame, or the mean of several.
-
-    Attributes
-    ----------
-    image : ndarray
-        ``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for
-        a single frame, float32 for a mean.
-    metadata : FrameMetadata
-        Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`.
-    average : int
-        Number of frames averaged.
-    """
+    """One photograph: a frame, or the mean of several."""
 
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+    """``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for a
+    single frame, float32 for a mean."""
     metadata: FrameMetadata
+    """Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`."""
     average: int
+    """Number of frames averaged."""
 
     @property
     def full_scale(self) -> int:

@@ -64,22 +64,15 @@ class CaptureOptions:
 
 @dataclass(frozen=True, slots=True)
 class HologramResult:
-    """A hologram and what will be seen of it, plane by plane.
-
-    Attributes
-    ----------
-    hologram : Hologram
-    wanted, seen, unfiltered : tuple of ndarray
-        Target and image through the eye's low-pass, and the image before it, in units of the target's white.
-    scores : tuple of Scores
-        Alias-free, with the envelope that was asked for and all frames.
-    """
+    """A hologram and what will be seen of it, plane by plane."""
 
     hologram: Hologram
     wanted: tuple[Image, ...]
     seen: tuple[Image, ...]
     unfiltered: tuple[Image, ...]
+    """Target and image through the eye's low-pass, and the image before; in units of the target's white."""
     scores: tuple[Scores, ...]
+    """Alias-free, with the envelope that was asked for and all frames."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -137,7 +130,6 @@ def prepare_target(
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
         Its ``fit``, ``srgb`` and ``envelope``.
-    z_mm : float
     """
     options = options or HologramOptions()
     image = field_picture(pixels, fit=options.fit, srgb=options.srgb)
@@ -222,7 +214,6 @@ def bench_display(
 
     Parameters
     ----------
-    config : BenchConfig
     size : ((int, int), float)
         The SLM's shape and pitch, from :func:`slm_size`.
     expansion : int, optional
@@ -307,31 +298,21 @@ ALIGNMENT = RecordFormat(
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Where the mask was found.
-
-    Attributes
-    ----------
-    pose : Pose
-        Left over with the stage at ``stage_position``.
-    error : mapping of parameter name to float
-        Standard uncertainties.
-    rest : ndarray, float64, (rows, columns, 2)
-        Smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask pixels.
-    efficiency : float
-        Spot brightness over the model's ideal.
-    stage_position : mapping of axis name to float
-        Where the stage was.
-    mask_shape : (int, int)
-        Of the mask that it holds for, in pixels.
-    simulated : bool
-    """
+    """Where the mask was found."""
 
     pose: Pose
+    """Left over with the stage at ``stage_position``."""
     error: Mapping[str, float]
+    """Standard uncertainties, by the name of the pose's parameter."""
     rest: npt.NDArray[np.float64]
+    """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask
+    pixels."""
     efficiency: float
+    """Spot brightness over the model's ideal."""
     stage_position: Mapping[str, float]
+    """Where the stage was, by the names of its axes."""
     mask_shape: tuple[int, int]
+    """Of the mask that it holds for, in pixels."""
     simulated: bool
 
     def of(self, display: Display) -> Display:

@@ -193,14 +193,11 @@ def write_alignment_figure(
 
     Parameters
     ----------
-    path : Path
     displacement, rest : ndarray, (rows, columns, 2)
         Of the pose, and the smooth rest; mask pixels on nodes from edge to edge of the mask.
     mask_shape : (int, int)
     efficiencies : sequence of (int, float)
         Frames taken, and spot brightness over the model's ideal.
-    title : str
-    simulated : bool
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

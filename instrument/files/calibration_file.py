@@ -53,7 +53,6 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
 
     Parameters
     ----------
-    calibration : Calibration
     folder : path
         Made by this call; its parent is made as well where missing.
     overwrite : bool

@@ -86,7 +86,6 @@ class ConfigError(BenchError):
     ----------
     path : path or str
         The file, or a name for a text that is no file.
-    problems : sequence of ConfigProblem
     """
 
     def __init__(self, path: Path | str, problems: Sequence[ConfigProblem]) -> None:

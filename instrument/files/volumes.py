@@ -201,7 +201,6 @@ class VolumeSource:
         ``read(z, y, x)`` takes slices or numbers and returns (..., n_channels); the finest level first.
     shapes : sequence of (int, int, int)
         ``(n_z, height, width)`` of each level.
-    n_channels : int
     """
 
     def __init__(

@@ -27,7 +27,6 @@ def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: i
     ----------
     lights : sequence of Light
         Patterns by name, or of :func:`group_lights`.
-    exposure_ms : float
     average : int
         Frames averaged for each pattern.
 

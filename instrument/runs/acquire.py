@@ -34,7 +34,6 @@ def acquire(
     ----------
     bench : Bench
         Open.
-    plan : Plan
     folder : path, optional
         Where the run's folder is made; None means the bench's own data folder.
     on_progress : callable, optional
@@ -149,30 +148,20 @@ def there_now(folder: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class RunFindings:
-    """What was found in a run's folder before it is continued.
-
-    Attributes
-    ----------
-    condition : RunCondition
-        How the run was left.
-    stored : int
-        Frames that are on the disk as they were written; none of them is taken again.
-    todo : tuple of int
-        Steps whose data are not safely stored, in order.
-    damaged : tuple of DamagedFrame
-        Frames among them that the log calls written, but that are not as they were.
-    torn_bytes : int
-        Length of the half line that a crash left at the end of the log.
-    unlogged : int
-        Frames among them whose image had reached the disk, but not their line in the log.
-    """
+    """What was found in a run's folder before it is continued."""
 
     condition: RunCondition
+    """How the run was left."""
     stored: int
+    """Frames that are on the disk as they were written; none of them is taken again."""
     todo: tuple[int, ...]
+    """Steps whose data are not safely stored, in order."""
     damaged: tuple[DamagedFrame, ...] = ()
+    """Frames among them that the log calls written, but that are not as they were."""
     torn_bytes: int = 0
+    """Length of the half line that a crash left at the end of the log."""
     unlogged: int = 0
+    """Frames among them whose image had reached the disk, but not their line in the log."""
 
     def __str__(self) -> str:
         lines = [f"{self.condition}: {self.stored} frames safely stored, {len(self.todo)} to do"]

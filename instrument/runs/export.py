@@ -38,7 +38,6 @@ def export(
 
     Parameters
     ----------
-    run : Run
     target : path
         Must not exist, except as a folder for PNG files.
     frames : sequence of int, optional

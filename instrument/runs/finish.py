@@ -108,10 +108,8 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
 
     Parameters
     ----------
-    bench : Bench
     writer : RunWriter
         Closed afterwards.
-    reason : FinishReason
     error : BaseException, optional
         What ended the acquisition. It gets notes on what failed here and on where the run is, and stays the
         error that matters, also when Ctrl-C is pressed meanwhile.

@@ -110,42 +110,28 @@ _DISK_CHECK_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RecordingStatus:
-    """A snapshot of a recording.
-
-    Attributes
-    ----------
-    written : int
-        Frames on the disk.
-    numbered : int
-        Those and the lost ones: the number of the next frame.
-    dropped_by_device : int
-        Frames that the camera or its driver lost.
-    not_written : int
-        Frames lost because the disk was slower than the camera.
-    waiting : int
-        Frames in memory on their way to the disk; more than ``n_buffers`` never are.
-    n_buffers : int
-    seconds : float
-        Since the first frame.
-    frames_per_s, bytes_per_s : float
-        Mean rates of what was written.
-    saturated_fraction : float
-        Of the newest frame.
-    free_bytes : int
-        Left on the disk.
-    """
+    """A snapshot of a recording."""
 
     written: int
+    """Frames on the disk."""
     numbered: int
+    """Those and the lost ones: the number of the next frame."""
     dropped_by_device: int
+    """Frames that the camera or its driver lost."""
     not_written: int
+    """Frames lost because the disk was slower than the camera."""
     waiting: int
+    """Frames in memory on their way to the disk; more than ``n_buffers`` never are."""
     n_buffers: int
     seconds: float
+    """Since the first frame."""
     frames_per_s: float
     bytes_per_s: float
+    """Mean rates of what was written."""
     saturated_fraction: float
+    """Of the newest frame."""
     free_bytes: int
+    """Left on the disk."""
 
 
 class Recorder:
@@ -160,7 +146,6 @@ class Recorder:
         Open; its light is as the caller set it.
     writer : RunWriter
         A run without a plan.
-    options : RecordingOptions
     on_progress : callable, optional
         Called with the status after every batch of frames, at once when frames were lost.
     """
