@@ -26,13 +26,7 @@ class SceneSwitch(Protocol):
 
 
 class Lights:
-    """Switches point source and scene, asking the operator where no device can do it.
-
-    Parameters
-    ----------
-    ask : callable, optional
-        None where nobody can be asked.
-    """
+    """Switches point source and scene, asking the operator where no device can do it."""
 
     def __init__(
         self,

@@ -80,7 +80,7 @@ def analyze(
 
     from calibration_routines.optics.angular_response import load_response
     from instrument.evaluation.analysis_figure import draw_analysis, facts
-    from instrument.files.atomic import whole_file, write_text
+    from instrument.files.atomic import write_text
     from instrument.files.calibration_file import load_calibration
     from instrument.files.figures import save_figure
     from instrument.reconstruction.job import find_calibration
@@ -108,8 +108,7 @@ def analyze(
             analysis = analyse(measured, settings, progress=lambda _what, share: advance(share * 100, 100))
         title, subtitle = _titles(measured, folder)
         figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
-        with whole_file(out) as file:
-            save_figure(figure, file)
+        save_figure(figure, out)
         described = {
             "calibration": str(folder.resolve()),
             "simulated": simulated,

@@ -212,14 +212,8 @@ def bench_display(
 ) -> Display:
     """Return the display that ``[display]`` describes.
 
-    Parameters
-    ----------
-    size : ((int, int), float)
-        The SLM's shape and pitch, from :func:`slm_size`.
-    expansion : int, optional
-        Another étendue expansion than the bench's, with a random mask of its own.
-    wavelength_nm : float, optional
-        Another wavelength; the mask keeps its height.
+    ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
+    random mask of its own; with another wavelength the mask keeps its height.
 
     Raises
     ------

@@ -124,12 +124,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     """Refuse a file that could not be written, before the work that would fill it.
 
-    Parameters
-    ----------
-    path : path
-        The file to be.
-    n_bytes : int
-        Its expected size; the disk must have that much room.
+    The disk must have room for ``n_bytes``.
 
     Raises
     ------

@@ -78,12 +78,6 @@ class SlmCorrection:
 def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrection | None = None) -> None:
     """Show ideal levels (256 a turn) on an SLM, through its calibration where there is one.
 
-    Parameters
-    ----------
-    slm : Slm
-        Open.
-    levels : ndarray, uint8, of the SLM's shape
-
     Raises
     ------
     LimitError

@@ -137,12 +137,8 @@ def check(
 ) -> None:
     """Refuse a plan that the bench cannot carry out.
 
-    Parameters
-    ----------
-    todo : collection of int, optional
-        Indices of the steps that will be done; None means all.
-    start : Step, optional
-        The bench's state before the first step, for what the plan leaves as it is.
+    Only the steps that are ``todo`` (None: all) are looked at; ``start`` is the bench's state before the
+    first, for what the plan leaves as it is.
 
     Raises
     ------

@@ -299,13 +299,7 @@ def _leave_out(data: Any, location: Sequence[int | str]) -> None:
 
 
 class PlanError(BenchError):
-    """A plan that cannot be carried out: every reason at once. Nothing has moved.
-
-    Parameters
-    ----------
-    name : path or str
-        The plan's file or label.
-    """
+    """A plan that cannot be carried out: every reason at once. Nothing has moved."""
 
     def __init__(self, name: Path | str, problems: Sequence[str]) -> None:
         self.name = name

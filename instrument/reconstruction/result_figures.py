@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from instrument.files.atomic import whole_file
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.volume_views import in_colour_of_depth
@@ -73,8 +72,7 @@ def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: in
     FileError, OSError
         When it cannot be written.
     """
-    with whole_file(path) as temporary:
-        save_figure(summary_figure(_summary(result, job, rotate_deg)), temporary)
+    save_figure(summary_figure(_summary(result, job, rotate_deg)), path)
 
 
 def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:

@@ -38,8 +38,7 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
         write_volume_zarr(outputs.image, result.volume, result.grid, about)
     else:
         _write_tiff(outputs.image, result)
-    with whole_file(outputs.preview) as temporary:
-        save_figure(volume_figure(result, simulated=job.simulated), temporary)
+    save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
     write_text(outputs.record, json.dumps(volume_record(result, job), indent=1, allow_nan=False) + "\n")
 
 

@@ -15,6 +15,7 @@ import tifffile
 from instrument.bench.photograph import Progress
 from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import write_image
 from instrument.runs.run import Run, RunError
 
 Image = npt.NDArray[Any]
@@ -181,12 +182,7 @@ def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) ->
     for index, image in zip(indices, images, strict=True):
         path = folder / f"frame-{index:0{digits}d}.png"
         require_new(path)
-        shown = image[..., ::-1] if image.ndim == 3 else image
-        done, data = cv2.imencode(".png", np.ascontiguousarray(shown))
-        if not done:
-            raise FileError(path, "could not be encoded as PNG.")
-        with whole_file(path) as temporary:
-            temporary.write_bytes(data.tobytes())
+        write_image(path, image)
 
 
 def _mp4(run: Run, path: Path, images: Iterator[Image], frames_per_s: float) -> None:

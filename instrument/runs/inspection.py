@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import Progress
-from instrument.files.atomic import whole_file
+from instrument.files.figures import save_figure
 from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
 
 
@@ -122,8 +122,7 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
             fontsize=8,
         )
         axes.set_axis_off()
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
+    save_figure(figure, path)
     return indices
 
 

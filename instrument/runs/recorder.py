@@ -138,16 +138,9 @@ class Recorder:
     """Records until a number of frames or seconds is reached, or until ``stop``.
 
     Memory is that of the stream's ring: when the disk is slower than the camera, frames are lost there and
-    counted, and nothing grows. A lost frame keeps its number: the recording's array has a gap.
-
-    Parameters
-    ----------
-    bench : Bench
-        Open; its light is as the caller set it.
-    writer : RunWriter
-        A run without a plan.
-    on_progress : callable, optional
-        Called with the status after every batch of frames, at once when frames were lost.
+    counted, and nothing grows. A lost frame keeps its number: the recording's array has a gap. The bench's
+    light is as the caller set it; ``writer`` is of a run without a plan. ``on_progress`` is called with the
+    status after every batch of frames, at once when frames were lost.
     """
 
     def __init__(
