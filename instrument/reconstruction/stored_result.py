@@ -16,7 +16,7 @@ from instrument.files.images import read_image
 from instrument.files.volume_source import VolumeSource, open_volume
 from instrument.files.volume_zarr import is_zarr_name
 from recon.solvers.stopping import IterationRecord
-from recon.verdict.verdict import Region
+from recon.verdict.judge import Region
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ import numpy as np
 
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.overrides import Overrides
-from recon.verdict.failure import PRECISION
-from recon.verdict.shipped import shipped_maps
+from recon.verdict.cases import shipped_maps
+from recon.verdict.map import PRECISION
 
 METHOD = "admm tv"
 """Of the map; it is ADMM that reconstructs what is chosen here. The map is of pictures; those of volumes are

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.solvers.empty_planes import EmptyPlanes
 from recon.solvers.stopping import IterationRecord, StopReason
-from recon.verdict.verdict import Verdict
+from recon.verdict.judge import Verdict
 
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice

@@ -28,9 +28,8 @@ from recon.solvers.base import Callback, Keeper
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.empty_planes import EmptyPlanes
 from recon.solvers.stopping import IterationRecord
-from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
-from recon.verdict.judge import method_name, verdict_on
-from recon.verdict.verdict import Verdict
+from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
+from recon.verdict.judge import Verdict, method_name, verdict_on
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -392,7 +391,7 @@ def _verdict(
             ),
             points=not picture,
         )
-        return verdict_on(evidence, method_name(result.solver if picture else "volume", result.prior)), ()
+        return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
     except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
         return None, (not_judged(error),)
 

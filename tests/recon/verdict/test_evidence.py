@@ -14,9 +14,8 @@ from recon.camera.camera_model import Depths
 from recon.camera.light import plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
 from recon.solvers.stopping import IterationRecord, StopReason
-from recon.verdict.collect import DIVERGED, unsettled_by
-from recon.verdict.evidence import Observation, _dimming, _similarity, measure
-from recon.verdict.verdict import Region
+from recon.verdict.evidence import DIVERGED, Observation, _dimming, _similarity, measure, unsettled_by
+from recon.verdict.judge import Region
 
 RNG = np.random.default_rng(1)
 
