@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from recon.base import metrics
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
-from recon.camera.background import BackgroundRemoval
+from recon.camera.factors import BackgroundRemoval
 from recon.errors import InputError
 from recon.evaluation.scored import Point
 from recon.evaluation.trial import Setting

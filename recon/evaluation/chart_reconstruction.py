@@ -18,8 +18,7 @@ import numpy.typing as npt
 
 from recon.base.namespace import Device, array_namespace
 from recon.base.noise import NoiseModel
-from recon.camera.camera_model import MODELS, members_of_depths
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS, MODELS, members_of_depths
 from recon.errors import InputError
 from recon.evaluation.chart_judge import Judge
 from recon.evaluation.scene import TestScene, make_scene
@@ -32,7 +31,7 @@ from recon.reconstruction.overrides import PRECISIONS
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]

@@ -20,8 +20,7 @@ from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.evaluation.scene import SceneSpec, TestScene
 from recon.evaluation.scene_trial import PIXELS, judge_image, scene_of, spec_at
 from recon.holography import Display, Target, random_mask
-from recon.holography.placement import PlacedHologram
-from recon.holography.pose import Pose
+from recon.holography.pose import PlacedHologram, Pose
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.priors.base import Prior
 from recon.reconstruction.options import ReconstructionOptions

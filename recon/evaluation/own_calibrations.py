@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import ModelName, members_of_depths
-from recon.camera.interpolation import grid_axes
+from recon.camera.varying_psfs import grid_axes
 from recon.errors import InputError
 from recon.evaluation.chart_calibration import ITERATIONS
 from recon.evaluation.chart_judge import Judge

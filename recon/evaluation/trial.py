@@ -2,7 +2,7 @@
 
 Solvers, priors and camera models are asked, not listed: what is registered takes part where its solver
 accepts the problem (:data:`recon.reconstruction.solvers.SOLVERS`, :data:`recon.priors.PRIORS`,
-:data:`recon.camera.offered.CAMERAS`).
+:data:`recon.camera.camera_model.CAMERAS`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.namespace import Device
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
@@ -27,7 +27,7 @@ from recon.reconstruction.overrides import Precision
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 from recon.verdict.cases import OF_VOLUMES
 
 
