@@ -5,7 +5,7 @@ only. Given ``y``, the best ``g`` is the projection of ``b - A y`` onto those fr
 left is ``min_y 1/2 ||P (b - A y)||^2 + prior(y)`` with ``P`` the projection onto the rest. So the joint
 problem needs no further unknowns, no step of its own and no start for ``g``: ``P`` is one more factor of the
 operator. The dissertation also asks for ``g >= 0``: :meth:`BackgroundRemoval.non_negative` is the projection
-onto backgrounds that obey it (see :mod:`recon.reconstruction.positive_background`).
+onto backgrounds that obey it (see :mod:`recon.reconstruction.solve`).
 
 A prior that does not mind a smooth object (total variation) leaves object and background to be exchanged for
 one another; l1, as in Eq. 6.2, does not.

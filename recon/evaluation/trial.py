@@ -19,8 +19,7 @@ from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import PRECISIONS, Precision
+from recon.reconstruction.options import PRECISIONS, Precision, ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.solvers import SOLVERS
 
