@@ -25,7 +25,7 @@ from recon.camera.registration import displacement
 from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 from recon.types import Calibration, Geometry
 
 Array = npt.NDArray[Any]

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, require_finite, saturated_share, select_psf
+from recon.base.checks import as_channels, require_finite, require_options, saturated_share, select_psf
 from recon.base.noise import NoiseModel, estimate_deviation
-from recon.base.options import require_options
 from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
 from recon.camera.field_registration import one_psf
 from recon.errors import InputError
@@ -41,7 +40,7 @@ class Measurement:
         True where a pixel tells nothing: dead, saturated, not read (Kuo 2020, Eq. 3.10, has the complement).
     patterns : array, (n_patterns, height, width), optional
         Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
-        sheet lit by it (see :mod:`recon.camera.patterned`). One pattern of ones is the ordinary photograph.
+        sheet lit by it (see :mod:`recon.camera.factors`). One pattern of ones is the ordinary photograph.
     """
 
     image: npt.ArrayLike

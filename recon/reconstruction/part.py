@@ -9,17 +9,13 @@ import numpy as np
 
 from recon.base import fft
 from recon.base.namespace import array_namespace
-from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array, LinearOperator
-from recon.camera.camera_model import LOW_RANK_ERROR
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
-from recon.camera.low_rank import low_rank
-from recon.camera.offered import CAMERAS
-from recon.camera.patterned import PatternedCamera
+from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
+from recon.camera.varying_psfs import FieldOfPsfs, field_of, local_convolution, low_rank
 from recon.errors import InputError
 from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, check_psf
-from recon.base.options import require_options
-from recon.camera.camera_model import (
-    Depths,
-    Extent,
-    ModelName,
-    choose_model,
-)
-from recon.camera.light import energies, levelled
+from recon.base.checks import as_channels, check_psf, require_options
+from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.declare import with_overrides
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS
 from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.local_convolution import field_of
+from recon.camera.varying_psfs import field_of
 from recon.reconstruction.options import Field
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
+from recon.solvers.douglas_rachford import EmptyPlanes
 from recon.types import Calibration
 from recon.verdict.verdict import Verdict
 

@@ -8,10 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from recon.camera.camera_model import LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
-from recon.camera.local_convolution import FieldOfPsfs
-from recon.camera.low_rank import principal_psfs
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
+from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
 from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.probe import ACCEPTED, CoarsePass, acceptance_px, psf_window, resolution_px

@@ -21,10 +21,8 @@ from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import OfferedSolver
 from recon.reconstruction.weights import is_weighted
 from recon.solvers import Outcome, Solver, StoppingRules, StopReason
-from recon.solvers.base import Callback, Keeper
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import Callback, IterationRecord, Keeper
+from recon.solvers.douglas_rachford import DouglasRachford, EmptyPlanes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]

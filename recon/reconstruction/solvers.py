@@ -18,8 +18,7 @@ from recon.base.registry import Registry
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
-from recon.solvers.base import Callback, Keeper, Outcome
-from recon.solvers.stopping import StoppingRules
+from recon.solvers.base import Callback, Keeper, Outcome, StoppingRules
 
 if TYPE_CHECKING:
     from recon.reconstruction.part import Part
@@ -208,7 +207,7 @@ class OneStep:
 
 def _wiener(part: Part, _: Array | None) -> Runs:
     """Wiener's penalty takes the place of a prior; bounds are kept by clipping."""
-    from recon.priors.simple import Separable
+    from recon.priors.base import Separable
     from recon.solvers.wiener import wiener
 
     def solve() -> Outcome:

@@ -12,14 +12,14 @@ import pytest
 import recon
 from recon import InputError
 from recon.base.blocks import block_mean, enlarged
-from recon.camera.offered import CAMERAS, OfferedCamera
+from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.planes import put_back
 from recon.reconstruction.reduction import reduced_calibration
 from recon.reconstruction.rules import drift, precision_of
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 
 solving = sys.modules[recon.solve.__module__]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from instrument.files.toml_lines import key_lines
+from instrument.bench.config_mistakes import key_lines
 
 TRICKY = '''\
 # [not.a.table]

@@ -7,8 +7,8 @@ import pytest
 import tifffile
 
 from instrument.cli import main
-from instrument.files.checkpoint import CheckpointFolder, digest
 from instrument.files.errors import FileError
+from instrument.reconstruction.checkpointing import CheckpointFolder, digest
 from recon.camera.convolution import PadCropConvolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Fista, SensorAdmm, StoppingRules

@@ -5,7 +5,7 @@ import pytest
 import zarr
 from ome_zarr_models.v05 import Image
 
-from instrument.files.volume_zarr import write_volume_zarr
+from instrument.files.volumes import write_volume_zarr
 from instrument.reconstruction.result_file import Outputs
 from recon.reconstruction.result import Grid
 
