@@ -27,8 +27,9 @@ from recon.evaluation.trial import Setting
 from recon.reconstruction.measurement import Measurement, channel_noise
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
-from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.result import window_of
 from recon.types import Calibration
 
 if TYPE_CHECKING:

@@ -26,8 +26,7 @@ from recon.evaluation.scored import Aside, Curve, Point
 from recon.evaluation.trial import Setting, Subject
 from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import PRECISIONS
+from recon.reconstruction.options import PRECISIONS, ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.solvers import SOLVERS

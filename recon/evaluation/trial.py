@@ -22,8 +22,7 @@ from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.priors import PRIORS
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import Precision
+from recon.reconstruction.options import Precision, ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solvers import SOLVERS

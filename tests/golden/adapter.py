@@ -62,7 +62,7 @@ def noise_model(read_noise: float, counts_per_electron: float) -> Any:
 
 def wishes(**wanted: str) -> Any:
     """Return choices that are not left to the program, from words."""
-    from recon.reconstruction.overrides import Overrides
+    from recon.reconstruction.options import Overrides
 
     return Overrides.parse(wanted)
 

@@ -15,7 +15,7 @@ from recon.camera.field_registration import NOT_ON_AXIS
 from recon.camera.varying_psfs import FieldOfPsfs
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 
 
