@@ -188,8 +188,7 @@ def _is_result(path: Path) -> bool:
 
 
 def _export_result(path: Path, target: Path) -> None:
-    from instrument.reconstruction.result_export import export_result
-    from instrument.reconstruction.stored_result import open_result
+    from instrument.reconstruction.stored_result import export_result, open_result
 
     result = open_result(path)
     try:
