@@ -21,7 +21,8 @@ from recon.base.option_text import size as size_of
 if TYPE_CHECKING:
     from instrument.evaluation.chart_data import ChartData
     from instrument.reconstruction.job import Job
-    from recon.evaluation.scored import Named, Point, Problem
+    from recon.evaluation.scored import Point
+    from recon.evaluation.trial import Named, Subject
 
 app = App()
 
@@ -203,7 +204,7 @@ def _problem(
     source: SourceOptions,
     inputs: InputOptions,
     bench: Path | None,
-) -> tuple[Problem, dict[str, Any]]:
+) -> tuple[Subject[Any], dict[str, Any]]:
     """Return what is charted, and what to say of it."""
     from instrument.evaluation.chart_problems import (
         problem_of_calibrations,
@@ -289,7 +290,7 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     return prepared(folder, image, inputs)
 
 
-def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:
+def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
     from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
     from recon.evaluation.chart_calibration import CalibrationProblem
 
@@ -317,7 +318,7 @@ def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[
     return CalibrationProblem(taken), {"bench": "simulated microscope", "simulated": True}
 
 
-def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
+def _made(problem: Subject[Any], about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
     from instrument.evaluation.chart_job import make_chart
 
     with saying_what_is_left(record), progress_bar() as bar:

@@ -29,7 +29,7 @@ from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.solvers.base import IterationRecord, StopReason
-from recon.verdict.verdict import Verdict
+from recon.verdict.judge import Verdict
 
 
 def reconstruct_photograph(

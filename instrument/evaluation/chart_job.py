@@ -22,7 +22,8 @@ from instrument.evaluation.chart_data import ChartData
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from recon.errors import InputError
-from recon.evaluation.scored import Curve, Named, Point, Problem
+from recon.evaluation.scored import Curve, Point
+from recon.evaluation.trial import Named, Subject
 
 _PRELOADED = [
     "instrument.evaluation.chart_job",
@@ -32,7 +33,7 @@ _PRELOADED = [
 """Imported once, in the process from which those of the settings are forked: seconds for each of them."""
 
 
-def in_own_process(problem: Problem, setting: Named, limit_s: float) -> Curve | str:
+def in_own_process(problem: Subject[Any], setting: Named, limit_s: float) -> Curve | str:
     """Run one setting by itself; the reason where it cannot be run.
 
     The process ends when this one is interrupted or killed.
@@ -71,7 +72,7 @@ def _context() -> ForkServerContext | SpawnContext:
     return context
 
 
-def _work(pipe: Connection, problem: Problem, setting: Named, limit_s: float) -> None:
+def _work(pipe: Connection, problem: Subject[Any], setting: Named, limit_s: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's: it ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
@@ -148,7 +149,7 @@ Told = Callable[[int, int, Named, float], object]
 
 
 def make_chart(
-    problem: Problem, about: Mapping[str, Any], path: Path, *, budget_s: float, told: Told
+    problem: Subject[Any], about: Mapping[str, Any], path: Path, *, budget_s: float, told: Told
 ) -> ChartData:
     """Run every setting that the budget allows; what ``path`` has of this problem already is kept.
 

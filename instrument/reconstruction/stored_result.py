@@ -25,7 +25,7 @@ from instrument.files.volumes import (
 from instrument.reconstruction.result_file import preview
 from recon.reconstruction.result import Grid
 from recon.solvers.base import IterationRecord
-from recon.verdict.verdict import Region
+from recon.verdict.judge import Region
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,9 +23,8 @@ from recon.reconstruction.solve import Progress, solve
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import Keeper
 from recon.types import Calibration
-from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
-from recon.verdict.judge import method_name, verdict_on
-from recon.verdict.verdict import Verdict
+from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
+from recon.verdict.judge import Verdict, method_name, verdict_on
 
 FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
@@ -144,7 +143,7 @@ def _verdict(
             ),
             points=not picture,
         )
-        return verdict_on(evidence, method_name(result.solver if picture else "volume", result.prior)), ()
+        return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
     except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
         return None, (not_judged(error),)
 

@@ -14,7 +14,7 @@ from recon.reconstruction.options import Field
 from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.douglas_rachford import EmptyPlanes
 from recon.types import Calibration
-from recon.verdict.verdict import Verdict
+from recon.verdict.judge import Verdict
 
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice

@@ -13,8 +13,8 @@ from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
 from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
 from recon.reconstruction.options import Overrides
 from recon.reconstruction.probe import ACCEPTED, CoarsePass, acceptance_px, psf_window, resolution_px
-from recon.verdict.failure import PRECISION
-from recon.verdict.shipped import shipped_maps
+from recon.verdict.cases import shipped_maps
+from recon.verdict.map import PRECISION
 
 VARYING_COST = 3.0
 """Operator applications an iteration of conjugate gradients, relative to a convolution."""

@@ -17,7 +17,7 @@ from instrument.evaluation.chart_data import read_chart
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.stability_file import read_stability
-from recon.verdict.shipped import shipped_file
+from recon.verdict.cases import SHIPPED
 
 WAIT_MS = 60_000
 
@@ -63,7 +63,7 @@ def made(tmp_path: Path) -> Path:
 
 def test_every_shipped_map_and_method_is_drawn(panel: ChartsPanel) -> None:
     view = panel.stability
-    maps = read_stability(shipped_file())["maps"]
+    maps = read_stability(SHIPPED)["maps"]
     assert [view.map.itemData(i) for i in range(view.map.count())] == list(maps)
     for index, record in enumerate(maps.values()):
         view.map.setCurrentIndex(index)

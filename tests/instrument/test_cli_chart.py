@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from instrument.cli import chart as module
 from instrument.reconstruction.job import Job
 from recon import Calibration, NoiseModel
-from recon.evaluation import chart_reconstruction as recon_chart
-from recon.evaluation.scored import Point
+from recon.evaluation.chart_reconstruction import ChartProblem
+from recon.evaluation.scored import Curve, Point
+from recon.evaluation.trial import Setting
 
 
 @pytest.fixture
@@ -24,17 +25,17 @@ def quick(monkeypatch):
     import instrument.evaluation.chart_job as job
 
     settings = (
-        recon_chart.Setting("wiener", "convolution", "none"),
-        recon_chart.Setting("admm", "convolution", "tv"),
+        Setting("wiener", "convolution", "none"),
+        Setting("admm", "convolution", "tv"),
     )
     ran = []
 
     def here(problem, setting, limit_s):
         assert limit_s > 0
         ran.append(setting.name)
-        return recon_chart.run_setting(problem, setting, counts=(2, 5))
+        return problem.run(setting, counts=(2, 5))
 
-    monkeypatch.setattr(recon_chart.ChartProblem, "settings", lambda problem: settings)
+    monkeypatch.setattr(ChartProblem, "settings", lambda problem: settings)
     monkeypatch.setattr(job, "in_own_process", here)
     return ran
 
@@ -75,7 +76,7 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
     def cut(problem, setting, limit_s):
         curve = whole(problem, setting, limit_s)
         shorter = setting.solver != "wiener"
-        return recon_chart.Curve(curve.points[:1], False) if shorter else curve
+        return Curve(curve.points[:1], False) if shorter else curve
 
     out = tmp_path / "chart"
     problem, about = problem_of_scene("sparse-picture", 32, 0)
@@ -159,11 +160,11 @@ def test_a_setting_runs_in_a_process_of_its_own():
     from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    found = in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    found = in_own_process(problem, Setting("wiener", "convolution", "none"), 20.0)
     assert not isinstance(found, str)
     assert found.points[0].peak_mib < 500
     assert found.finished
-    refused = in_own_process(problem, recon_chart.Setting("admm", "convolution", "tv-haar"), 20.0)
+    refused = in_own_process(problem, Setting("admm", "convolution", "tv-haar"), 20.0)
     assert isinstance(refused, str)
 
 
@@ -330,8 +331,8 @@ def test_what_ends_a_setting_is_told_in_its_row():
     from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    broken = replace(problem, measurement=None)
-    found = in_own_process(broken, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    broken = replace(problem, calibration=None)
+    found = in_own_process(broken, Setting("wiener", "convolution", "none"), 20.0)
     assert isinstance(found, str)
     assert "Error" in found
     assert "status" not in found

@@ -13,9 +13,8 @@ from recon import InputError, reconstruct
 from recon.camera.camera_model import Depths, plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
 from recon.solvers.base import IterationRecord, StopReason
-from recon.verdict.collect import DIVERGED, unsettled_by
-from recon.verdict.evidence import Observation, _dimming, _similarity, measure
-from recon.verdict.verdict import Region
+from recon.verdict.evidence import DIVERGED, Observation, _dimming, _similarity, measure, unsettled_by
+from recon.verdict.judge import Region
 
 RNG = np.random.default_rng(1)
 
