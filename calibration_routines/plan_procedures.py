@@ -18,8 +18,7 @@ from calibration_routines.procedure import (
 )
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
-from instrument.runs.acquire import abilities_of, acquire
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import abilities_of, acquire, prepare_resume
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 

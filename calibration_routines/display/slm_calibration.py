@@ -20,8 +20,7 @@ from calibration_routines.display.display_io import (
 )
 from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
 from instrument.bench.bench import Bench
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import load_alignment
+from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl

@@ -171,7 +171,7 @@ def watch_resumed(bench: Bench, runner: Runner, listener: Listener) -> None:
     bench : Bench
         Open.
     runner : Runner
-        From :func:`~instrument.runs.resume.prepare_resume`, not yet begun.
+        From :func:`~instrument.runs.acquire.prepare_resume`, not yet begun.
     listener : Listener
         Its ``event`` is not called for what was taken before.
 

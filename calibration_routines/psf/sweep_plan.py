@@ -14,8 +14,7 @@ from calibration_routines.psf.exposure import AutoExposure, TooDarkError, expose
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.sweep_options import AxialSweep, PointSweep
 from instrument.bench.bench import Bench
-from instrument.files.errors import SettingsError
-from instrument.files.formatting import count
+from instrument.files.errors import SettingsError, count
 from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints, check, estimate
 from instrument.runs.acquire import abilities_of

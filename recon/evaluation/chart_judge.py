@@ -18,14 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
-from recon.camera.background import BackgroundRemoval
+from recon.camera.factors import BackgroundRemoval
 from recon.evaluation.scored import Point
 from recon.evaluation.trial import Setting, binnings_of
 from recon.reconstruction.measurement import Measurement, channel_noise
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
-from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.result import window_of
 from recon.types import Calibration
 
 if TYPE_CHECKING:

@@ -62,7 +62,7 @@ def noise_model(read_noise: float, counts_per_electron: float) -> Any:
 
 def wishes(**wanted: str) -> Any:
     """Return choices that are not left to the program, from words."""
-    from recon.reconstruction.overrides import Overrides
+    from recon.reconstruction.options import Overrides
 
     return Overrides.parse(wanted)
 
@@ -126,7 +126,7 @@ def resumed(
     kind: str, measurement: npt.NDArray[Any], calibration: Any, *, after: int, iterations: int, **options: Any
 ) -> Result:
     """Keep a reconstruction in a folder after some iterations, and go on with it."""
-    from instrument.files.checkpoint import CheckpointFolder
+    from instrument.reconstruction.checkpointing import CheckpointFolder
 
     run = {"picture": picture, "volume": volume}[kind]
     with TemporaryDirectory() as folder:
