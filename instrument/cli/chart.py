@@ -281,7 +281,7 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     if psf is not None and volume:
         raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
     from instrument.reconstruction.job import job_from_calibration, job_from_files
-    from instrument.reconstruction.volume_job import volume_job
+    from instrument.reconstruction.request import volume_job
 
     if psf is not None:
         return job_from_files(psf, image, inputs)
