@@ -20,7 +20,6 @@ from calibration_routines.display.hologram_photograph import (
     photograph_hologram,
     write_capture,
 )
-from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
@@ -41,7 +40,7 @@ from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.slm_image import load_slm_correction
-from instrument.reconstruction.result_list import free_result
+from instrument.reconstruction.stored_result import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -229,7 +228,7 @@ def photograph(
 
     context.on_cancel(cancel)
     try:
-        with _exposure_kept(bench.camera), under_control(bench, control):
+        with _exposure_kept(bench.camera), control.procedure(bench):
             if computed.order.alignment is not None:
                 bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
             found = photograph_hologram(

@@ -59,7 +59,8 @@ class RecordFormat:
     error: type[FileError] = FileError
     """Raised for whatever is wrong with a file."""
     numbered_before: bool = False
-    """Whether files of before named no format and had the version as ``"format"``."""
+    unnamed_before: bool = False
+    """Whether files of before named no format, and had the version as ``"format"`` or nothing there."""
 
     # Writing -------------------------------------------------------------------------------------
     def stamped(self, fields: Mapping[str, Any]) -> Fields:
@@ -108,7 +109,8 @@ class RecordFormat:
     def checked(self, record: Fields, path: Path) -> Fields:
         """Return the fields of a record that was read from ``path``; errors as :meth:`read`."""
         fields = dict(record)
-        name, version = fields.pop("format", None), fields.pop("version", 1)
+        name = fields.pop("format", self.name if self.unnamed_before else None)
+        version = fields.pop("version", 1)
         if self.numbered_before and isinstance(name, int):
             name, version = self.name, name
         if name != self.name:
