@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.progress import first_interrupt_cancels, progress_bar
+from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
@@ -318,14 +318,13 @@ def hologram(
 def _compute(
     display: Display, targets: list[Target], options: HologramOptions, initial: Any, cancel: Any, label: str
 ) -> HologramResult:
-    with progress_bar() as bar:
-        task = bar.add_task(label, total=options.iterations, note="")
+    with one_task(label, options.iterations) as advance:
 
         def show(record: HologramRecord, _slm: object) -> None:
             done = float(record.iteration)
             if options.time_s is not None:
                 done = max(done, options.iterations * record.seconds / options.time_s)
-            bar.update(task, completed=done, note=f"{record.psnr_db:.2f} dB")
+            advance(done, note=f"{record.psnr_db:.2f} dB")
 
         return compute_and_judge(display, targets, options, initial=initial, callback=show, cancel=cancel)
 

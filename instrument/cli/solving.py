@@ -7,7 +7,7 @@ import time
 import typer
 
 from instrument.cli.app import saying_what_is_left
-from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
+from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.files.errors import duration
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
@@ -47,16 +47,13 @@ def reconstruct_photograph(
         outputs.check(planes * job.measurement.size, overwrite=output.force)
         _tell_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
-        with progress_bar() as bar, first_interrupt_cancels() as cancel:
-            total = iteration_limit(request.options) or 1000
-            task = bar.add_task("volume" if is_volume else "picture", total=total, note="")
+        total = iteration_limit(request.options) or 1000
+        what = "volume" if is_volume else "picture"
+        with one_task(what, total) as advance, first_interrupt_cancels() as cancel:
 
             def show(record: IterationRecord, _picture: object) -> None:
-                bar.update(
-                    task,
-                    completed=round(total * done_share(request.options, record)),
-                    note=f"change {record.change:.1e}",
-                )
+                share = done_share(request.options, record)
+                advance(round(total * share), note=f"change {record.change:.1e}")
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
         _tell(result)
@@ -69,7 +66,7 @@ def reconstruct_photograph(
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
-    _end(result, "volume" if is_volume else "picture")
+    _end(result, what)
 
 
 def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: OutputOptions) -> None:
@@ -81,11 +78,13 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
         _tell_job(job, "calibration or frames come from the simulated bench")
-        with progress_bar() as bar, first_interrupt_cancels() as cancel:
-            task = bar.add_task("picture", total=request.iterations or ITERATIONS, note="")
+        with (
+            one_task("picture", request.iterations or ITERATIONS) as advance,
+            first_interrupt_cancels() as cancel,
+        ):
 
             def show(record: IterationRecord) -> None:
-                bar.update(task, completed=record.iteration, note=f"change {record.change:.1e}")
+                advance(record.iteration, note=f"change {record.change:.1e}")
 
             result = solve_patterned(prepared, watch=show, cancel=cancel)
         _tell_end(result)
@@ -217,17 +216,16 @@ def _solve(prepared: PreparedVideo, workers: int | None, scheduler: str | None) 
     total = len(prepared.job.plan.frames)
     before = _frames_done(prepared)
     began_s = time.monotonic()
-    with progress_bar() as bar, first_interrupt_cancels() as cancel:
-        task = bar.add_task("frames", total=total, completed=before, note="")
+    with one_task("frames", total, done=before) as advance, first_interrupt_cancels() as cancel:
         done = before
 
-        def told(report: BlockReport) -> None:
+        def on_progress(report: BlockReport) -> None:
             nonlocal done
             done += len(prepared.job.blocks[report.block])
             rate = (done - before) / max(time.monotonic() - began_s, 1e-9)
-            bar.update(task, completed=done, note=f"{rate:.1f} frames/s")
+            advance(done, note=f"{rate:.1f} frames/s")
 
-        return solve_video(prepared, told, cancel, workers=workers, scheduler=scheduler)
+        return solve_video(prepared, on_progress, cancel, workers=workers, scheduler=scheduler)
 
 
 def _frames_done(prepared: PreparedVideo) -> int:
