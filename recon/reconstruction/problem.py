@@ -22,8 +22,8 @@ from recon.camera.camera_model import (
     one_depth,
     sort_by_depth,
 )
+from recon.camera.convolution import field_of
 from recon.camera.field_registration import one_psf
-from recon.camera.varying_psfs import field_of
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
