@@ -159,7 +159,7 @@ class BackgroundRemoval(LinearOperator):
     projection onto the rest. So the joint problem needs no further unknowns, no step of its own and no start
     for ``g``: ``P`` is one more factor of the operator. The dissertation also asks for ``g >= 0``:
     :meth:`non_negative` is the projection onto backgrounds that obey it (see
-    :mod:`recon.reconstruction.positive_background`).
+    :mod:`recon.reconstruction.solve`).
 
     A prior that does not mind a smooth object (total variation) leaves object and background to be exchanged
     for one another; l1, as in Eq. 6.2, does not.

@@ -17,7 +17,8 @@ from recon.camera.spatially_varying import SpatiallyVarying
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
 from recon.errors import InputError
 from recon.priors import Prior, TotalVariation
-from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.result import window_of
 from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
 from recon.solvers import memory
 

@@ -10,7 +10,7 @@ from recon.base.metrics import psnr
 from recon.camera.base import estimate_norm
 from recon.camera.convolution import Convolution
 from recon.camera.factors import PatternedCamera
-from recon.reconstruction.problem import window_of
+from recon.reconstruction.result import window_of
 
 SHAPE = (24, 30)
 

@@ -15,10 +15,10 @@ from recon.base.blocks import block_mean, enlarged
 from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.planes import put_back
-from recon.reconstruction.precision import drift, precision_of
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.rules import drift, precision_of
 from recon.solvers.base import StopReason
 
 solving = sys.modules[recon.solve.__module__]
@@ -233,7 +233,7 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
         "y": {"values": [32, 64]},
         "methods": {"admm tv": {"error": [[1e-4, 1e-3], [1e-3, 1e-2]]}},
     }}  # fmt: skip
-    monkeypatch.setattr("recon.reconstruction.precision.shipped_maps", lambda: rough)
+    monkeypatch.setattr("recon.reconstruction.rules.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
     assert precision_of(Overrides(), 1000, 64).value == "float64"
     assert precision_of(Overrides(precision="float32"), 1000, 64).value == "float32"
