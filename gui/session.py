@@ -6,7 +6,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -203,18 +203,6 @@ class BenchSession(QObject):
                 self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
 
     # Jobs ----------------------------------------------------------------------------------------
-    def device_job(
-        self,
-        title: str,
-        work: Work,
-        lanes: Collection[str],
-        *,
-        quiet: bool = False,
-        endless: bool = False,
-    ) -> Job:
-        """Run a job on devices; errors and flags as ``JobRunner.device``. ``quiet`` ones are not told of."""
-        return self.jobs.device(title, work, lanes, quiet=quiet, endless=endless)
-
     def camera_job(self, title: str, work: Callable[[Camera], Any], *, idle: bool = False) -> Job:
         """Run a short job on the camera; with ``idle`` the live view pauses for it (regions, formats ...)."""
 

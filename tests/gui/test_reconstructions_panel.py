@@ -19,7 +19,7 @@ from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.dialogues import Question
-from gui.widgets.number_edit import NumberEdit
+from gui.widgets.entry import NumberEdit
 from instrument.files.images import read_image, write_image
 from instrument.files.volume_source import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
