@@ -66,8 +66,8 @@ class DeviceChips(QWidget):
             self.chips[kind], self.reconnect_buttons[kind] = chip, again
             self.show_state(kind)
         pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
-        shown = [widget for pair in pairs for widget in pair] or [label("no devices")]
-        fill(self, *shown, across=True, spacing=4)
+        shown: list[QWidget] = [widget for pair in pairs for widget in pair]
+        fill(self, *(shown or [label("no devices")]), across=True, spacing=4)
         session.device_changed.connect(self.show_state)
 
     def show_state(self, kind: str) -> None:

@@ -19,8 +19,7 @@ from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError, SettingsError
-from instrument.files.formatting import count, duration, size
+from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
 """Rest after a key before what was typed is checked."""

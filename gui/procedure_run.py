@@ -12,9 +12,8 @@ from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.display_io import SpotLook
-from calibration_routines.errors import RunEndedError
-from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
-from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
+from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
 from gui.jobs import Job, JobContext
@@ -22,9 +21,9 @@ from gui.panel import on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, every, fill, in_row, label, share_bar
 from instrument.bench.photograph import Snapshot
-from instrument.files.formatting import duration
+from instrument.files.errors import duration
 from instrument.plan import Plan
-from instrument.plan.file import plan_toml
+from instrument.plan.model import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
 from recon.base.declare import Imports, expression

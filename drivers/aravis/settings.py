@@ -16,8 +16,10 @@ from drivers.aravis.features import (
     FRAME_RATE_ENABLE,
     GAIN,
     Features,
+    enable_fake,
+    library_error,
+    load,
 )
-from drivers.aravis.library import enable_fake, library_error, load
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.gain import GainScale, GainUnit
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart
@@ -83,9 +85,7 @@ class AravisSettings(BufferedCamera):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__()
-        if not isinstance(options, AravisOptions):
-            raise TypeError(f"A GenICam camera takes AravisOptions, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = AravisOptions.of(options)
         self._aravis: Any = None
         self._camera: Any = None
         self._handler = 0

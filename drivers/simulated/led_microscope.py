@@ -2,25 +2,83 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
+from scipy import fft
 
-from drivers.device import DriverOptions, SharedPart
+from drivers.device import DriverOptions
 from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
-from drivers.simulated.surroundings import Clock, Surroundings
+from drivers.simulated.surroundings import CommonOptions, Surroundings
 from recon.base.blocks import block_sum
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
-from recon.optics.led_microscope import led_image
+from recon.optics.grid import BANDS
 from recon.optics.sensor import SensorSpec
-from recon.optics.spectrum import BANDS
 from recon.types import Geometry
+
+Floats = npt.NDArray[np.float64]
+
+
+def led_image(
+    phase: npt.NDArray[np.floating],
+    pitch_um: float,
+    sines: Floats,
+    weights: Floats,
+    *,
+    wavelength_nm: float,
+    na: float,
+    defocus_um: float = 0.0,
+    workers: int = 2,
+) -> npt.NDArray[np.float32]:
+    """Image of a thin phase sample, relative to no sample and all the LEDs' light through the pupil.
+
+    Partially coherent imaging, wave by wave: every LED is a point far away and incoherent with the others. It
+    sends a plane wave through the sample, whose spectrum the objective's pupil cuts; the image is the sum of
+    all LEDs' intensities. Nothing is assumed about how strong or how slow the sample's phase is.
+
+    Parameters
+    ----------
+    phase : ndarray, (height, width)
+        Radians. Taken as periodic: give a rim that is not looked at.
+    pitch_um : float
+        Of the samples, in the object.
+    sines : ndarray, (n_leds, 2)
+        Of each LED's direction as seen from the sample, x and y; its light travels the other way.
+    weights : ndarray, (n_leds,)
+        Light of each LED; they add up.
+    wavelength_nm, na : float
+        Of the light; of the objective.
+    defocus_um : float
+        Distance of the focal plane from the sample.
+
+    Returns
+    -------
+    ndarray, float32, (height, width)
+    """
+    spectrum = fft.fft2(np.exp(1j * np.asarray(phase, np.float64)).astype(np.complex64), workers=workers)
+    height, width = phase.shape
+    qy, qx = fft.fftfreq(height, pitch_um)[:, None], fft.fftfreq(width, pitch_um)
+    wavelength_um = 1e-3 * wavelength_nm
+    total = np.zeros(phase.shape, np.float32)
+    for (sine_x, sine_y), weight in zip(sines, weights, strict=True):
+        y, x = qy - sine_y / wavelength_um, qx - sine_x / wavelength_um
+        squared = y**2 + x**2
+        passed = squared <= (na / wavelength_um) ** 2
+        if not passed.any():
+            continue
+        field = np.where(passed, spectrum, 0)
+        if defocus_um:
+            along = np.sqrt(np.maximum(wavelength_um**-2 - squared, 0.0))
+            field = field * np.exp(2j * np.pi * defocus_um * along)
+        amplitude = fft.ifft2(field.astype(np.complex64), workers=workers)
+        total += np.float32(weight) * (amplitude.real**2 + amplitude.imag**2)
+    return total
+
 
 Image = npt.NDArray[np.float32]
 Rgb = tuple[float, float, float]
@@ -28,13 +86,9 @@ RIM_UM = 80.0
 """Of the sample beyond the field of view on each side: what the propagation wraps around stays out of it."""
 
 
-class LedMicroscopeOptions(DriverOptions):
+class LedMicroscopeOptions(CommonOptions):
     """Options of the simulated LED array microscope."""
 
-    seed: int = Field(0, ge=0, description="The same seed gives the same diffuser, sensor and noise.")
-    time_scale: float = Field(1.0, ge=0, description="Real seconds per simulated second; 0: no waiting.")
-    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
-    fixed_pattern: bool = Field(True, description="Whether camera pixels differ.")
     pixels: int = Field(384, ge=64, le=1024, description="Of the camera along each side.")
     light: float = Field(2e4, gt=0, description="Electrons a second that one LED gives a camera pixel.")
     magnification: float = Field(4.0, gt=0, description="Of the objective.")
@@ -58,15 +112,11 @@ class LedMicroscopeWorld(Surroundings):
 
     table = "simulated_led_microscope"
     Options = LedMicroscopeOptions
+    options: LedMicroscopeOptions
 
     def __init__(self, options: DriverOptions) -> None:
-        if not isinstance(options, LedMicroscopeOptions):
-            raise TypeError(
-                f"The simulated microscope takes LedMicroscopeOptions, not {type(options).__name__}."
-            )
-        self.options: LedMicroscopeOptions = options
-        self.clock = Clock(options.time_scale)
-        self.sensor = SensorSpec(
+        options = LedMicroscopeOptions.of(options)
+        sensor = SensorSpec(
             name="microscope camera",
             shape=(options.pixels, options.pixels),
             pitch_um=6.5,
@@ -78,8 +128,7 @@ class LedMicroscopeWorld(Surroundings):
             dsnu_e=1.0,
             bits=12,
         )
-        self.scene_lit = False
-        self._lock = threading.RLock()
+        super().__init__(options, sensor)
         self._sines = np.zeros((0, 2))
         self._levels = np.zeros((0, 3))
         self._sample: Diffuser | None = None
@@ -188,6 +237,7 @@ class MicroscopeLedArray(SimulatedLedArray):
 
     Shared = LedMicroscopeWorld
     Options = MicroscopeLedOptions
+    world: LedMicroscopeWorld  # type: ignore[assignment]  # which Shared makes sure of
 
     def _show(self, pattern: LedPattern) -> None:
         levels: Mapping[int, tuple[int, int, int]] = dict(pattern.levels)
@@ -197,14 +247,7 @@ class MicroscopeLedArray(SimulatedLedArray):
         # An LED seen at an angle is farther away, and turned away: cosine to the fourth.
         cosine = np.sqrt(1 - (sines**2).sum(axis=1))
         self._pattern = pattern
-        world = self._surroundings()
-        world.light_leds(sines, bright * cosine[:, None] ** 4)
-
-    def _surroundings(self) -> LedMicroscopeWorld:
-        world: SharedPart = self.world
-        if not isinstance(world, LedMicroscopeWorld):
-            raise TypeError(f"The microscope's LED array is in no {type(world).__name__}.")
-        return world
+        self.world.light_leds(sines, bright * cosine[:, None] ** 4)
 
 
 class MicroscopeCamera(SimulatedCamera):

@@ -23,13 +23,12 @@ from instrument.reconstruction.checkpointing import checkpoint_for, require_kept
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, request_of
-from instrument.reconstruction.result_file import Outputs, write_reconstruction
-from instrument.reconstruction.volume_file import write_volume
+from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from recon.base.declare import Imports, expression, option, options_of
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 CALIBRATION, PSF, VOLUME = "Picture (calibration)", "Picture (PSF image)", "Volume (PSFs)"
 SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}

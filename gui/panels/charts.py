@@ -21,12 +21,12 @@ from gui.widgets.building import button, cell, choice, fill, in_row, label, offe
 from gui.widgets.dialogues import choose_path
 from gui.widgets.plots import curve_colour, curve_pen, dots, plot_widget
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart_data import read_chart, subject_of
+from instrument.evaluation.chart import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
 from recon.base.declare import Imports, expression
 from recon.evaluation.scored import KINDS, Axis
-from recon.verdict.shipped import shipped_file
+from recon.verdict.cases import SHIPPED
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
 
@@ -38,14 +38,14 @@ class ChartsPanel(Panel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
-        self.maps_path = shipped_file()
+        self.maps_path = SHIPPED
         self.chart_path: Path | None = None
         self.stability = StabilityView()
         self.chart = ChartView()
         tip = "A stability.json or chart.json, made by the commands of those names"
         self.open_button = button("Open…", tip, self._choose)
         tip = "The maps that come with the program, by which verdicts are made"
-        self.shipped_button = button("Shipped maps", tip, lambda: self.open(shipped_file()))
+        self.shipped_button = button("Shipped maps", tip, lambda: self.open(SHIPPED))
         self.heading = label()
         self.heading.setMinimumWidth(10)
         self._headings = {self.stability: ("", ""), self.chart: (_NO_CHART, "")}
@@ -100,7 +100,7 @@ class ChartsPanel(Panel):
     def as_python(self) -> str:
         """Return lines that draw the map that is shown, or read the chart."""
         if self.tabs.currentWidget() is self.chart and self.chart_path is not None:
-            imports = Imports({("instrument.evaluation.chart_data", "read_chart")})
+            imports = Imports({("instrument.evaluation.chart", "read_chart")})
             key = repr(self.chart.key)
             lines = [
                 f"points = read_chart({expression(self.chart_path, imports)})['points']",
@@ -110,7 +110,7 @@ class ChartsPanel(Panel):
             imports = Imports(
                 {
                     ("instrument.files.figures", "save_figure"),
-                    ("instrument.evaluation.stability_figure", "map_figure"),
+                    ("instrument.evaluation.figures", "map_figure"),
                     ("instrument.files.stability_file", "read_stability"),
                 }
             )

@@ -17,9 +17,7 @@ from gui.widgets.building import button, every, fill, in_row, label, split
 from gui.widgets.camera_controls import CameraForm, RecordBar
 from gui.widgets.entry import NumberEdit
 from gui.widgets.live_picture import LivePicture
-from instrument.live.frame_view import sensor_roi
-from instrument.live.live_camera import LiveCameraStatus
-from instrument.runs.snapshot import (
+from instrument.bench.photograph import (
     LightState,
     check_photograph_file,
     led_pattern,
@@ -27,6 +25,8 @@ from instrument.runs.snapshot import (
     photograph_name,
     write_snapshot,
 )
+from instrument.live.frame_view import sensor_roi
+from instrument.live.live_camera import LiveCameraStatus
 from recon.base.declare import Imports, expression
 
 _LOOK_MS = 8
@@ -117,7 +117,7 @@ class LivePanel(Panel):
     def as_python(self) -> str:
         """Return lines that bring the camera to these settings and take the same photograph."""
         names = ("LightState", "photograph_name", "switch_light", "write_snapshot")
-        imports = Imports({("instrument.runs.snapshot", name) for name in names})
+        imports = Imports({("instrument.bench.photograph", name) for name in names})
         light, bench = self.light, self.session.bench
         lines = []
         if (state := self.form.state) is not None:

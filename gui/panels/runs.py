@@ -16,8 +16,7 @@ from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
-from calibration_routines.psf.sweep import FOLDER
-from calibration_routines.psf.sweep_record import is_sweep
+from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
@@ -36,7 +35,7 @@ from gui.widgets.building import (
     text_view,
 )
 from gui.widgets.image_view import ImageView
-from instrument.runs.catalogue import RunSummary, run_paths, summary
+from instrument.runs.inspection import RunSummary, run_paths, summary
 from instrument.runs.run import Run, RunCondition
 from recon.base.declare import Imports, expression
 
@@ -164,7 +163,7 @@ class RunsPanel(Panel):
                 "    frame, metadata = run.frame(index), run.metadata(index)",
             ]
         else:
-            imports.names |= {("instrument.runs.catalogue", name) for name in ("run_paths", "summary")}
+            imports.names |= {("instrument.runs.inspection", name) for name in ("run_paths", "summary")}
             folder = expression(self.session.runs_folder, imports)
             lines = [f"for path in run_paths({folder}):", "    print(summary(path))"]
         return "\n".join([*imports.lines(), "", *lines, ""])
@@ -288,7 +287,7 @@ class RunsPanel(Panel):
 
     def _use(self) -> None:
         if self.opened is not None:
-            self.session.handed_on.emit("reconstructions", self.opened.path / FOLDER)
+            self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
 
     def _open_folder(self) -> None:
         if self.opened is not None:
@@ -316,7 +315,7 @@ def _look_into(path: Path) -> _Found | str:
         run = Run.open(path)
         whole = run.condition is RunCondition.COMPLETED and not run.missing()
         can_resume = run.plan is not None and (not whole or lacks_result(run.path))
-        return _Found(run, sorted(run.records), _about(run), can_resume, (path / FOLDER).is_dir())
+        return _Found(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
         return str(error)
 
@@ -363,13 +362,13 @@ def _about(run: Run) -> list[str]:
     devices = run.provenance.get("devices")
     if isinstance(devices, Mapping):
         lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
-    if is_sweep(run.path):
+    if SWEEP.is_of(run.path):
         lines += _calibration_lines(run.path)
     return lines
 
 
 def _calibration_lines(run: Path) -> list[str]:
-    file = run / FOLDER / "calibration.json"
+    file = run / SWEEP.result / "calibration.json"
     if not file.is_file():
         return ["A sweep without its calibration: Resume makes it."]
     try:

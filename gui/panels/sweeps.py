@@ -26,10 +26,9 @@ from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
-from instrument.files.errors import BenchError, FileError, SettingsError
-from instrument.files.formatting import count
+from instrument.files.errors import BenchError, FileError, SettingsError, count
 from instrument.plan import Plan
-from instrument.plan.file import load_plan, plan_toml
+from instrument.plan.model import load_plan, plan_toml
 from recon.base.declare import option
 
 Image = npt.NDArray[Any]

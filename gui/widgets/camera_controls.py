@@ -19,13 +19,12 @@ from gui.widgets.building import button, every, fill, in_row, label
 from gui.widgets.dialogues import TextWindow
 from gui.widgets.entry import Entry, NumberEdit
 from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera
-from instrument.files.errors import FileError
-from instrument.files.formatting import duration, size
+from instrument.bench.photograph import Lit
+from instrument.files.errors import FileError, duration, size
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, there_now
 from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
-from instrument.runs.snapshot import Lit
 from recon.base.declare import options_of
 
 _READ_BACK_MS = 3000

@@ -17,7 +17,7 @@ from gui.theme import colours
 from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import ImageView
 from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 
 class FactsView(QTextBrowser):

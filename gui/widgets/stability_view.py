@@ -14,7 +14,7 @@ from gui.theme import colours
 from gui.widgets.building import choice, fill, in_row, label, offer
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.plots import curve_colour, curve_pen, dots, legend, plot_widget
-from recon.verdict.failure import Failure
+from recon.verdict.map import Failure
 
 _SPAN = 1.0
 """The colours reach from a tenth of the severity at the boundary to ten times of it."""

@@ -19,8 +19,8 @@ from gui.theme import colours
 from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import StretchedImage
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
-from instrument.files.volume_source import Plane, VolumeSource
-from instrument.reconstruction.volume_views import Projections, grey, in_colour_of_depth, project
+from instrument.files.volumes import Plane, VolumeSource
+from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
 
 Mode = Literal["brightest", "slices"]
 Axis = Literal["z", "y", "x"]

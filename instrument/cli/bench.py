@@ -16,9 +16,8 @@ from instrument.files.errors import BenchError, FileError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from drivers.device import Device, Setting
-    from drivers.registry.discovery import FoundDevice
-    from drivers.registry.listing import Listing
+    from drivers.device import Device, FoundDevice, Setting
+    from drivers.registry.registry import Listing
 
 new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
 
@@ -200,7 +199,7 @@ def devices(
     Devices that a driver is sure of come with the lines to put into bench.toml. Without --probe nothing is
     written to any serial port, so a stage behind a common USB adapter is only listed as a port.
     """
-    from drivers.registry.listing import list_devices
+    from drivers.registry.registry import list_devices
 
     listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
     typer.echo(_listing_json(listing) if as_json else _listing_words(listing))
@@ -212,7 +211,7 @@ def _listing_json(listing: Listing) -> str:
 
 
 def _listing_words(listing: Listing) -> str:
-    from drivers.registry.discovery import BUSES
+    from drivers.device import BUSES
 
     lines: list[str] = []
     others = sorted({device.bus for device in listing.found} - set(BUSES))

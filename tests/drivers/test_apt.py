@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.apt import stage as apt_stage
-from drivers.apt.actuators import CONTROLLERS, SPEED_SCALE
 from drivers.apt.protocol import (
+    CONTROLLERS,
     HW_GET_INFO,
     MOT_GET_DCSTATUSUPDATE,
+    SPEED_SCALE,
     AptFramer,
     Message,
     decode,
@@ -26,8 +27,8 @@ from drivers.apt.protocol import (
     short,
 )
 from drivers.apt.stage import AptOptions, AptStage
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.registry.discovery import FoundDevice
 from drivers.testing.stage import StageContract
 from tests.mocks.apt_controller import STATUS_WITHOUT_SIGN_OF_LIFE, AptController
 from tests.mocks.moving_axis import MovingAxis
