@@ -93,9 +93,9 @@ class _Mailbox(Listener):
         with self._lock:
             self._lines.append(words)
 
-    def exposures(self, found: SweepExposures) -> None:
+    def exposures(self, exposures: SweepExposures) -> None:
         with self._lock:
-            self._lines += exposure_lines(found)
+            self._lines += exposure_lines(exposures)
 
     def frame(self, status: RunStatus) -> None:
         with self._lock:

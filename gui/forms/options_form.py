@@ -207,7 +207,7 @@ class OptionsForm(QWidget):
 
     # Reasons -------------------------------------------------------------------------------------
     def check(self) -> bool:
-        """Tell whether all can be read; the first that cannot is brought into sight, with the reason."""
+        """Return whether all can be read; the first that cannot is brought into sight, with the reason."""
         if self.values() is not None:
             return True
         name = next(name for name, reason in self._reasons.items() if reason.text())
@@ -217,7 +217,7 @@ class OptionsForm(QWidget):
         return False
 
     def recheck(self, *names: str) -> bool:
-        """Look again at some fields, whose limits another one sets, and tell whether all of them can be."""
+        """Look again at some fields, whose limits another one sets, and return whether all of them can be."""
         good = True
         for name in names:
             problem = self.fields[name].read()[1] if self.applies(name) else ""

@@ -226,7 +226,7 @@ class ReconstructForm(QWidget):
 
 
 def _one_shot(present: dict[str, Any]) -> str:
-    """Say why nothing tells it when to stop; empty where something does."""
+    """Say why what ends iterations does not apply; empty where it does."""
     solver = str(present.get("solver"))
     one_step = solver in SOLVERS and SOLVERS[solver].one_step
     return f"{solver} is one shot: it has no iterations." if one_step else ""

@@ -46,7 +46,7 @@ _REST_MS = 500
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _Opened:
     """A run that was read."""
 
     run: Run
@@ -114,11 +114,11 @@ class RunsPanel(Panel):
             self._watcher.addPath(str(folder))
 
         def work(context: JobContext) -> list[RunSummary]:
-            found = []
+            summaries = []
             for path in reversed(run_paths(folder)):
                 context.check()
-                found.append(summary(path))
-            return found
+                summaries.append(summary(path))
+            return summaries
 
         self._listing = self.jobs.watch("Reading the list of runs", work)
         self._listing.succeeded.connect(self._show_list)
@@ -130,23 +130,23 @@ class RunsPanel(Panel):
         self._opening = path
         self._reader.ask(lambda: _look_into(path), self._show_run)
 
-    def _show_run(self, found: _Found | str) -> None:
+    def _show_run(self, opened: _Opened | str) -> None:
         self._opening = None
-        if isinstance(found, str):
-            self._close_run(found)
+        if isinstance(opened, str):
+            self._close_run(opened)
             return
-        run = self.opened = found.run
-        middle = len(found.stored) // 2  # the first ones are dark
+        run = self.opened = opened.run
+        middle = len(opened.stored) // 2  # the first ones are dark
         with QSignalBlocker(self.slider):
-            self.slider.setEnabled(len(found.stored) > 1)
-            self.slider.setRange(0, max(0, len(found.stored) - 1))
+            self.slider.setEnabled(len(opened.stored) > 1)
+            self.slider.setRange(0, max(0, len(opened.stored) - 1))
             self.slider.setValue(middle)
-        self._stored = found.stored
-        self.about.setPlainText("\n".join(found.about))
-        self._can_resume = found.can_resume and run.condition is not RunCondition.RUNNING
+        self._stored = opened.stored
+        self.about.setPlainText("\n".join(opened.about))
+        self._can_resume = opened.can_resume and run.condition is not RunCondition.RUNNING
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
-        self.use_button.setEnabled(found.is_usable)
+        self.use_button.setEnabled(opened.is_usable)
         self._show_frame(middle)
 
     def as_python(self) -> str:
@@ -195,7 +195,7 @@ class RunsPanel(Panel):
     def _make_list(self) -> None:
         self.table = table(_COLUMNS, "Click a run to open it", wide=0, row_px=26)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
-        # What tells runs of a day apart stands at the end of their names.
+        # What distinguishes runs of a day stands at the end of their names.
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.table.verticalHeader().hide()
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
@@ -222,21 +222,21 @@ class RunsPanel(Panel):
         wanted = self._wanted or self._opening or (self.opened and self.opened.path)
         self.summaries = summaries
         self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
-        paths = [found.path for found in summaries]
+        paths = [listed.path for listed in summaries]
         chosen = paths.index(wanted) if wanted in paths else -1
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(summaries))
-            for number, found in enumerate(summaries):
+            for number, listed in enumerate(summaries):
                 texts = (
-                    found.path.name,
-                    found.condition.value if found.condition is not None else "UNREADABLE",
-                    f"{found.stored} of {found.frames}",
-                    "recording" if found.is_recording else "plan",
-                    "SIMULATED" if found.is_simulated else "",
+                    listed.path.name,
+                    listed.condition.value if listed.condition is not None else "UNREADABLE",
+                    f"{listed.stored} of {listed.frames}",
+                    "recording" if listed.is_recording else "plan",
+                    "SIMULATED" if listed.is_simulated else "",
                 )
                 for place, text in enumerate(texts):
-                    tip = found.problem or (str(found.path) if place == 0 else text)
-                    warns = place == 1 and found.condition is not RunCondition.COMPLETED
+                    tip = listed.problem or (str(listed.path) if place == 0 else text)
+                    warns = place == 1 and listed.condition is not RunCondition.COMPLETED
                     self.table.setItem(number, place, cell(text, tip, warns=warns))
             self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
         if chosen >= 0 and self._wanted is not None:
@@ -251,11 +251,11 @@ class RunsPanel(Panel):
 
     def _row_chosen(self, row: int) -> None:
         if 0 <= row < len(self.summaries) and not self.run.is_running:
-            found = self.summaries[row]
-            if found.condition is None:
-                self._close_run(f"{found.path}: {found.problem}")
+            listed = self.summaries[row]
+            if listed.condition is None:
+                self._close_run(f"{listed.path}: {listed.problem}")
             else:
-                self.open_run(found.path)
+                self.open_run(listed.path)
 
     def _close_run(self, why: str) -> None:
         self._reader.forget()
@@ -278,12 +278,12 @@ class RunsPanel(Panel):
         index = self._stored[min(number, len(self._stored) - 1)]
         self._reader.ask(lambda: _read_frame(run, index), self._frame_read)
 
-    def _frame_read(self, found: _Picture | str) -> None:
-        if isinstance(found, str):
-            self.frame_words.setText(found)
+    def _frame_read(self, frame: _Picture | str) -> None:
+        if isinstance(frame, str):
+            self.frame_words.setText(frame)
         else:
-            self.view.show_image(found.image, found.low, found.high, found.full_scale)
-            self.frame_words.setText(found.words)
+            self.view.show_image(frame.image, frame.low, frame.high, frame.full_scale)
+            self.frame_words.setText(frame.words)
 
     def _use(self) -> None:
         if self.opened is not None:
@@ -309,14 +309,14 @@ class RunsPanel(Panel):
         self.read_folder()
 
 
-def _look_into(path: Path) -> _Found | str:
+def _look_into(path: Path) -> _Opened | str:
     """Read a run; the reason where it cannot be read."""
     try:
         run = Run.open(path)
         whole = run.condition is RunCondition.COMPLETED and not run.missing()
         can_resume = run.plan is not None and (not whole or lacks_result(run.path))
-        return _Found(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
-    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
+        return _Opened(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
+    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
 
@@ -324,7 +324,7 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
     """Read a frame; the reason where it cannot be read."""
     try:
         image, metadata = run.frame(index), run.metadata(index)
-    except Exception as error:  # noqa: BLE001 - a damaged file is told, whatever it raises
+    except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
     low, high = np.percentile(image[::4, ::4], _LEVELS)
     words = [
@@ -374,8 +374,8 @@ def _calibration_lines(run: Path) -> list[str]:
     try:
         quality: dict[str, Any] = json.loads(file.read_text("utf-8"))["quality"]
         psfs = quality["psfs"]
-        found = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
+        findings = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
         verdict = "good" if quality["good"] else "with findings"
     except (OSError, ValueError, KeyError, TypeError) as error:
         return [f"Calibration {file.parent} cannot be read: {error!r}"]
-    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *found]
+    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *findings]

@@ -314,5 +314,5 @@ def _disk_of(folder: Path) -> _Disk:
     except FileError as error:
         return _Disk(problem=str(error))
     if not total:  # as some file systems of servers and user space have it
-        return _Disk(problem=f"{folder}: its file system tells no size.")
+        return _Disk(problem=f"{folder}: its file system gives no size.")
     return _Disk(1 - free / total, free)

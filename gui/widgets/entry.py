@@ -91,7 +91,7 @@ class Entry(_Refusing):
         return self._understand(self.text().strip())
 
     def check(self) -> bool:
-        """Tell whether the text is understood, and show the reason where it is not."""
+        """Return whether the text is understood, and show the reason where it is not."""
         try:
             self.value()
         except BenchError as error:
