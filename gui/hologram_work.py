@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
 from calibration_routines.display.hologram_photograph import (
-    CaptureOptions,
     Photographed,
     photograph_hologram,
     write_capture,
@@ -29,6 +28,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.safety import StepsFailedError
 from instrument.display.hologram import (
+    CaptureOptions,
     HologramResult,
     bench_display,
     compute_and_judge,

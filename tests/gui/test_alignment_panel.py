@@ -17,7 +17,7 @@ from gui.main_window import MainWindow
 from gui.panels.alignment import AlignmentPanel
 from gui.procedure_run import ProcedureRun, RunBar, Situation
 from gui.session import BenchSession
-from instrument.bench.config_file import display_text
+from instrument.bench.config_file import template
 from recon.holography.pose import NODES, Pose
 
 LEFT = Qt.MouseButton.LeftButton
@@ -37,7 +37,7 @@ SMALL = {
 
 @pytest.fixture
 def bench_text() -> str:
-    text = display_text()
+    text = template("display")
     for key, value in SMALL.items():
         text = re.sub(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
     return text
