@@ -309,7 +309,7 @@ def hologram(
                 result = _compute(display, targets, options, initial[channel], cancel, label)
                 initial[channel] = result.hologram.slm if inputs.video else None
                 writer.write(number, channel, result)
-                _tell(label, result, options)
+                _print(label, result, options)
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
@@ -346,7 +346,7 @@ def _channel(picture: Pixels, channel: int | None) -> npt.NDArray[Any]:
     return np.ascontiguousarray(picture[..., channel])
 
 
-def _tell(label: str, result: HologramResult, options: HologramOptions) -> None:
+def _print(label: str, result: HologramResult, options: HologramOptions) -> None:
     """Say how good the hologram is, for which grid, envelope and frame count."""
     history = result.hologram.history
     typer.echo(

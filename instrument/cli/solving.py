@@ -37,7 +37,7 @@ def reconstruct_photograph(
 ) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
     if output.explain:
-        tell_choice(request.explain(request.prepare()))
+        _print_choice(request.explain(request.prepare()))
         return
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
@@ -45,7 +45,7 @@ def reconstruct_photograph(
         job = request.prepare()
         planes = len(job.calibration.psfs) if is_volume else 1
         outputs.check(planes * job.measurement.size, overwrite=output.force)
-        _tell_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
+        _print_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
         total = iteration_limit(request.options) or 1000
         what = "volume" if is_volume else "picture"
@@ -56,7 +56,7 @@ def reconstruct_photograph(
                 advance(round(total * share), note=f"change {record.change:.1e}")
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
-        _tell(result)
+        _print(result)
         if is_volume:
             write_volume(outputs, result, job)
             if steps := uneven_steps(result.grid.z_um):
@@ -77,7 +77,7 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
             prepared = prepare_patterned(request, advance)
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
-        _tell_job(job, "calibration or frames come from the simulated bench")
+        _print_job(job, "calibration or frames come from the simulated bench")
         with (
             one_task("picture", request.iterations or ITERATIONS) as advance,
             first_interrupt_cancels() as cancel,
@@ -87,13 +87,13 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
                 advance(record.iteration, note=f"change {record.change:.1e}")
 
             result = solve_patterned(prepared, watch=show, cancel=cancel)
-        _tell_end(result)
+        _print_end(result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
     _end(result, "picture")
 
 
-def tell_choice(choice: Choice) -> None:
+def _print_choice(choice: Choice) -> None:
     """Print what was chosen and why, and what one step up and down would cost."""
     for line in choice.lines():
         typer.echo(line)
@@ -103,13 +103,13 @@ def tell_choice(choice: Choice) -> None:
     )
 
 
-def tell_verdict(verdict: Verdict | None) -> None:
+def _print_verdict(verdict: Verdict | None) -> None:
     """Print the verdict, one sentence a line; nothing where none was asked for."""
     for index, sentence in enumerate(verdict.sentences if verdict is not None else ()):
         typer.echo(f"{'Verdict' if not index else '':<12}{sentence}")
 
 
-def _tell_job(job: Job, simulated: str) -> None:
+def _print_job(job: Job, simulated: str) -> None:
     for name, text in job.notes.items():
         typer.echo(f"{name:<12}{text}")
     if job.simulated:
@@ -118,7 +118,7 @@ def _tell_job(job: Job, simulated: str) -> None:
         typer.echo(f"Warning: {warning}", err=True)
 
 
-def _tell(result: Reconstruction) -> None:
+def _print(result: Reconstruction) -> None:
     weight = "" if result.tau is None else f", tau {result.tau:.3g}"
     if result.choice is not None:
         for line in result.choice.brief():
@@ -128,13 +128,13 @@ def _tell(result: Reconstruction) -> None:
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")
-    _tell_end(result)
-    tell_verdict(result.verdict)
+    _print_end(result)
+    _print_verdict(result.verdict)
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)
 
 
-def _tell_end(result: Reconstruction) -> None:
+def _print_end(result: Reconstruction) -> None:
     count = _iterations(result)
     if not count:
         typer.echo(f"{'Done':<12}in one step, {result.seconds:.1f} s")

@@ -99,7 +99,7 @@ class RunControl:
             yield
         except BaseException as error:
             try:
-                bench.safe_state()
+                bench.stop()
             except StepsFailedError as failure:
                 error.add_note(str(failure))
             raise
