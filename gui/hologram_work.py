@@ -21,7 +21,6 @@ from calibration_routines.display.hologram_photograph import (
     photograph_hologram,
     write_capture,
 )
-from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
@@ -229,7 +228,7 @@ def photograph(
 
     context.on_cancel(cancel)
     try:
-        with _exposure_kept(bench.camera), under_control(bench, control):
+        with _exposure_kept(bench.camera), control.procedure(bench):
             if computed.order.alignment is not None:
                 bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
             found = photograph_hologram(

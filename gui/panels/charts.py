@@ -13,7 +13,7 @@ from gui.session import BenchSession
 from gui.widgets.chart_view import ChartView
 from gui.widgets.dialogues import choose_path
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart_data import read_chart, subject_of
+from instrument.evaluation.chart import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
 from recon.base.declare import expression
@@ -105,7 +105,7 @@ class ChartsPanel(Panel):
             lines = [
                 "from pathlib import Path",
                 "",
-                "from instrument.evaluation.chart_data import read_chart",
+                "from instrument.evaluation.chart import read_chart",
                 "",
                 f"points = read_chart({expression(self.chart_path)})['points']",
                 f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "
@@ -119,7 +119,7 @@ class ChartsPanel(Panel):
                 "from pathlib import Path",
                 "",
                 "from instrument.files.figures import save_figure",
-                "from instrument.evaluation.stability_figure import map_figure",
+                "from instrument.evaluation.figures import map_figure",
                 "from instrument.files.stability_file import read_stability",
                 "",
                 f"maps = read_stability({expression(self.maps_path)})['maps']",

@@ -112,7 +112,7 @@ def _make(folder: Path) -> None:
 
 
 def _draw(record: dict[str, object], picture: Path) -> None:
-    from instrument.evaluation.stability_figure import map_figure
+    from instrument.evaluation.figures import map_figure
     from instrument.files.atomic import whole_file
     from instrument.files.figures import save_figure
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.condition import condition_number
+from recon.analysis.gram import WindowProblem, condition_number
 from recon.analysis.points import Noise, PointGrid, try_points
-from recon.analysis.window import WindowProblem
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
