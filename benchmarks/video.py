@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
-from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from instrument.reconstruction.video_work import cluster, in_process, on_cluster
 from recon.base import fft as project_fft
 from recon.base.metrics import psnr
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem

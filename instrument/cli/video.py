@@ -15,8 +15,7 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_block import BlockReport
-from instrument.reconstruction.video_workers import require_crew
+from instrument.reconstruction.video_work import BlockReport, require_crew
 
 
 def reconstruct_to_video(
@@ -72,13 +71,13 @@ def _solve(prepared: PreparedVideo, workers: int | None, scheduler: str | None) 
         task = bar.add_task("frames", total=total, completed=before, note="")
         done = before
 
-        def told(report: BlockReport) -> None:
+        def advance(report: BlockReport) -> None:
             nonlocal done
             done += len(prepared.job.blocks[report.block])
             rate = (done - before) / max(time.monotonic() - began_s, 1e-9)
             bar.update(task, completed=done, note=f"{rate:.1f} frames/s")
 
-        return solve_video(prepared, told, cancel, workers=workers, scheduler=scheduler)
+        return solve_video(prepared, advance, cancel, workers=workers, scheduler=scheduler)
 
 
 def _frames_done(prepared: PreparedVideo) -> int:

@@ -23,12 +23,19 @@ from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import PictureRequest
-from instrument.reconstruction.video_block import BlockReport, CancelledError
+from instrument.reconstruction.video_files import (
+    DEFAULT_FPS,
+    SAMPLES,
+    VideoPictures,
+    as_shown,
+    create_output,
+    has_light,
+    levels_of,
+    require_video,
+    write_mp4,
+)
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
-from instrument.reconstruction.video_mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
-from instrument.reconstruction.video_output import VideoPictures, create_output
-from instrument.reconstruction.video_source import has_light, require_video
-from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from recon.base.declare import inapplicable
 from recon.reconstruction.measurement import Measurement
@@ -205,7 +212,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
 
 def solve_video(
     prepared: PreparedVideo,
-    told: Callable[[BlockReport], object],
+    on_progress: Callable[[BlockReport], object],
     cancel: threading.Event,
     *,
     workers: int | None = None,
@@ -229,10 +236,10 @@ def solve_video(
     folder = job.folder.resolve()
     try:
         if workers is None and scheduler is None:
-            in_process(folder, output, prepared.left, told, cancel)
+            in_process(folder, output, prepared.left, on_progress, cancel)
         else:
             with cluster(workers=workers, scheduler=scheduler) as client:
-                on_cluster(client, folder, output, prepared.left, told, cancel)
+                on_cluster(client, folder, output, prepared.left, on_progress, cancel)
     except CancelledError:
         return False
     return True
