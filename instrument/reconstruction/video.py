@@ -42,8 +42,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
-from recon.streams.running import Running
-from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, stream_problem
+from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, VideoSolver, stream_problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -321,7 +320,7 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
             "prior": str(request.options.prior or "tv"),
             "model": problem.model,
             "background_estimated": problem.smooth,
-            "weight": max(Running(problem).weights),
+            "weight": max(VideoSolver(problem).weights),
             "noise_deviation": problem.noise,
             "optics_sha256": _digest(problem, reduction),
             "simulated": picture.simulated,

@@ -11,7 +11,7 @@ import importlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
@@ -26,11 +26,12 @@ from instrument.reconstruction.video_job import VideoJob
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.run import FRAMES
 from recon.base.threads import get_threads, set_threads
+from recon.reconstruction.measurement import Floats
 from recon.streams.joint import solve_together
-from recon.streams.video import Floats, VideoSolver
+from recon.streams.video import VideoSolver
 
 _kept = threading.local()
-"""A thread's last job with its solver, whose arrays are dear to make: ``(folder, plan, job, solver)``."""
+"""A thread's last job with its solver, whose arrays are dear to make."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,8 @@ def solve_block(
 
     if together_in is None:
         job, solver = _solver_for(job)
-        solved = _one_by_one(solver, measured())
+        solver.begin()
+        solved: Iterator[Floats] = map(solver.next, measured())
     else:
         stack = np.stack(list(measured()))
         together = solve_together(
@@ -122,23 +124,18 @@ def solve_block(
     return BlockReport(number, len(block), written, time.perf_counter() - began_s, unlit)
 
 
-def _one_by_one(solver: VideoSolver, frames: Iterable[Floats]) -> Iterator[Floats]:
-    solver.begin()
-    for frame in frames:
-        yield solver.next(frame)
-
-
 def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
-    kept: tuple[Path, object, VideoJob, VideoSolver] | None = getattr(_kept, "value", None)
-    if kept is not None and kept[0] == job.folder and kept[1] == job.plan:
-        return kept[2], kept[3]
-    _kept.value = None  # its memory is needed
+    kept: tuple[VideoJob, VideoSolver] | None = getattr(_kept, "value", None)
+    if kept is not None:
+        if (kept[0].folder, kept[0].plan) == (job.folder, job.plan):
+            return kept
+        kept[1].close()
+    kept = _kept.value = None  # its memory is needed
+    plan = job.plan
     solver = VideoSolver(
-        job.problem,
-        cold_iterations=job.plan.cold_iterations,
-        warm_iterations=job.plan.warm_iterations,
+        job.problem, cold_iterations=plan.cold_iterations, warm_iterations=plan.warm_iterations
     )
-    _kept.value = (job.folder, job.plan, job, solver)
+    _kept.value = job, solver
     return job, solver
 
 
