@@ -21,7 +21,7 @@ from ome_zarr_models.v05 import Image
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.plan import Part, Plan
-from instrument.reconstruction import video_block as block_module
+from instrument.reconstruction import video_work as block_module
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
