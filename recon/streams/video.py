@@ -87,6 +87,8 @@ class VideoSolver:
         Of :func:`stream_problem`: a first frame settles noise, scales and the prior's weight.
     cold_iterations, warm_iterations : int
         Of the first frame after :meth:`begin`, and of each after it.
+    parts : list of Part, optional
+        The problem's, where they are there already.
 
     Attributes
     ----------
@@ -105,6 +107,7 @@ class VideoSolver:
         *,
         cold_iterations: int = COLD_ITERATIONS,
         warm_iterations: int = WARM_ITERATIONS,
+        parts: list[Part] | None = None,
     ) -> None:
         if min(cold_iterations, warm_iterations) < 1:
             raise InputError(
@@ -113,7 +116,7 @@ class VideoSolver:
         self.cold_iterations, self.warm_iterations = cold_iterations, warm_iterations
         self._offered = require_steps(problem)
         self._first = self.problem = problem
-        self.parts = [Part(problem, channels) for channels in parts_of(problem)]
+        self.parts = parts or [Part(problem, channels) for channels in parts_of(problem)]
         for part in self.parts:
             part.weigh(problem.options.tau)
         self.solvers: list[Any] = [None for _ in self.parts]
