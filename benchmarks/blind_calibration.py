@@ -27,9 +27,9 @@ from drivers.simulated.world import LUMINANCE, SimulatedWorld, sample_picture
 from recon import reconstruct
 from recon.base.threads import set_threads
 from recon.blind import BlindSettings, calibrate_from_beads
-from recon.blind.point_psfs import support_of
+from recon.blind.points import support_of
 from recon.camera.registration import displacement, shifted
-from recon.optics.scenes import bead_volume, picture
+from recon.optics.scene import bead_volume, picture
 from recon.types import Calibration, Geometry
 
 GREEN = (0.0, 1.0, 0.0)

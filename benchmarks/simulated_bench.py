@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from recon.optics.grid import PixelGrid
+from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.sensor import Readout, expose
-from recon.optics.spectrum import mixed_spectrum
 
 Image = npt.NDArray[np.float32]
 GREEN = (0.0, 1.0, 0.0)

@@ -21,8 +21,7 @@ from calibration_routines.psf.sweep_procedure import analysing, sweep_outcome
 from calibration_routines.psf.sweep_record import is_sweep
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
-from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import abilities_of, prepare, prepare_resume
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 

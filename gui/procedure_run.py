@@ -20,7 +20,7 @@ from gui.jobs import Job, JobContext
 from gui.session import BenchSession
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Plan
-from instrument.plan.file import plan_toml
+from instrument.plan.model import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
 from recon.base.declare import Imports, expression

@@ -18,7 +18,7 @@ from instrument.reconstruction.request import PictureRequest, VolumeRequest, don
 from instrument.reconstruction.result_file import Outputs, write_reconstruction
 from instrument.reconstruction.volume_file import write_volume
 from recon.base.declare import Imports, expression
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 _INTERVAL_S = 0.5
 """What there is so far is shown this often, at most."""

@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from calibration_routines.psf.sweep_options import AxialSweep
 from recon.base.declare import option
-from recon.optics.scene import Scene
-from recon.optics.scenes import picture
+from recon.optics.scene import Scene, picture
 
 PICTURE = Path(__file__).with_name("demo_picture.jpg")
 """A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""

@@ -47,8 +47,7 @@ from calibration_routines.display.mask_search import (
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, home_if_needed, under_control
 from instrument.bench.bench import Bench
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import Alignment, save_alignment
+from instrument.display.hologram import Alignment, bench_display, save_alignment
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
@@ -305,7 +304,7 @@ class AlignmentProcedure:
             bench.safe_state()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
-        from instrument.display.figures import (
+        from instrument.display.hologram_files import (
             write_alignment_figure,  # matplotlib, only where it is drawn
         )
 

@@ -20,9 +20,8 @@ from calibration_routines.display.mask_search import (
 from drivers.stage import Stage
 from instrument.files.sample_images import load_sample
 from recon.holography import Display, Target
-from recon.holography.lowpass import make_band
-from recon.holography.placement import PlacedHologram
-from recon.holography.pose import NAMES, Pose
+from recon.holography.pose import NAMES, PlacedHologram, Pose
+from recon.holography.target import make_band
 
 ITERATIONS = 15
 """Enough to tell places apart: further ones raise all of them alike."""

@@ -21,8 +21,7 @@ from calibration_routines.display.display_io import (
 from calibration_routines.options import problems_of
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
 from instrument.bench.bench import Bench
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import load_alignment
+from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl

@@ -20,9 +20,9 @@ from calibration_routines.psf.analysis import binned
 from instrument.bench.bench import Bench
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError, OperatorNeededError, SettingsError
-from instrument.runs.folder import dated_name, free_name
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import RunProgress
+from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import RARE, option
 from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
 from recon.types import Calibration, Geometry

@@ -178,7 +178,7 @@ def watch_resumed(bench: Bench, runner: Runner, on_event: OnEvent | None = None)
     bench : Bench
         Open.
     runner : Runner
-        From :func:`~instrument.runs.resume.prepare_resume`, not yet begun.
+        From :func:`~instrument.runs.acquire.prepare_resume`, not yet begun.
     on_event : callable, optional
         As :func:`calibrate_sweep`; not called for what was taken before.
 

@@ -15,7 +15,7 @@ from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, Later
 from calibration_routines.psf.sweep_plan import DARK, check_sweep, depths_um, reference_point, sweep_plan
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
 from instrument.bench.bench import Bench
-from instrument.files.formatting import count
+from instrument.files.errors import count
 from instrument.plan import Plan, estimate
 from instrument.runs.acquire import abilities_of
 from instrument.runs.run_control import EndedEarlyError, RunControl

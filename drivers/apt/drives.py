@@ -8,7 +8,6 @@ import time
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.apt.actuators import SPEED_SCALE
 from drivers.apt.link import Link
 from drivers.apt.protocol import (
     BAY_1,
@@ -43,6 +42,7 @@ from drivers.apt.protocol import (
     RACK,
     RACK_GET_BAYUSED,
     RACK_REQ_BAYUSED,
+    SPEED_SCALE,
     STOP_AT_ONCE,
     fault_words,
     long,

@@ -6,13 +6,14 @@ import logging
 import struct
 from dataclasses import dataclass
 
-from drivers.apt.actuators import CONTROLLERS, ControllerName
 from drivers.apt.protocol import (
+    CONTROLLERS,
     HW_GET_INFO,
     HW_REQ_INFO,
     HW_RESPONSE,
     HW_RICHRESPONSE,
     AptFramer,
+    ControllerName,
     Message,
     decode,
     short,

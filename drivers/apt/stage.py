@@ -9,7 +9,9 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from drivers.apt.actuators import (
+from drivers.apt.drives import Drive, InertiaChannel, InertiaUnit, Motor
+from drivers.apt.link import Link
+from drivers.apt.protocol import (
     ACTUATORS,
     CONTROLLERS,
     FASTEST_COUNTS_PER_S,
@@ -18,8 +20,6 @@ from drivers.apt.actuators import (
     ActuatorName,
     ControllerName,
 )
-from drivers.apt.drives import Drive, InertiaChannel, InertiaUnit, Motor
-from drivers.apt.link import Link
 from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim

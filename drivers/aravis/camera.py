@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from drivers.aravis.features import library_error, load
 from drivers.aravis.image_settings import AravisImageSettings
-from drivers.aravis.library import library_error, load
 from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels, unpack

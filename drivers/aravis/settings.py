@@ -16,8 +16,10 @@ from drivers.aravis.features import (
     FRAME_RATE_ENABLE,
     GAIN,
     Features,
+    enable_fake,
+    library_error,
+    load,
 )
-from drivers.aravis.library import enable_fake, library_error, load
 from drivers.common.buffered_camera import BufferedCamera
 from drivers.common.gain import GainScale, GainUnit
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart

@@ -14,8 +14,7 @@ from pydantic import Field, model_validator
 
 from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
 from drivers.dlpc900 import commands
-from drivers.dlpc900.commands import Board, Command
-from drivers.dlpc900.images import encode
+from drivers.dlpc900.commands import Board, Command, encode
 from drivers.dlpc900.link import HidLink, found_controllers
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.registry.discovery import FoundDevice

@@ -14,7 +14,7 @@ from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.scene_light import Lamp, SceneLight
 from drivers.simulated.world import SimulatedWorld
-from recon.optics.spectrum import BANDS
+from recon.optics.grid import BANDS
 
 
 class LedArrayOptions(DriverOptions):

@@ -24,12 +24,10 @@ from recon.optics.fall_off import (
     response_on,
     table_fall_off,
 )
-from recon.optics.grid import PixelGrid
+from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.render import RenderSettings, render
-from recon.optics.scene import Scene, TruthGrid, true_scene
-from recon.optics.scenes import bar_target, bead_volume, picture, tilted_target
+from recon.optics.scene import Scene, TruthGrid, bar_target, bead_volume, picture, tilted_target, true_scene
 from recon.optics.sensor import SensorSpec
-from recon.optics.spectrum import mixed_spectrum
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
 

@@ -39,7 +39,7 @@ from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.run_bar import RunBar
-from instrument.runs.catalogue import RunSummary, run_paths, summary
+from instrument.runs.inspection import RunSummary, run_paths, summary
 from instrument.runs.run import Run, RunCondition
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
@@ -173,7 +173,7 @@ class RunsPanel(Panel):
         """Return lines that read the run, or go on with it where it did not end."""
         if self.opened is None:
             return (
-                "from pathlib import Path\n\nfrom instrument.runs.catalogue import run_paths, summary\n\n"
+                "from pathlib import Path\n\nfrom instrument.runs.inspection import run_paths, summary\n\n"
                 f"for path in run_paths(Path({str(self.session.runs_folder)!r})):\n    print(summary(path))\n"
             )
         if self._can_resume:

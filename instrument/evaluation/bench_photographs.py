@@ -24,8 +24,7 @@ from instrument.files.atomic import check_writable, whole_file
 from instrument.files.errors import FileError
 from instrument.files.sample_images import SAMPLES
 from recon.evaluation.chart_calibration import FINE, SCENES, Photographed, Photographs
-from recon.optics.scene import Scene
-from recon.optics.scenes import bead_volume, picture
+from recon.optics.scene import Scene, bead_volume, picture
 from recon.types import Geometry
 
 VERSION = 2

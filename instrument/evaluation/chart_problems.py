@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.bench.display_setup import bench_display, slm_size
-from instrument.display.hologram_job import prepare_target
+from instrument.display.hologram import bench_display, prepare_target, slm_size
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES

@@ -12,7 +12,7 @@ from instrument.reconstruction.mosaic import MosaicChoice, mosaic_named
 from instrument.reconstruction.preparation import Crop
 from recon.base.declare import RARE, option
 from recon.base.noise import NoiseModel
-from recon.camera.bayer import PATTERNS
+from recon.camera.factors import PATTERNS
 from recon.errors import InputError
 from recon.streams.joint import OverTimeName
 from recon.streams.video import WARM_ITERATIONS

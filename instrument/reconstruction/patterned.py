@@ -21,7 +21,7 @@ from instrument.reconstruction.preparation import reduce
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
 from recon.reconstruction.result import Reconstruction
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 from recon.types import Calibration
 
 Floats = npt.NDArray[np.float32]

@@ -10,7 +10,7 @@ import numpy as np
 from instrument.files.images import ImageFile
 from instrument.reconstruction.preparation import AUTO_PIXELS, Crop, Dark, FloatImage
 from recon.base.noise import NoiseModel
-from recon.camera.bayer import Pattern
+from recon.camera.factors import Pattern
 
 
 def noise_of(image: ImageFile) -> NoiseModel | None:

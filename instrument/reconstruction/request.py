@@ -19,8 +19,7 @@ from instrument.reconstruction.job import (
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice, SourceOptions
 from instrument.reconstruction.volume_job import volume_job
-from recon.base.checks import select_psf
-from recon.base.options import require_options
+from recon.base.checks import require_options, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.priors import Prior
 from recon.reconstruction.choice import Choice
@@ -32,8 +31,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, volume_priors
-from recon.solvers.base import Keeper
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.files.volume_source import VolumeSource
-from instrument.files.volume_zarr import is_zarr_name, middle_step_um, write_volume_zarr
+from instrument.files.volumes import VolumeSource, is_zarr_name, middle_step_um, write_volume_zarr
 from instrument.reconstruction.result_file import preview
 from instrument.reconstruction.stored_result import StoredResult
 from recon.reconstruction.result import Grid

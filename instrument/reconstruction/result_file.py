@@ -16,7 +16,7 @@ from instrument.files.atomic import check_writable, write_text
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
 from instrument.files.record import plain
-from instrument.files.volume_zarr import is_zarr_name
+from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.job import Job
 from recon.reconstruction.result import Grid, Reconstruction
 

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
-from instrument.files.volume_source import VolumeSource, open_volume
-from instrument.files.volume_zarr import is_zarr_name
-from recon.solvers.stopping import IterationRecord
+from instrument.files.volumes import VolumeSource, is_zarr_name, open_volume
+from recon.solvers.base import IterationRecord
 from recon.verdict.verdict import Region
 
 

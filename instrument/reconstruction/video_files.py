@@ -19,7 +19,7 @@ from drivers.frame import FrameMetadata
 from instrument.files.atomic import whole_file
 from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import FileError
-from instrument.files.ome import ome_attributes
+from instrument.files.volumes import ome_attributes
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
 from recon.base.noise import estimate_deviation

@@ -14,7 +14,7 @@ import numpy as np
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.figures import save_figure
 from instrument.files.record import plain
-from instrument.files.volume_zarr import is_zarr_name, middle_step_um, uneven_steps, write_volume_zarr
+from instrument.files.volumes import is_zarr_name, middle_step_um, uneven_steps, write_volume_zarr
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.result_file import Outputs
 from recon.reconstruction.result import Grid, Reconstruction

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.volume_source import VolumeSource
+from instrument.files.volumes import VolumeSource
 
 Grey = npt.NDArray[np.float32]
 

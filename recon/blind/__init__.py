@@ -1,6 +1,6 @@
 """Compressive calibration: PSFs over the field from a few images of beads at unknown places (sec. 5.4)."""
 
 from recon.blind.alternate import BlindResult, BlindSettings, calibrate_from_beads
-from recon.blind.point_step import Points
+from recon.blind.points import Points
 
 __all__ = ["BlindResult", "BlindSettings", "Points", "calibrate_from_beads"]

@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.blind.field_functions import FieldFunctions
-from recon.blind.point_psfs import PointMixer, solve_smooth, support_of
-from recon.blind.point_step import PointImages, Points, cleaned, overlooked, refine
+from recon.blind.points import (
+    FieldFunctions,
+    PointImages,
+    PointMixer,
+    Points,
+    cleaned,
+    overlooked,
+    refine,
+    solve_smooth,
+    support_of,
+)
 from recon.camera.registration import displacement, shifted
 
 Array = npt.NDArray[Any]

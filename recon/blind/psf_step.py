@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.point_step import Points
+from recon.blind.points import Points
 from recon.camera.base import Array
-from recon.camera.local_convolution import field_of
 from recon.camera.registration import LOCAL_MEAN_PX
+from recon.camera.varying_psfs import field_of
 from recon.errors import InputError
 
 Floats = npt.NDArray[np.float32]

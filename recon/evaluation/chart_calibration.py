@@ -20,12 +20,12 @@ import numpy.typing as npt
 
 from recon.base.metrics import ssim
 from recon.blind import BlindSettings, calibrate_from_beads
-from recon.blind.point_psfs import support_of
+from recon.blind.points import support_of
 from recon.camera.registration import displacement
 from recon.errors import InputError
 from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 from recon.types import Calibration, Geometry
 
 Array = npt.NDArray[Any]

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
-from recon.camera.background import BackgroundRemoval
+from recon.camera.factors import BackgroundRemoval
 from recon.evaluation.scored import Point
 from recon.evaluation.trial import Setting, binnings_of
 from recon.reconstruction.measurement import Measurement, channel_noise

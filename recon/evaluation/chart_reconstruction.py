@@ -22,7 +22,7 @@ from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.evaluation.trial import Setting, left_out, require_applicable, settings_for
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 from recon.types import Calibration
 
 __all__ = ["ChartProblem", "Setting", "left_out", "run_setting", "settings_for"]

@@ -7,8 +7,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from recon.holography import Display, Target, random_mask
-from recon.holography.placement import PlacedHologram
-from recon.holography.pose import Pose
+from recon.holography.pose import PlacedHologram, Pose
 from recon.verdict.failure import PSNR_DB, Failure, bounded
 from recon.verdict.map import Axis, Size, StressMap, Trial
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import ModelName, members_of_depths
-from recon.camera.interpolation import grid_axes
+from recon.camera.varying_psfs import grid_axes
 from recon.errors import InputError
 from recon.evaluation.chart_calibration import ITERATIONS
 from recon.evaluation.chart_judge import Judge
@@ -23,7 +23,7 @@ from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.evaluation.trial import Setting
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import StopReason
 
 _SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
 """What a photograph is of is for its owner to say: both fronts are drawn."""

@@ -13,8 +13,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from recon.base.namespace import Device, array_namespace
-from recon.camera.camera_model import MODELS, ModelName, members_of_depths
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS, MODELS, ModelName, members_of_depths
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS

@@ -8,11 +8,18 @@ In short::
     print(judge(hologram.slm, display, Target(image)).psnr_db)
 """
 
-from recon.holography.display import DcTerm, Display, ScatteringMask, random_mask
-from recon.holography.etendue import Etendue, eyebox_for_field_of_view, field_of_view_for_eyebox, pixels_for
+from recon.holography.display import (
+    DcTerm,
+    Display,
+    Etendue,
+    ScatteringMask,
+    eyebox_for_field_of_view,
+    field_of_view_for_eyebox,
+    pixels_for,
+    random_mask,
+)
 from recon.holography.judge import Scores, judge
 from recon.holography.losses import LOSSES, Loss
-from recon.holography.lowpass import Grid
 from recon.holography.model import Evaluation, HologramModel
 from recon.holography.optimise import (
     Hologram,
@@ -22,7 +29,7 @@ from recon.holography.optimise import (
     one_step,
 )
 from recon.holography.options import HologramOptions
-from recon.holography.target import Target, foveal_weights, painted_weights
+from recon.holography.target import Grid, Target, foveal_weights, painted_weights
 
 __all__ = [
     "LOSSES",

@@ -28,9 +28,8 @@ from recon.base.threads import get_threads, in_blocks
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.losses import loss_of
-from recon.holography.lowpass import make_band
 from recon.holography.options import HologramOptions
-from recon.holography.target import Target, weights_on
+from recon.holography.target import Target, make_band, weights_on
 
 ComplexArray = npt.NDArray[Any]
 

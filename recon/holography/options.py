@@ -12,8 +12,7 @@ from recon.base.declare import option, require
 from recon.errors import InputError
 from recon.holography.display import Display
 from recon.holography.losses import LOSSES, Loss, loss_of
-from recon.holography.lowpass import Grid
-from recon.holography.target import foveal_weights
+from recon.holography.target import Grid, foveal_weights
 
 Method = Literal["lbfgs", "nesterov", "one-step"]
 Fit = Literal["cover", "contain", "stretch"]

@@ -1,11 +1,20 @@
-"""The mask's pose relative to the SLM's image: as parameters, as a displacement field, as a vector to fit."""
+"""The mask's pose relative to the SLM's image: parameters, displacement field, and what a wrong one costs."""
 
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.fft
+
+from recon.base.metrics import psnr
+from recon.holography.display import Display
+from recon.holography.judge import low_pass
+from recon.holography.model import HologramModel
+from recon.holography.optimise import compute_hologram
+from recon.holography.target import Target, make_band
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,3 +109,116 @@ def natural_steps(
     move, edge, depth = 0.4 * factor, 0.7 * factor, 0.7 * depth_um
     tilts = [1e3 * depth / (half * pitch_um) for half in (half_y, half_x)]
     return np.array([move, move, 1e3 * edge / half_x, edge / half_x, 4.0 * factor, depth, *tilts])
+
+
+Array = npt.NDArray[Any]
+
+
+class PlacedHologram:
+    """A hologram computed for a mask at one place, seen through it at another.
+
+    The hologram's model knows a displacement field only. What it does not know (distance, tilts, the error of
+    the displacement) is propagated here plainly, on the mask's grid.
+
+    Parameters
+    ----------
+    display : Display
+        Its displacement is not used.
+    target : Target
+        In focus.
+    pose : Pose
+        Distance and tilts are not known to the hologram.
+    rest : ndarray, (rows, columns, 2), or None
+        Displacement beyond the pose's, see :class:`recon.holography.spots.SpotMaker`.
+    iterations : int
+    """
+
+    def __init__(
+        self,
+        display: Display,
+        target: Target,
+        pose: Pose,
+        rest: npt.NDArray[np.float64] | None = None,
+        *,
+        iterations: int = 30,
+    ) -> None:
+        self.display = display
+        self.pose = pose
+        self.displacement = pose.displacement(display.mask.shape)
+        if rest is not None:
+            self.displacement += rest
+        placed = replace(display, displacement=self.displacement)
+        model = HologramModel(placed, [target])
+        self.slm = compute_hologram(model, iterations=iterations).slm[0]
+        self._wanted = np.fft.ifftshift(np.asarray(model.wanted(), float))
+        self._peak = model.peaks[0]
+
+    def psnr_db(self, pose: Pose, error: npt.NDArray[np.float64] | None = None) -> float:
+        """Return the PSNR seen where the mask is at ``pose``.
+
+        Parameters
+        ----------
+        pose : Pose
+        error : ndarray, (rows, columns, 2), optional
+            Displacement to add to what the hologram was computed for, beyond the difference of the poses.
+        """
+        shape = self.display.mask.shape
+        moved = self.displacement + pose.displacement(shape) - self.pose.displacement(shape)
+        if error is not None:
+            moved = moved + error
+        image = _seen(self.slm, self.display, moved, pose)
+        scaled = image * (self._wanted.mean() / image.mean())
+        return psnr(scaled, self._wanted, data_range=self._peak)
+
+
+def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Array:
+    """Return the low-passed image, FFT order, on the smallest grid that holds it."""
+    from recon.holography import _kernels
+
+    height, width = display.mask.shape
+    field = np.zeros((height, width), np.complex64)
+    pattern = (slm * display.dc.modulated + display.dc.amplitude).astype(np.complex64)
+    # The SLM's image in the mask's frame: as the model fills it, through a mask that does nothing yet.
+    _kernels.fill_displaced(
+        field,
+        pattern,
+        np.zeros((height, width), np.uint8),
+        np.ones(1, np.complex64),
+        np.ones(height, np.complex64),
+        np.ones(width, np.complex64),
+        displacement.astype(np.float32),
+        display.factor,
+        0,
+        height,
+    )
+    field = _propagate(field, display, pose) * display.mask.field(display.wavelength_nm).astype(np.complex64)
+    band = make_band(display.slm_shape, display.factor, "alias-free")
+    far = scipy.fft.fft2(field, band.shape)
+    ey, ex = display.envelope(band.shape)
+    image = (far.real**2 + far.imag**2) * (ey[:, None] * ex)
+    lags = scipy.fft.rfft2(image)
+    rows, columns = band.seen_shape
+    small = np.zeros((rows, columns // 2 + 1), lags.dtype)
+    top, below, right = band.top, band.kept[0] - band.top, band.kept[1]
+    small[:top, :right] = lags[:top, :right]
+    small[rows - below :, :right] = lags[lags.shape[0] - below :, :right]
+    return low_pass(scipy.fft.irfft2(small, (rows, columns)), display.slm_shape)
+
+
+def _propagate(field: Array, display: Display, pose: Pose) -> Array:
+    """Take light from the SLM's image to the tilted mask (first order in the tilt's small depth)."""
+    if not (pose.z_um or pose.pitch_mrad or pose.yaw_mrad):
+        return field
+    pitch_mm = display.mask_pitch_um * 1e-3
+    fy2, fx2 = (
+        np.pi * display.wavelength_nm * 1e-6 * scipy.fft.fftfreq(n, pitch_mm)[..., None] ** 2
+        for n in field.shape
+    )
+    f2 = (fy2 + fx2.T).astype(np.float32)
+    spectrum = scipy.fft.fft2(field) * np.exp(np.complex64(-1e-3j * pose.z_um) * f2)
+    there = scipy.fft.ifft2(spectrum)
+    if pose.pitch_mrad or pose.yaw_mrad:
+        y, x = ((np.arange(n) - (n - 1) / 2) * pitch_mm for n in field.shape)
+        depth_mm = (1e-3 * (pose.pitch_mrad * y[:, None] + pose.yaw_mrad * x)).astype(np.float32)
+        there = there + depth_mm * scipy.fft.ifft2(spectrum * (np.complex64(-1j) * f2))
+    return np.asarray(there)

@@ -16,10 +16,9 @@ import numpy.typing as npt
 from scipy import fft
 
 from recon.optics.fall_off import FallOff, response_on
-from recon.optics.grid import PixelGrid
-from recon.optics.propagator import Propagator
+from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
-from recon.optics.spectrum import mixed_spectrum
+from recon.optics.wave import Propagator
 
 Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -113,6 +114,15 @@ class Choice:
     """Change an iteration at which to stop."""
     decisions: tuple[Decision, ...]
     seconds: float
+
+    @property
+    def key(self) -> str:
+        """What tells the problem that was chosen from others: kept work of another is not gone on with."""
+        chosen = (
+            self.model, self.planes, self.between, self.binning, self.merged, self.background,
+            self.precision, self.psf_window, self.acceptance_px,
+        )  # fmt: skip
+        return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 
     def lines(self) -> list[str]:
         """Return what was chosen and why, one or more lines a choice."""

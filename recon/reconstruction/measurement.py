@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, require_finite, saturated_share
+from recon.base.checks import as_channels, require_finite, require_options, saturated_share
 from recon.base.noise import NoiseModel, estimate_deviation
-from recon.base.options import require_options
 from recon.errors import InputError
 
 Array = npt.NDArray[Any]
@@ -37,7 +36,7 @@ class Measurement:
         True where a pixel tells nothing: dead, saturated, not read (Kuo 2020, Eq. 3.10, has the complement).
     patterns : array, (n_patterns, height, width), optional
         Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
-        sheet lit by it (see :mod:`recon.camera.patterned`). One pattern of ones is the ordinary photograph.
+        sheet lit by it (see :mod:`recon.camera.factors`). One pattern of ones is the ordinary photograph.
     """
 
     image: npt.ArrayLike
@@ -83,8 +82,8 @@ class Measurement:
         require_options(noise=self.noise)
         counts = self.channels()
         background = self.background
-        data = counts if background is None else counts - like_data(background, counts, "background")
-        valid = np.ones(data.shape, bool) if self.erasures is None else ~_mask(self.erasures, data)
+        data = counts if background is None else counts - self.like(background, counts, "background")
+        valid = np.ones(data.shape, bool) if self.erasures is None else ~self._erased(data)
         if not valid.any(axis=(1, 2)).all():
             raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
         # As it came: once a background is off, saturated pixels no longer share a value.
@@ -94,6 +93,40 @@ class Measurement:
             if (said := _doubt(channel, values[kept]))
         )
         return Counts(data, valid, warnings)
+
+    def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
+        """Broadcast a number, one image, or one for each channel (of patterned light: frame) to the data.
+
+        Raises
+        ------
+        InputError
+            When it is shaped otherwise.
+        """
+        if np.ndim(image) == 0:
+            return np.full_like(data, float(np.asarray(image)))
+        if self.patterns is not None and np.ndim(image) == 3:  # shaped as the frames: patterns first
+            image = np.moveaxis(np.asarray(image), 0, -1)
+        channels = as_channels(image, name)
+        if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
+            one = "channels" if self.patterns is None else "frames"
+            raise InputError(
+                f"The {name} has {_size(channels)} pixels and {len(channels)} {one}; the measurement has "
+                f"{_size(data)} and {len(data)}."
+            )
+        return np.broadcast_to(channels, data.shape)
+
+    def _erased(self, data: Floats) -> npt.NDArray[np.bool_]:
+        """Return the erasures as a mask of the data's shape."""
+        expected = (
+            "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
+        )
+        if self.erasures is None or np.ndim(self.erasures) == 0:
+            raise InputError(f"erasures is {self.erasures!r}: {expected}.")
+        mask = self.like(self.erasures, data, "erasures")
+        if not np.isin(mask, (0, 1)).all():
+            raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
+        erased: npt.NDArray[np.bool_] = mask != 0
+        return erased
 
     def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
         """Return every channel's noise deviation, counts; of frames under patterns their root mean square."""
@@ -142,19 +175,6 @@ def require_same_channels(psfs: Array, data: Array) -> None:
         )
 
 
-def like_data(image: npt.ArrayLike, data: Floats, name: str) -> Floats:
-    """Broadcast a number or an image to the data, channels first."""
-    if np.ndim(image) == 0:
-        return np.full_like(data, float(np.asarray(image)))
-    channels = as_channels(image, name)
-    if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
-        raise InputError(
-            f"The {name} has {_size(channels)} pixels and {len(channels)} channels; the measurement has "
-            f"{_size(data)} and {len(data)}."
-        )
-    return np.broadcast_to(channels, data.shape)
-
-
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
     """Return frames that fit their patterns."""
     data = np.asarray(frames, np.float32)
@@ -182,19 +202,6 @@ def _doubt(channel: int, values: Array) -> str:
             "Leave them out with erasures, or expose shorter."
         )
     return ""
-
-
-def _mask(erasures: npt.ArrayLike, data: Floats) -> npt.NDArray[np.bool_]:
-    """Return erasures as a mask of the data's shape."""
-    given = np.asarray(erasures)
-    expected = "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
-    if given.ndim == 0:
-        raise InputError(f"erasures is {erasures!r}: {expected}.")
-    mask = like_data(given, data, "erasures")
-    if not np.isin(mask, (0, 1)).all():
-        raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
-    erased: npt.NDArray[np.bool_] = mask != 0
-    return erased
 
 
 def _size(channels: Array) -> str:

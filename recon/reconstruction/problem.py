@@ -10,26 +10,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, check_psf, select_psf
-from recon.base.options import require_options
+from recon.base.checks import as_channels, check_psf, require_options, select_psf
 from recon.camera.camera_model import (
     Depths,
     Extent,
     ModelName,
     choose_model,
+    energies,
+    levelled,
     members_of_depths,
     one_depth,
     sort_by_depth,
 )
 from recon.camera.field_registration import one_psf
-from recon.camera.light import energies, levelled
-from recon.camera.local_convolution import field_of
+from recon.camera.varying_psfs import field_of
 from recon.errors import InputError
-from recon.priors import Prior
+from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
     Floats,
     Measurement,
-    like_data,
     require_same_channels,
     require_same_pixels,
 )
@@ -160,7 +159,7 @@ class Problem:
             model, reason = choose_model(depths, model)
         asked = True if options.positive_background else options.estimate_background
         deviation = measurement.deviations(counts).astype(np.float32)
-        return cls(
+        problem = cls(
             measurement,
             calibration,
             options,
@@ -175,6 +174,9 @@ class Problem:
             extent,
             tuple(dict.fromkeys((*doubts, *depths.warnings, *counts.warnings))),
         )
+        if options.axis_weights is not None:
+            problem._require_axis_weights(options.axis_weights)
+        return problem
 
     def with_data(self, image: npt.ArrayLike) -> Problem:
         """Return the same problem with another photograph of the same camera: noise and scales stay.
@@ -198,7 +200,7 @@ class Problem:
                 f"The frame is {np.shape(image)}, those before {np.shape(self.measurement.image)}."
             )
         if measurement.background is not None:
-            counts = counts - like_data(measurement.background, counts, "background")
+            counts = counts - measurement.like(measurement.background, counts, "background")
         data = counts / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
@@ -340,6 +342,27 @@ class Problem:
         """Weights of the z, y and x differences of total variation, (3,) or (n_z, 3)."""
         given = self.options.axis_weights
         return self.grid.axis_weights() if given is None else np.asarray(given, float)
+
+    def _require_axis_weights(self, given: npt.ArrayLike) -> None:
+        """Refuse weights of differences that the prior does not take, or that are none."""
+        if isinstance(self.prior, Prior):
+            raise InputError(
+                "axis_weights are for a prior by name; one given as an object has its own: leave them out."
+            )
+        if not any(isinstance(term, TotalVariation) for term in PRIORS.named(self.prior)(1.0).terms()):
+            raise InputError(
+                f"axis_weights weigh the differences of total variation; the prior {self.prior} has "
+                "none that can be weighed: leave them out, or take tv or tv-isotropic."
+            )
+        weights = np.asarray(given)
+        shapes = ((3,), (self.n_planes, 3))
+        if weights.dtype.kind not in "uif" or weights.shape not in shapes:
+            raise InputError(
+                f"axis_weights are numbers for the z, y and x differences, (3,) or ({self.n_planes}, 3), a "
+                f"row a depth; found {given!r}."
+            )
+        if not (np.isfinite(weights).all() and (weights >= 0).all()):
+            raise InputError(f"axis_weights must be 0 or more, and finite; found {given!r}.")
 
     def measured(self, solution: Array, channels: slice) -> Floats:
         """Return what a solution (some channels, n_z, ...) is in the window, in measurement units.

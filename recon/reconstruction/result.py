@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
+from recon.solvers.douglas_rachford import EmptyPlanes
 from recon.verdict.verdict import Verdict
 
 if TYPE_CHECKING:

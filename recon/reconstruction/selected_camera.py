@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from recon.camera.camera_model import LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
-from recon.camera.local_convolution import FieldOfPsfs
-from recon.camera.low_rank import principal_psfs
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
+from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
 from recon.reconstruction.choice import Decision, Option
 from recon.reconstruction.estimates import loss_db
 from recon.reconstruction.overrides import Overrides
@@ -75,10 +74,16 @@ def model_decision(
     times: Mapping[ModelName, float],
     overrides: Overrides,
 ) -> Decision:
-    """Add the neighbours on the scale convolution, low-rank, local."""
+    """Add the neighbours on the scale convolution, low-rank, local, and what was not judged."""
     scale = candidates(depths)
+    unjudged = [name for name, offered in CAMERAS.items() if offered.refuses(depths) is None]
+    if unjudged and overrides.model is None:
+        why += (
+            f"; left out: {', '.join(unjudged)}, of which nobody knows what it costs and gains "
+            f"(--model {unjudged[0]} takes it)"
+        )
     numbers = {"psf_variation": variation, "tolerated": TOLERATED}
-    if len(scale) == 1:
+    if len(scale) == 1 or model not in scale:
         return Decision("model", model, why, numbers=numbers, overruled=overrides.model is not None)
     low = principal_psfs(_densest(depths), error=LOW_RANK_ERROR)
     numbers |= {"rank": float(len(low.components)), "rank_error": low.error}

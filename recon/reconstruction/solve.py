@@ -10,24 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.offered import CAMERAS
+from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.positive_background import in_turns, is_negative, may_go_on
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reduction import bring_back, places_of, put_planes_back, reduced_start
+from recon.reconstruction.reduction import bring_back, put_planes_back, reduced_start
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
 from recon.reconstruction.unmodelled_planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.weights import is_weighted
 from recon.solvers import Outcome, StoppingRules, StopReason
-from recon.solvers.base import Callback, Keeper
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import Callback, IterationRecord, Keeper
+from recon.solvers.douglas_rachford import DouglasRachford, EmptyPlanes
 from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
 from recon.verdict.judge import method_name, verdict_on
 from recon.verdict.verdict import Verdict
@@ -93,7 +91,7 @@ def solve(
             None if on_progress is None else _shown(problem, on_progress),
             cancel,
             keeper,
-            f"planes-{'_'.join(map(str, places_of(problem.reduction.choice)))}-" if rounds else "",
+            f"auto-{problem.reduction.choice.key}",
         )
         spent += result.seconds
         lost = StopReason.NOT_FINITE in result.stop_reasons
@@ -159,8 +157,9 @@ def _solve(
     for one in channels:
         part = Part(problem, one)
         try:
-            name = f"{prefix}channel-{one.start}" if len(channels) > 1 or not problem.together else prefix
-            found.append(_run(part, offered, rules, warm, on_progress, cancel, (keeper, name)))
+            channel = f"channel-{one.start}" if len(channels) > 1 or not problem.together else ""
+            kept = keeper, "-".join(filter(None, (prefix, channel)))
+            found.append(_run(part, offered, rules, warm, on_progress, cancel, kept))
         finally:
             part.close()
     return _together(problem, offered, found)

@@ -15,7 +15,7 @@ from recon.base.blocks import block_mean
 from recon.base.checks import as_channels, require_finite
 from recon.base.declare import inapplicable, with_overrides
 from recon.errors import InputError
-from recon.reconstruction.measurement import Floats, Measurement, like_data
+from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given, reconstruct
@@ -102,7 +102,8 @@ class LiveReconstructor:
             raise InputError("Live pictures are of one scene in one light: leave the patterns out.")
         self._given = calibration
         if isinstance(calibration, Calibration) and calibration.background is not None:
-            self._known.setdefault("background", np.moveaxis(calibration.background, 0, -1))
+            if self._known.get("background") is None:
+                self._known["background"] = np.moveaxis(calibration.background, 0, -1)
         checked = self._checked()
         self.calibration, self._options = checked.calibration, checked.options
         self.warnings = self._doubts = checked.warnings
@@ -132,14 +133,13 @@ class LiveReconstructor:
         """Return the problem of a frame that holds nothing: what has no way is refused before the stream."""
         psfs = self._given.psfs if isinstance(self._given, Calibration) else as_channels(self._given, "PSF")
         sides = psfs.shape[-2:]
-        known = [np.shape(self._known.get(name, 0)) for name in ("background", "erasures")]
-        colours = max(psfs.shape[-3], *(shape[2] if len(shape) == 3 else 1 for shape in known))
-        blank = np.arange(colours * int(np.prod(sides)), dtype=np.float32).reshape(*sides, colours)
-        estimate = self.options.estimate_background
-        if estimate is None and self._known.get("background") is not None:
-            estimate = False
-        options = replace(self.options, estimate_background=estimate)
         known = {"noise": 1.0} | {name: fact for name, fact in self._known.items() if fact is not None}
+        shapes = [np.shape(fact) for fact in known.values()]
+        colours = max(psfs.shape[-3], *(shape[2] if len(shape) == 3 else 1 for shape in shapes))
+        blank = np.arange(colours * int(np.prod(sides)), dtype=np.float32).reshape(*sides, colours)
+        options = self.options
+        if options.estimate_background is None and "background" in known:
+            options = replace(options, estimate_background=False)
         problem = stream_problem(Measurement(blank, **known), self._given, options)
         require_steps(problem)
         return problem
@@ -370,9 +370,10 @@ class LiveReconstructor:
                     "change of the camera's region, binning or format."
                 )
             background, flat = self._known.get("background"), image.ndim == 2
-            counts = Measurement(frame[0] if flat else np.moveaxis(frame, 0, -1), **self._known).counts()
-            self._background = None if background is None else like_data(background, frame, "background")
-            self._valid = None if counts.valid.all() else counts.valid
+            known = Measurement(frame[0] if flat else np.moveaxis(frame, 0, -1), **self._known)
+            valid = known.counts().valid
+            self._background = None if background is None else known.like(background, frame, "background")
+            self._valid = None if valid.all() else valid
             self._shape = image.shape
         if self._background is not None:
             frame = frame - self._background

@@ -22,9 +22,8 @@ from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver
-from recon.solvers.base import Solver
+from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.solvers.stopping import StoppingRules
 from recon.types import Calibration
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4

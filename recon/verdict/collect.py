@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.checks import as_channels, saturated_share
-from recon.solvers.stopping import IterationRecord, StoppingRules, StopReason
+from recon.solvers.base import IterationRecord, StoppingRules, StopReason
 from recon.verdict.evidence import Evidence, Observation, averaged, measure
 
 Array = npt.NDArray[Any]
@@ -92,7 +92,7 @@ def unsettled_by(
 ) -> float:
     """Return the last change over ten times the tolerance, where a limit ended the run; else 0.
 
-    A run that was ended before it could be seen to settle (:class:`~recon.solvers.stopping.StoppingRules`
+    A run that was ended before it could be seen to settle (:class:`~recon.solvers.base.StoppingRules`
     ask for several calm iterations in a row) counts as if everything had changed: many solvers do not move
     at all in their first iteration. One that was ``started`` from a result had not to begin anew: there the
     residuals count as they do for those rules, as the change alone would call any start settled. Where they

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import metrics
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 
 Image = npt.NDArray[Any]
 

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.apt import stage as apt_stage
-from drivers.apt.actuators import CONTROLLERS, SPEED_SCALE
 from drivers.apt.protocol import (
+    CONTROLLERS,
     HW_GET_INFO,
     MOT_GET_DCSTATUSUPDATE,
+    SPEED_SCALE,
     AptFramer,
     Message,
     decode,

@@ -19,8 +19,7 @@ from pydantic import ValidationError
 
 from drivers.device import Device
 from drivers.dlpc900 import commands, link
-from drivers.dlpc900.commands import Board, Command
-from drivers.dlpc900.images import encode
+from drivers.dlpc900.commands import Board, Command, encode
 from drivers.dlpc900.link import parse_reply, reports
 from drivers.dlpc900.slm import Dlpc900Options, Dlpc900Slm
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError

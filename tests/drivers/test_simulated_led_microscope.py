@@ -13,11 +13,11 @@ from drivers.simulated.led_microscope import (
     MicroscopeCamera,
     MicroscopeLedArray,
     MicroscopeLedOptions,
+    led_image,
 )
 from drivers.testing.camera import CameraContract
 from drivers.testing.led_array import LedArrayContract
 from instrument.plan.led_shapes import HalfCircle
-from recon.optics.led_microscope import led_image
 
 
 def small_world(time_scale: float = 0.0) -> LedMicroscopeWorld:

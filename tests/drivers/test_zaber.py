@@ -179,7 +179,7 @@ def test_a_fault_that_lasts_refuses_moves(stage: ZaberStage, chain: ZaberChain) 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait half as long for replies as one would for real devices."""
-    monkeypatch.setattr("drivers.zaber.chain._REPLY_S", 0.25)
+    monkeypatch.setattr("drivers.zaber.stage._REPLY_S", 0.25)
 
 
 def late(seconds: float) -> Callable[[bytes], list[Answer]]:

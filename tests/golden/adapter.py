@@ -126,7 +126,7 @@ def resumed(
     kind: str, measurement: npt.NDArray[Any], calibration: Any, *, after: int, iterations: int, **options: Any
 ) -> Result:
     """Keep a reconstruction in a folder after some iterations, and go on with it."""
-    from instrument.files.checkpoint import CheckpointFolder
+    from instrument.reconstruction.checkpointing import CheckpointFolder
 
     run = {"picture": picture, "volume": volume}[kind]
     with TemporaryDirectory() as folder:

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from drivers.aravis.library import load
+from drivers.aravis.features import load
 from drivers.errors import DeviceError
 
 ADDRESS = "127.0.0.1"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from calibration_routines.optics.dpc import DpcSetup, dpc_optics, measure_diffuser
-from drivers.simulated.led_microscope import LedMicroscopeWorld
+from drivers.simulated.led_microscope import LedMicroscopeWorld, led_image
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import led_microscope_text, parse_config
 from instrument.cli import main
@@ -27,7 +27,6 @@ from recon.analysis.dpc import (
     transfer,
 )
 from recon.errors import InputError
-from recon.optics.led_microscope import led_image
 
 SETUP = DpcSetup(objective_na=0.1, magnification=4.0)
 SMALL = led_microscope_text().replace("pixels = 384", "pixels = 160")

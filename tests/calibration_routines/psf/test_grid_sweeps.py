@@ -34,7 +34,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import prepare_resume
 from instrument.runs.run import FinishReason, RunCondition
 from instrument.runs.runner import Runner, RunStatus
 from recon import reconstruct

@@ -9,10 +9,10 @@ import pytest
 
 import recon
 from recon.camera import field_registration
-from recon.camera import registration_cache as remembered
+from recon.camera import field_registration as remembered
 from recon.camera.camera_model import sort_by_depth
 from recon.camera.field_registration import NOT_ON_AXIS
-from recon.camera.local_convolution import FieldOfPsfs
+from recon.camera.varying_psfs import FieldOfPsfs
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 from recon.reconstruction.overrides import Overrides

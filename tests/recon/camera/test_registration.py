@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from recon.camera.registration import aligned, depth_scale, displacement, expected_shift, register, scaled
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
-from recon.optics.grid import PixelGrid
-from recon.optics.spectrum import GREEN
+from recon.optics.grid import GREEN, PixelGrid
 from recon.optics.wave import WavePropagator
 
 Image = npt.NDArray[np.float32]

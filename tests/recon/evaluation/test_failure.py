@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 from recon.verdict.failure import (
     WORST,
     Failure,

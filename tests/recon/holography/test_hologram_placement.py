@@ -11,8 +11,7 @@ import pytest
 from recon.errors import InputError
 from recon.holography import DcTerm, Display, HologramModel, Target, random_mask
 from recon.holography.judge import compare, low_pass
-from recon.holography.placement import PlacedHologram
-from recon.holography.pose import Pose
+from recon.holography.pose import PlacedHologram, Pose
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
 
 SHAPE, K = (48, 64), 4

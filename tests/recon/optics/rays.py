@@ -11,10 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.optics.diffuser import Diffuser
-from recon.optics.grid import PixelGrid
+from recon.optics.grid import PixelGrid, Spectrum
 from recon.optics.jit import compiled
-from recon.optics.propagator import Emission, Propagator, Source, check_source
-from recon.optics.spectrum import Spectrum
+from recon.optics.wave import Emission, Propagator, Source, check_source
 
 
 class RayPropagator(Propagator):

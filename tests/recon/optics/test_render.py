@@ -7,10 +7,9 @@ import pytest
 
 from recon.optics.diffuser import smooth_diffuser
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off, response_on
-from recon.optics.grid import PixelGrid
+from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.render import render
 from recon.optics.scene import Beads, Layer, Scene, TruthGrid
-from recon.optics.spectrum import mixed_spectrum
 from recon.optics.wave import WavePropagator
 
 DISTANCE_UM = 8900.0

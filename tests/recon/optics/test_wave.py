@@ -9,8 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from recon.optics.diffuser import AIR, Diffuser, Glass, microlens_diffuser, smooth_diffuser
-from recon.optics.grid import PixelGrid
-from recon.optics.spectrum import GREEN, mixed_spectrum
+from recon.optics.grid import GREEN, PixelGrid, mixed_spectrum
 from recon.optics.wave import WavePropagator
 
 DISTANCE_UM = 8900.0

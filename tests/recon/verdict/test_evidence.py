@@ -10,10 +10,9 @@ import pytest
 
 import recon
 from recon import InputError, reconstruct
-from recon.camera.camera_model import Depths
-from recon.camera.light import plane_gains
+from recon.camera.camera_model import Depths, plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.solvers.base import IterationRecord, StopReason
 from recon.verdict.collect import DIVERGED, unsettled_by
 from recon.verdict.evidence import Observation, _dimming, _similarity, measure
 from recon.verdict.verdict import Region
