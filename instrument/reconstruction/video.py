@@ -160,11 +160,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
             erasures=None if picture.valid is None else ~picture.valid,
         ),
         picture.calibration,
-        z_um=options.z_um,
-        model=options.model,
-        prior=options.prior,
-        tau=options.tau,
-        estimate_background=options.estimate_background,
+        replace(options, iterations=None),
     )
     if request.over_time is not None and not problem.together:
         raise BenchError(
@@ -318,6 +314,7 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
             "psf_file": None if request.psf is None else str(request.psf.resolve()),
             "z_um": request.options.z_um,
             "prior": str(request.options.prior or "tv"),
+            "solver": problem.solver.name,
             "model": problem.model,
             "background_estimated": problem.smooth,
             "weight": max(VideoSolver(problem).weights),

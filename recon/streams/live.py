@@ -101,9 +101,9 @@ class LiveReconstructor:
         if self._known.get("patterns") is not None:
             raise InputError("Live pictures are of one scene in one light: leave the patterns out.")
         self._given = calibration
-        if isinstance(calibration, Calibration) and calibration.background is not None:
-            if self._known.get("background") is None:
-                self._known["background"] = np.moveaxis(calibration.background, 0, -1)
+        background = calibration.background if isinstance(calibration, Calibration) else None
+        if background is not None and self._known.get("background") is None:
+            self._known["background"] = np.moveaxis(background, 0, -1)
         checked = self._checked()
         self.calibration, self._options = checked.calibration, checked.options
         self.warnings = self._doubts = checked.warnings
