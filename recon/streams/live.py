@@ -34,7 +34,8 @@ LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
 
 SETTLED = 1e-3
-"""Change an iteration below which a frame's picture is done: 55 dB from where it would end."""
+"""Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
+from where the exact-data ADMM would end."""
 
 AT_ONCE = 150_000
 """Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
@@ -270,7 +271,7 @@ class LiveReconstructor:
         first = _now()
         done = 0
         while True:
-            self._settled = level.solver.advance(SETTLED)
+            self._settled = level.solver.advance(min(SETTLED, level.problem.stop_tolerance))
             done += 1
             spent_ms = _since(began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
