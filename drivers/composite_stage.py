@@ -106,9 +106,7 @@ class CompositeStage(Stage):
     Options: ClassVar[type[DriverOptions]] = CompositeOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, CompositeOptions):
-            raise TypeError(f"A composite stage takes CompositeOptions, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = CompositeOptions.of(options)
         self._parts = {name: part.make() for name, part in options.parts.items()}
         self._opened = False
         self._moving: tuple[str, ...] = ()
@@ -122,8 +120,7 @@ class CompositeStage(Stage):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim what every part claims."""
-        assert isinstance(options, CompositeOptions)
-        return tuple(claim for part in options.parts.values() for claim in part.claims())
+        return tuple(claim for part in CompositeOptions.of(options).parts.values() for claim in part.claims())
 
     # Device ----------------------------------------------------------------------------------------
     @property

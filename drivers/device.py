@@ -1,17 +1,68 @@
-"""What every device has in common: identity, open and close, settings as read back."""
+"""What every device has in common: how it is found and told apart, open and close, settings as read back."""
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from drivers.registry.discovery import FoundDevice
+BUSES = ("USB", "HID", "serial", "video", "GenICam", "display")
+"""The buses that are looked at, in the order in which they are listed; a driver may bring others."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """One device on one bus; the same hardware may be found on several (USB, HID, serial).
+
+    ``driver``, ``kind`` and ``options`` are given by a driver that is sure that it can use the device.
+    """
+
+    bus: str
+    """One of ``BUSES``, or another word that people know."""
+    address: str
+    """How the bus names it: ``"/dev/ttyUSB0"``, ``"bus 1 device 4"``, ``"HDMI-1"``."""
+    description: str
+    vendor: str = ""
+    product: str = ""
+    serial_number: str = ""
+    usb_id: str = ""
+    """Vendor and product as ``lsusb`` writes them: ``"0403:faf0"``; empty when it is no USB device."""
+    driver: str | None = None
+    """Name that ``driver =`` takes in ``bench.toml``; None when no driver claims the device."""
+    kind: str | None = None
+    """``"camera"``, ``"stage"``, ``"led_array"`` or ``"slm"``, with ``driver``."""
+    options: Mapping[str, object] = field(default_factory=dict)
+    """The keys of its table in ``bench.toml``, beside ``driver``."""
+    note: str = ""
+    """What the user must add to these lines, if anything."""
+
+    def bench_lines(self) -> str:
+        """Return the table of ``bench.toml`` that uses the device; empty when no driver claims it."""
+        if self.driver is None or self.kind is None:
+            return ""
+        rows = {"driver": self.driver, **self.options}
+        lines = [f"[{self.kind}]", *(f"{key} = {_toml(value)}" for key, value in rows.items())]
+        return "\n".join([*lines, f"# {self.note}"] if self.note else lines)
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    # A TOML basic string escapes as JSON does, and DEL besides.
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+
 
 Setting = str | int | float | bool | tuple[float, ...] | tuple[int, ...] | tuple[str, ...] | None
 
@@ -43,6 +94,13 @@ class DriverOptions(BaseModel):
     """The keys that a driver adds to its device's table in ``bench.toml``; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @classmethod
+    def of(cls, options: DriverOptions) -> Self:
+        """Return the options that a driver was given, as its own; those of another one are a TypeError."""
+        if not isinstance(options, cls):
+            raise TypeError(f"{cls.__name__} are needed, not {type(options).__name__}.")
+        return options
 
 
 class SharedPart(ABC):

@@ -16,12 +16,10 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
 from calibration_routines.display.hologram_photograph import (
-    CaptureOptions,
     Photographed,
     photograph_hologram,
     write_capture,
 )
-from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
@@ -30,6 +28,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.safety import StepsFailedError
 from instrument.display.hologram import (
+    CaptureOptions,
     HologramResult,
     bench_display,
     compute_and_judge,
@@ -41,7 +40,7 @@ from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.slm_image import load_slm_correction
-from instrument.reconstruction.result_list import free_result
+from instrument.reconstruction.stored_result import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -229,7 +228,7 @@ def photograph(
 
     context.on_cancel(cancel)
     try:
-        with _exposure_kept(bench.camera), under_control(bench, control):
+        with _exposure_kept(bench.camera), control.procedure(bench):
             if computed.order.alignment is not None:
                 bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
             found = photograph_hologram(

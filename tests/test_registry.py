@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DeviceError
-from drivers.registry import listing, registry
+from drivers.registry import registry
 from drivers.registry.registry import GROUP, KINDS, driver_names, load_driver, registration_mistakes
 from instrument.bench.config_file import load_config
 from instrument.files.errors import ConfigError
@@ -41,7 +41,7 @@ def register(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Register:
 def unavailable() -> list[str]:
     """What a listing of the devices says of the drivers, without looking at the buses."""
     said: list[str] = []
-    assert list(listing._drivers(said))
+    assert list(registry._drivers(said))
     return said
 
 

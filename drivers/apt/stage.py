@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -22,10 +23,9 @@ from drivers.apt.protocol import (
 )
 from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.stage_axes import MRAD_PER_DEG, UM_PER_MM, AxisMap, AxisName, AxisOptions
-from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, SharedPart, port_claim
 from drivers.errors import DeviceError
 from drivers.registry.buses import lasting_name, serial_ports
-from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 
@@ -150,10 +150,8 @@ class AptStage(PolledStage):
     Options = AptOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, AptOptions):
-            raise TypeError(f"A Thorlabs stage takes AptOptions, not {type(options).__name__}.")
         super().__init__()
-        self.options = options
+        self.options = options = AptOptions.of(options)
         self._maps = {name: axis.axis_map(name) for name, axis in options.axes.items()}
         controllers = {axis.port: axis.controller for axis in options.axes.values()}
         self._links = {port: Link(port, self.name, name) for port, name in controllers.items()}
@@ -168,8 +166,7 @@ class AptStage(PolledStage):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the ports of all controllers."""
-        assert isinstance(options, AptOptions)
-        return tuple(sorted({port_claim(axis.port) for axis in options.axes.values()}))
+        return tuple(sorted({port_claim(axis.port) for axis in AptOptions.of(options).axes.values()}))
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
@@ -184,14 +181,11 @@ class AptStage(PolledStage):
             # No controller knows its actuator: checking bench.toml will ask for it.
             axes = {"x_um": {"port": lasting_name(port.address), "controller": name, "actuator": "WHICH?"}}
             found.append(
-                FoundDevice(
-                    bus="serial",
-                    address=port.address,
+                replace(
+                    port,
                     description=f"Thorlabs {name}",
                     vendor="Thorlabs",
                     product=name,
-                    serial_number=port.serial_number,
-                    usb_id=port.usb_id,
                     driver="apt",
                     kind="stage",
                     options={"axes": axes},

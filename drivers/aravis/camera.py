@@ -15,9 +15,8 @@ from drivers.aravis.image_settings import AravisImageSettings
 from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels, unpack
-from drivers.device import DriverOptions, SharedPart
+from drivers.device import DriverOptions, FoundDevice, SharedPart
 from drivers.errors import DeviceError
-from drivers.registry.discovery import FoundDevice
 
 _SLICE_S = 0.05
 """A wait in the library cannot be ended from outside: it is cut into pieces of this length."""

@@ -85,9 +85,7 @@ class AravisSettings(BufferedCamera):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__()
-        if not isinstance(options, AravisOptions):
-            raise TypeError(f"A GenICam camera takes AravisOptions, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = AravisOptions.of(options)
         self._aravis: Any = None
         self._camera: Any = None
         self._handler = 0

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.device import FoundDevice
 from drivers.dlpc900.commands import Command, error_words
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError
 from drivers.registry.buses import hid_devices
-from drivers.registry.discovery import FoundDevice
 
 REPORT_BYTES = 64
 _HEADER_BYTES = 4

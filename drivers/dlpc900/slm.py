@@ -6,18 +6,18 @@ import logging
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
 from drivers.dlpc900 import commands
 from drivers.dlpc900.commands import Board, Command, encode
 from drivers.dlpc900.link import HidLink, found_controllers
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.registry.discovery import FoundDevice
 from drivers.slm import Slm
 
 _log = logging.getLogger(__name__)
@@ -70,9 +70,7 @@ class Dlpc900Slm(Slm):
     Options = Dlpc900Options
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, Dlpc900Options):
-            raise TypeError(f"A DLPC900 takes Dlpc900Options, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = Dlpc900Options.of(options)
         self._link = HidLink(self.name, options.serial_number)
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -91,21 +89,14 @@ class Dlpc900Slm(Slm):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the controller by its serial number, or the only one."""
-        assert isinstance(options, Dlpc900Options)
-        return (f"DLPC900 {options.serial_number or 'on USB'}",)
+        return (f"DLPC900 {Dlpc900Options.of(options).serial_number or 'on USB'}",)
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:
         """Return the controllers that are connected, told by their USB id."""
         return tuple(
-            FoundDevice(
-                bus=device.bus,
-                address=device.address,
-                description=device.description,
-                vendor=device.vendor,
-                product=device.product,
-                serial_number=device.serial_number,
-                usb_id=device.usb_id,
+            replace(
+                device,
                 driver="dlpc900",
                 kind="slm",
                 options={"serial_number": device.serial_number} if device.serial_number else {},

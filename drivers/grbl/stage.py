@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 
 from drivers.common.polled_stage import PolledStage, StageState
-from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
 from drivers.grbl.protocol import (
@@ -25,7 +25,6 @@ from drivers.grbl.protocol import (
 )
 from drivers.grbl.settings import REPORTED_STEP, ControllerSettings, GrblAxis, GrblOptions
 from drivers.registry.buses import lasting_name
-from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 _log = logging.getLogger(__name__)
@@ -51,10 +50,8 @@ class GrblStage(PolledStage):
     """What a reply may take."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, GrblOptions):
-            raise TypeError(f"A GRBL stage takes GrblOptions, not {type(options).__name__}.")
         super().__init__()
-        self.options = options
+        self.options = options = GrblOptions.of(options)
         self._maps = {name: axis.axis_map(name) for name, axis in options.axes.items()}
         self._link = GrblLink(options.port, self.name, options.baud_rate, self.reply_s)
         self._controller = ControllerSettings({}, {})
@@ -69,8 +66,7 @@ class GrblStage(PolledStage):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the serial port."""
-        assert isinstance(options, GrblOptions)
-        return (port_claim(options.port),)
+        return (port_claim(GrblOptions.of(options).port),)
 
     @classmethod
     def probe(cls, port: str) -> FoundDevice | None:

@@ -10,14 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart, port_claim
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
 from drivers.illuminate.geometry import ArrayGeometry, read_geometry
 from drivers.illuminate.link import Link
 from drivers.illuminate.sequencer import Sequencer
 from drivers.led_array import OFF, LedArray, LedPattern, Rgb
 from drivers.registry.buses import lasting_name
-from drivers.registry.discovery import FoundDevice
 
 _log = logging.getLogger(__name__)
 _OVERTAKE_S = 0.2
@@ -54,9 +53,7 @@ class IlluminateLedArray(LedArray):
     """What a reply may take."""
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, IlluminateOptions):
-            raise TypeError(f"An Illuminate array takes IlluminateOptions, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = IlluminateOptions.of(options)
         self.link = Link(options.port, self.name, self.reply_s)
         self.commanding = threading.RLock()
         self._darkenings = 0
@@ -74,8 +71,7 @@ class IlluminateLedArray(LedArray):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the serial port."""
-        assert isinstance(options, IlluminateOptions)
-        return (port_claim(options.port),)
+        return (port_claim(IlluminateOptions.of(options).port),)
 
     @classmethod
     def probe(cls, port: str) -> FoundDevice | None:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError
-from drivers.registry.discovery import FoundDevice
 
 _SERIAL_LINKS = Path("/dev/serial/by-id")
 _USB_FOLDER = Path("/sys/bus/usb/devices")

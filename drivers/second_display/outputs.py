@@ -50,9 +50,14 @@ class SecondDisplayOptions(DriverOptions):
         False, description="Whether the desktop's primary output may be covered, too."
     )
 
+    @property
+    def wanted(self) -> dict[str, str | int]:
+        """What names the output: all that is given."""
+        return self.model_dump(include={"output", "model", "serial_number", "index"}, exclude_none=True)
+
     @model_validator(mode="after")
     def _names_an_output(self) -> Self:
-        if self.output is None and self.model is None and self.serial_number is None and self.index is None:
+        if not self.wanted:
             raise ValueError("name the output by output, model, serial_number or index")
         return self
 
@@ -93,7 +98,7 @@ def choose(outputs: Sequence[Output], options: SecondDisplayOptions, device: str
         When none or several fit what was given, or the one that fits is the desktop's primary output, has
         another shape than expected, or too few bits a pixel.
     """
-    wanted = options.model_dump(include={"output", "model", "serial_number", "index"}, exclude_none=True)
+    wanted = options.wanted
     fitting = [
         output
         for output in outputs

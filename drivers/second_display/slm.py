@@ -11,9 +11,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from drivers.device import DeviceIdentity, DriverOptions, Setting, SharedPart
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
-from drivers.registry.discovery import FoundDevice
 from drivers.second_display.outputs import Output, SecondDisplayOptions
 from drivers.slm import Slm
 
@@ -40,11 +39,7 @@ class SecondDisplaySlm(Slm):
     Options = SecondDisplayOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, SecondDisplayOptions):
-            raise TypeError(
-                f"An SLM as second display takes SecondDisplayOptions, not {type(options).__name__}."
-            )
-        self.options = options
+        self.options = options = SecondDisplayOptions.of(options)
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._window: _Window | None = None
@@ -56,9 +51,8 @@ class SecondDisplaySlm(Slm):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the output by the name that the configuration gives it."""
-        assert isinstance(options, SecondDisplayOptions)
-        given = options.model_dump(include={"output", "model", "serial_number", "index"}, exclude_none=True)
-        return ("display " + ", ".join(f"{key} {value}" for key, value in given.items()),)
+        wanted = SecondDisplayOptions.of(options).wanted
+        return ("display " + ", ".join(f"{key} {value}" for key, value in wanted.items()),)
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 from pydantic import Field
 
 from drivers.camera import Camera, Roi, TriggerMode
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, LimitError
-from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.surroundings import SimulatedDevice, Surroundings
+from drivers.simulated.world import SimulatedWorld
 
 ROI_STEP = 4
 BINNINGS = (1, 2, 4)
@@ -46,13 +48,12 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     """The part of the simulated camera that takes no images."""
 
     kind = "camera"
+    Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     Options = CameraOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, CameraOptions):
-            raise TypeError(f"The simulated camera takes CameraOptions, not {type(options).__name__}.")
         self._connect(shared)
-        self.options = options
+        self.options = options = CameraOptions.of(options)
         self._spec = self.world.sensor
         self._reset_settings()
 

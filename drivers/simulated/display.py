@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from math import pi
 from typing import Any
 
@@ -17,7 +17,7 @@ from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.mechanics import AxisSpec
 from drivers.simulated.slm import SimulatedSlm, SlmOptions
 from drivers.simulated.stage import AxisOptions, CarriageStage, StageOptions, axis_spec
-from drivers.simulated.surroundings import Clock, Surroundings
+from drivers.simulated.surroundings import CommonOptions, Surroundings
 from recon.base.blocks import block_sum
 from recon.optics.scattering_display import DisplaySpec, MaskPose, ScatteringDisplay
 from recon.optics.sensor import SensorSpec
@@ -39,17 +39,9 @@ SENSOR = SensorSpec(
 )
 
 
-class DisplayOptions(DriverOptions):
+class DisplayOptions(CommonOptions):
     """Options of the simulated holographic display; what is off is off as on a bench just put together."""
 
-    seed: int = Field(0, ge=0, description="The same seed gives the same sensor, noise and flatness error.")
-    time_scale: float = Field(
-        1.0,
-        ge=0,
-        description="Real seconds per simulated second of motion, exposure; 0: no waiting.",
-    )
-    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
-    fixed_pattern: bool = Field(True, description="Whether camera pixels differ.")
     light: float = Field(
         2e5, gt=0, description="Mean electrons a second in a camera pixel inside the field of view."
     )
@@ -97,15 +89,10 @@ class DisplayWorld(Surroundings):
 
     table = "simulated_display"
     Options = DisplayOptions
+    options: DisplayOptions
 
     def __init__(self, options: DriverOptions) -> None:
-        if not isinstance(options, DisplayOptions):
-            raise TypeError(f"The simulated display takes DisplayOptions, not {type(options).__name__}.")
-        self.options: DisplayOptions = options
-        self.clock = Clock(options.time_scale)
-        self.sensor = SENSOR
-        self.scene_lit = False
-        self._lock = threading.RLock()
+        super().__init__(DisplayOptions.of(options), SENSOR)
         self._phase: Callable[[], npt.NDArray[np.float32]] | None = None
         self._stage: Callable[[], Mapping[str, float]] = dict
         self._slm_pitch_um = 8.0
@@ -163,21 +150,9 @@ class DisplayWorld(Surroundings):
             bits = np.random.default_rng(options.mask_seed).integers(0, 2, (height, width), dtype=np.uint8)
             spec = DisplaySpec(
                 slm_pitch_um=self._slm_pitch_um,
-                mask_pitch_um=options.mask_pitch_um,
-                wavelength_nm=options.wavelength_nm,
-                focal_mm=options.focal_mm,
-                magnification=options.magnification,
-                relay_distortion_um=options.relay_distortion_um,
-                relay_centre_um=options.relay_centre_um,
-                dc_power=options.dc_power,
-                dc_phase_rad=options.dc_phase_rad,
-                fill=options.fill,
-                oversampling=options.oversampling,
                 sensor_shape=self.sensor.shape,
                 sensor_pitch_um=self.sensor.pitch_um,
-                sensor_offset_um=options.sensor_offset_um,
-                sensor_roll_mrad=options.sensor_roll_mrad,
-                lens_distortion=options.lens_distortion,
+                **options.model_dump(include={field.name for field in fields(DisplaySpec)}),
             )
             self._optics = ScatteringDisplay(spec, pi * bits)
         return self._optics

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +12,8 @@ from pydantic import Field
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
 from drivers.led_array import OFF, LedArray, LedPattern
-from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.scene_light import Lamp, SceneLight
+from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
 from recon.optics.grid import BANDS
 
@@ -34,15 +35,14 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     """
 
     kind = "led_array"
+    Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     model = "round LED array"
     Options = LedArrayOptions
     world: SimulatedWorld
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, LedArrayOptions):
-            raise TypeError(f"The simulated LED array takes LedArrayOptions, not {type(options).__name__}.")
         self._connect(shared)
-        self.options = options
+        self.options = options = LedArrayOptions.of(options)
         self._positions_mm = _round_array(options.leds, options.led_pitch_mm)
         self._pattern = OFF
 

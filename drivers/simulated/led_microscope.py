@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -11,11 +10,11 @@ import numpy.typing as npt
 from pydantic import Field
 from scipy import fft
 
-from drivers.device import DriverOptions, SharedPart
+from drivers.device import DriverOptions
 from drivers.led_array import LedPattern
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.led_array import LedArrayOptions, SimulatedLedArray
-from drivers.simulated.surroundings import Clock, Surroundings
+from drivers.simulated.surroundings import CommonOptions, Surroundings
 from recon.base.blocks import block_sum
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.grid import BANDS
@@ -87,13 +86,9 @@ RIM_UM = 80.0
 """Of the sample beyond the field of view on each side: what the propagation wraps around stays out of it."""
 
 
-class LedMicroscopeOptions(DriverOptions):
+class LedMicroscopeOptions(CommonOptions):
     """Options of the simulated LED array microscope."""
 
-    seed: int = Field(0, ge=0, description="The same seed gives the same diffuser, sensor and noise.")
-    time_scale: float = Field(1.0, ge=0, description="Real seconds per simulated second; 0: no waiting.")
-    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
-    fixed_pattern: bool = Field(True, description="Whether camera pixels differ.")
     pixels: int = Field(384, ge=64, le=1024, description="Of the camera along each side.")
     light: float = Field(2e4, gt=0, description="Electrons a second that one LED gives a camera pixel.")
     magnification: float = Field(4.0, gt=0, description="Of the objective.")
@@ -117,15 +112,11 @@ class LedMicroscopeWorld(Surroundings):
 
     table = "simulated_led_microscope"
     Options = LedMicroscopeOptions
+    options: LedMicroscopeOptions
 
     def __init__(self, options: DriverOptions) -> None:
-        if not isinstance(options, LedMicroscopeOptions):
-            raise TypeError(
-                f"The simulated microscope takes LedMicroscopeOptions, not {type(options).__name__}."
-            )
-        self.options: LedMicroscopeOptions = options
-        self.clock = Clock(options.time_scale)
-        self.sensor = SensorSpec(
+        options = LedMicroscopeOptions.of(options)
+        sensor = SensorSpec(
             name="microscope camera",
             shape=(options.pixels, options.pixels),
             pitch_um=6.5,
@@ -137,8 +128,7 @@ class LedMicroscopeWorld(Surroundings):
             dsnu_e=1.0,
             bits=12,
         )
-        self.scene_lit = False
-        self._lock = threading.RLock()
+        super().__init__(options, sensor)
         self._sines = np.zeros((0, 2))
         self._levels = np.zeros((0, 3))
         self._sample: Diffuser | None = None
@@ -247,6 +237,7 @@ class MicroscopeLedArray(SimulatedLedArray):
 
     Shared = LedMicroscopeWorld
     Options = MicroscopeLedOptions
+    world: LedMicroscopeWorld  # type: ignore[assignment]  # which Shared makes sure of
 
     def _show(self, pattern: LedPattern) -> None:
         levels: Mapping[int, tuple[int, int, int]] = dict(pattern.levels)
@@ -256,14 +247,7 @@ class MicroscopeLedArray(SimulatedLedArray):
         # An LED seen at an angle is farther away, and turned away: cosine to the fourth.
         cosine = np.sqrt(1 - (sines**2).sum(axis=1))
         self._pattern = pattern
-        world = self._surroundings()
-        world.light_leds(sines, bright * cosine[:, None] ** 4)
-
-    def _surroundings(self) -> LedMicroscopeWorld:
-        world: SharedPart = self.world
-        if not isinstance(world, LedMicroscopeWorld):
-            raise TypeError(f"The microscope's LED array is in no {type(world).__name__}.")
-        return world
+        self.world.light_leds(sines, bright * cosine[:, None] ** 4)
 
 
 class MicroscopeCamera(SimulatedCamera):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.device import DriverOptions
+from drivers.simulated.surroundings import CommonOptions
 from recon.optics.sensor import SensorSpec
 
 DiffuserKind = Literal["smooth", "random_microlens", "regular_microlens"]
@@ -169,20 +169,12 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
-class WorldOptions(DriverOptions):
+class WorldOptions(CommonOptions):
     """Options of the simulated world; what is left out comes from the preset."""
 
     preset: Literal["pco", "pointgrey", "microscope", "tiny"] = Field(
         "pco", description="Optics and sensor; 'tiny' is for tests and trials."
     )
-    seed: int = Field(0, ge=0, description="The same seed gives the same diffuser, sensor and noise.")
-    time_scale: float = Field(
-        1.0,
-        ge=0,
-        description="Real seconds per simulated second of motion, exposure, settling; 0: no waiting.",
-    )
-    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
-    fixed_pattern: bool = Field(True, description="Whether pixels differ (response, offset, hot, dead).")
 
     diffuser: DiffuserKind | None = Field(None, description="Kind of diffuser; left out: the preset's.")
     diffuser_seed: int | None = Field(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,8 @@ from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import LimitError
-from drivers.simulated.base import SimulatedDevice
+from drivers.simulated.surroundings import SimulatedDevice, Surroundings
+from drivers.simulated.world import SimulatedWorld
 from drivers.slm import Slm
 
 Side = Annotated[int, Field(ge=1, le=8192)]
@@ -36,14 +37,13 @@ class SimulatedSlm(SimulatedDevice, Slm):
     """A phase SLM whose grey levels turn into phase by a look-up table that may be off."""
 
     kind = "slm"
+    Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     model = "phase SLM"
     Options = SlmOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, SlmOptions):
-            raise TypeError(f"The simulated SLM takes SlmOptions, not {type(options).__name__}.")
         self._connect(shared)
-        self.options = options
+        self.options = options = SlmOptions.of(options)
         self._closing = threading.Event()
         self._displayed = np.zeros(options.shape, np.uint8)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Self
+from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.common.stage_axes import AXIS_NAMES, check_target
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
-from drivers.simulated.base import SimulatedDevice
 from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
 from drivers.simulated.options import NotNegative, Positive
+from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
 from drivers.stage import Stage, StageAxis
 
@@ -75,13 +75,12 @@ class CarriageStage(SimulatedDevice, Stage):
     """
 
     kind = "stage"
+    Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     Options = StageOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, StageOptions):
-            raise TypeError(f"The simulated stage takes StageOptions, not {type(options).__name__}.")
         self._connect(shared)
-        self.options = options
+        self.options = options = StageOptions.of(options)
         specs = tuple(
             self._axis_spec(name, options.axes.get(name, AxisOptions())) for name in options.axis_names
         )

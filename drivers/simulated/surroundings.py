@@ -1,17 +1,18 @@
-"""What a simulated camera needs of the world it looks at, whatever that world is, and the world's time."""
+"""What all simulated devices share: a world with a sensor and a clock in it, opening, identity, faults."""
 
 from __future__ import annotations
 
 import threading
 import time
 from abc import abstractmethod
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
-from drivers.device import SharedPart
-from drivers.errors import DeviceError
+from drivers.device import Device, DeviceIdentity, DriverOptions, SharedPart
+from drivers.errors import DeviceError, DeviceNotOpenError
 from recon.optics.sensor import FixedPattern, SensorSpec, fixed_pattern
 
 
@@ -35,30 +36,35 @@ class Clock:
         return (time.monotonic() - start) / self.time_scale
 
 
-class CommonOptions(Protocol):
+class CommonOptions(DriverOptions):
     """What the options of every simulated world have."""
 
-    @property
-    def seed(self) -> int:
-        """The same seed gives the same world."""
-
-    @property
-    def noise(self) -> float:
-        """Scale of all temporal noise."""
-
-    @property
-    def fixed_pattern(self) -> bool:
-        """Whether pixels differ."""
+    seed: int = Field(0, ge=0, description="The same seed gives the same optics, sensor and noise.")
+    time_scale: float = Field(
+        1.0,
+        ge=0,
+        description="Real seconds per simulated second of motion, exposure, settling; 0: no waiting.",
+    )
+    noise: float = Field(1.0, ge=0, description="Scale of all temporal noise: 1 is physical, 0 is none.")
+    fixed_pattern: bool = Field(
+        True, description="Whether camera pixels differ (response, offset, hot, dead)."
+    )
 
 
 class Surroundings(SharedPart):
     """A simulated world with a sensor in it, devices whose plugs can be pulled, and a clock."""
 
     options: CommonOptions
-    clock: Clock
-    sensor: SensorSpec
     _pattern: FixedPattern | None = None
     _unplugged: frozenset[str] = frozenset()
+
+    def __init__(self, options: CommonOptions, sensor: SensorSpec) -> None:
+        self.options = options
+        self.clock = Clock(options.time_scale)
+        self.sensor = sensor
+        self.scene_lit = False
+        """Whether the scene glows."""
+        self._lock = threading.RLock()
 
     @abstractmethod
     def photons_per_s(
@@ -100,3 +106,58 @@ class Surroundings(SharedPart):
         """Raise :class:`DeviceError` when the device is unplugged."""
         if kind in self._unplugged:
             raise DeviceError(name, "was unplugged.", "Plug it in and open the bench again.")
+
+
+class SimulatedDevice(Device):
+    """Mix-in for the simulated drivers; the interface's class comes second in the bases."""
+
+    Shared: ClassVar[type[Surroundings]]
+    kind: ClassVar[str]
+    model: ClassVar[str]
+    world: Surroundings
+    _is_open = False
+
+    @classmethod
+    def claims(cls, _options: DriverOptions) -> tuple[str, ...]:
+        """Claim nothing: every program has a simulated world of its own."""
+        return ()
+
+    def _connect(self, shared: SharedPart | None) -> None:
+        if not isinstance(shared, self.Shared):
+            raise TypeError(
+                f"{self.name} needs the bench's {self.Shared.__name__}, not {type(shared).__name__}."
+            )
+        self.world = shared
+
+    @property
+    def name(self) -> str:
+        """The device as error messages name it."""
+        return f"{self.kind} (simulated)"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the device is connected."""
+        return self._is_open
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Who the device says it is."""
+        self._require()
+        return DeviceIdentity(
+            kind=self.kind,
+            driver="simulated",
+            vendor="diffuserbench",
+            model=self._model(),
+            serial_number=f"SIM-{self.world.options.seed}",
+            firmware="1",
+            simulated=True,
+        )
+
+    def _model(self) -> str:
+        return self.model
+
+    def _require(self) -> None:
+        """Raise unless the device is open and plugged in."""
+        if not self._is_open:
+            raise DeviceNotOpenError(self.name)
+        self.world.check_plugged(self.kind, self.name)

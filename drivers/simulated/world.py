@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from matplotlib import cbook
 from drivers.device import DriverOptions
 from drivers.simulated.options import PRESETS, Preset, WorldOptions
 from drivers.simulated.scene_light import SceneLight
-from drivers.simulated.surroundings import Clock, Surroundings
+from drivers.simulated.surroundings import Surroundings
 from recon.optics.diffuser import Diffuser, microlens_diffuser, smooth_diffuser
 from recon.optics.fall_off import (
     FallOff,
@@ -27,7 +26,6 @@ from recon.optics.fall_off import (
 from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.render import RenderSettings, render
 from recon.optics.scene import Scene, TruthGrid, bar_target, bead_volume, picture, tilted_target, true_scene
-from recon.optics.sensor import SensorSpec
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
 
@@ -45,11 +43,7 @@ def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Sce
     """Build the scene that the options name; sizes left out follow from what the sensor sees."""
     if options.scene == "none":
         return None
-    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
-    sensor_um = preset.sensor.shape[0] * preset.sensor.pitch_um
-    height_um = FIELD_SHARE * sensor_um * z_um / distance_um
-    if options.scene_height_mm is not None:
-        height_um = 1e3 * options.scene_height_mm
+    z_um, height_um = _place(options, preset, distance_um)
     if options.scene in ("picture", "color_picture"):
         portrait = sample_picture()
         if options.scene == "picture":
@@ -73,11 +67,7 @@ def make_scene(options: WorldOptions, preset: Preset, distance_um: float) -> Sce
 
 def make_slide(options: WorldOptions, preset: Preset, distance_um: float, number: int) -> Scene:
     """Build a flat slide of beads where the scene is; each ``number`` has its beads at other places."""
-    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
-    sensor_um = preset.sensor.shape[0] * preset.sensor.pitch_um
-    height_um = FIELD_SHARE * sensor_um * z_um / distance_um
-    if options.scene_height_mm is not None:
-        height_um = 1e3 * options.scene_height_mm
+    z_um, height_um = _place(options, preset, distance_um)
     return bead_volume(
         options.beads,
         (height_um, height_um),
@@ -85,6 +75,14 @@ def make_slide(options: WorldOptions, preset: Preset, distance_um: float, number
         diameter_um=options.bead_diameter_um,
         seed=options.seed + 1000 * (number + 1),
     )
+
+
+def _place(options: WorldOptions, preset: Preset, distance_um: float) -> tuple[float, float]:
+    """Return a scene's distance from the diffuser and its height: half of what the sensor sees there."""
+    z_um = 1e3 * (options.scene_distance_mm or preset.source_distance_mm)
+    if options.scene_height_mm is not None:
+        return z_um, 1e3 * options.scene_height_mm
+    return z_um, FIELD_SHARE * preset.sensor.shape[0] * preset.sensor.pitch_um * z_um / distance_um
 
 
 def sample_picture() -> npt.NDArray[np.float32]:
@@ -119,28 +117,22 @@ class SimulatedWorld(Surroundings):
 
     table = "simulated"
     Options = WorldOptions
+    options: WorldOptions
 
     def __init__(self, options: DriverOptions) -> None:
-        if not isinstance(options, WorldOptions):
-            raise TypeError(f"The simulated world takes WorldOptions, not {type(options).__name__}.")
-        self.options: WorldOptions = options
-        self.clock = Clock(options.time_scale)
-        preset = PRESETS[options.preset]
-        self.preset: Preset = preset
-        self.sensor: SensorSpec = preset.sensor
+        options = WorldOptions.of(options)
+        self.preset = preset = PRESETS[options.preset]
+        super().__init__(options, preset.sensor)
         self.distance_um = 1e3 * (options.diffuser_distance_mm or preset.diffuser_distance_mm)
         self.aperture_mm = options.aperture_mm or preset.aperture_mm
         self.fall_off = _fall_off(options, preset)
         self.source_diameter_um = (
             preset.source_diameter_um if options.source_diameter_um is None else options.source_diameter_um
         )
-        self._lock = threading.RLock()
         self._propagator: WavePropagator | None = None
         self._cache: OrderedDict[Any, Image] = OrderedDict()
         self._emission: Rgb = (0.0, 0.0, 0.0)
         self._carrier: Callable[[], Position] = lambda: (0.0, 0.0, 1e3 * preset.source_distance_mm)
-        self.scene_lit = False
-        """Whether the scene glows."""
         self._scene = make_scene(options, preset, self.distance_um)
         self._scene_number = 0
         self._scene_light: SceneLight | None = None
@@ -230,13 +222,7 @@ class SimulatedWorld(Surroundings):
         return light
 
     def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
-        """Photons a second on every binned pixel now, or None when all is dark.
-
-        Parameters
-        ----------
-        weights : tuple of float
-            Sensitivity to red, green and blue. The fixed pattern is not included, the angular response is.
-        """
+        """Photons a second on every binned pixel now, or None when all is dark."""
         light = None
         glow = _product(self.emission, weights)
         if any(glow):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from drivers.common.buffered_camera import RawFrame
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
-from drivers.device import DriverOptions, SharedPart
+from drivers.device import DriverOptions, FoundDevice, SharedPart
 from drivers.errors import DeviceError
 from drivers.registry.buses import video_devices
-from drivers.registry.discovery import FoundDevice
 from drivers.v4l2 import api
 from drivers.v4l2.device import FilledBuffer, VideoDevice, lasting_path
 from drivers.v4l2.formats import decode
@@ -43,14 +43,8 @@ class V4l2Camera(V4l2ImageSettings):
                 continue  # metadata, a decoder, not permitted: still listed, as its bus has it
             node.close()
             found.append(
-                FoundDevice(
-                    bus=device.bus,
-                    address=device.address,
-                    description=device.description,
-                    vendor=device.vendor,
-                    product=device.product,
-                    serial_number=device.serial_number,
-                    usb_id=device.usb_id,
+                replace(
+                    device,
                     driver="v4l2",
                     kind="camera",
                     options={"device": lasting_path(device.address)},

@@ -78,9 +78,7 @@ class V4l2Settings(BufferedCamera):
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
         super().__init__()
-        if not isinstance(options, V4l2Options):
-            raise TypeError(f"A V4L2 camera takes V4l2Options, not {type(options).__name__}.")
-        self.options = options
+        self.options = options = V4l2Options.of(options)
         self._device = VideoDevice(options.device, self.name, self.kernel, self._note_lost)
         self._identity: DeviceIdentity | None = None
         self._period: float | None = None

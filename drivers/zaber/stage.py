@@ -15,10 +15,9 @@ from drivers.common.framing import Belongs
 from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.serial_transport import SerialTransport
 from drivers.common.stage_axes import MRAD_PER_DEG, AxisMap, AxisName, AxisOptions
-from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError
 from drivers.registry.buses import lasting_name, serial_ports
-from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 from drivers.zaber.protocol import (
     FAULTS,
@@ -234,10 +233,8 @@ class ZaberStage(PolledStage):
     Options = ZaberOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        if not isinstance(options, ZaberOptions):
-            raise TypeError(f"A Zaber stage takes ZaberOptions, not {type(options).__name__}.")
         super().__init__()
-        self.options = options
+        self.options = options = ZaberOptions.of(options)
         self._maps = {name: axis.axis_map(name) for name, axis in options.axes.items()}
         self._chain = Chain(options.port, self.name, options.baud_rate)
         self._without_checksums: set[int] = set()
@@ -247,8 +244,7 @@ class ZaberStage(PolledStage):
     @classmethod
     def claims(cls, options: DriverOptions) -> tuple[str, ...]:
         """Claim the serial port."""
-        assert isinstance(options, ZaberOptions)
-        return (port_claim(options.port),)
+        return (port_claim(ZaberOptions.of(options).port),)
 
     @classmethod
     def discover(cls) -> tuple[FoundDevice, ...]:

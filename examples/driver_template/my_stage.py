@@ -19,9 +19,8 @@ from pydantic import Field
 from drivers.common.framing import reply_line
 from drivers.common.polled_stage import PolledStage, StageState
 from drivers.common.serial_transport import SerialTransport
-from drivers.device import DeviceIdentity, DriverOptions, SharedPart, port_claim
+from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError
-from drivers.registry.discovery import FoundDevice
 from drivers.stage import StageAxis
 
 WHO = (b"V\n", reply_line(rb"MYSTAGE [\d.]+ \S+"))

@@ -39,9 +39,13 @@ from instrument.files.images import write_image
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
-from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.result_list import find_results, free_result
-from instrument.reconstruction.stored_result import StoredResult, open_result
+from instrument.reconstruction.stored_result import (
+    StoredResult,
+    export_result,
+    find_results,
+    free_result,
+    open_result,
+)
 from recon.base.declare import expression
 from recon.reconstruction.choice import Choice
 

@@ -16,9 +16,8 @@ from instrument.files.errors import BenchError, FileError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from drivers.device import Device, Setting
-    from drivers.registry.discovery import FoundDevice
-    from drivers.registry.listing import Listing
+    from drivers.device import Device, FoundDevice, Setting
+    from drivers.registry.registry import Listing
 
 new_app, check_app, drivers_app, devices_app, gui_app = App(), App(), App(), App(), App()
 
@@ -43,20 +42,19 @@ def new(
     ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
-    from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
-    from instrument.files.atomic import write_text
+    from instrument.bench.config_file import DEFAULT_NAME, template
+    from instrument.files.atomic import require_new, write_text
 
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
-    if file.exists() and not force:
-        raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+    require_new(file, overwrite=force)
     if display and led_microscope:
         raise BenchError("Give --display or --led-microscope, not both.")
-    text, what = default_text(), "bench, with every key explained"
+    text, what = template(), "bench, with every key explained"
     if display:
-        text, what = display_text(), "holographic display"
+        text, what = template("display"), "holographic display"
     if led_microscope:
-        text, what = led_microscope_text(), "LED array microscope"
+        text, what = template("led_microscope"), "LED array microscope"
     write_text(file, text)
     typer.echo(f"Wrote {file}: a SIMULATED {what}.")
     typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")
@@ -200,7 +198,7 @@ def devices(
     Devices that a driver is sure of come with the lines to put into bench.toml. Without --probe nothing is
     written to any serial port, so a stage behind a common USB adapter is only listed as a port.
     """
-    from drivers.registry.listing import list_devices
+    from drivers.registry.registry import list_devices
 
     listing = list_devices(probe=probe, say=lambda sentence: typer.echo(sentence, err=True))
     typer.echo(_listing_json(listing) if as_json else _listing_words(listing))
@@ -212,7 +210,7 @@ def _listing_json(listing: Listing) -> str:
 
 
 def _listing_words(listing: Listing) -> str:
-    from drivers.registry.discovery import BUSES
+    from drivers.device import BUSES
 
     lines: list[str] = []
     others = sorted({device.bus for device in listing.found} - set(BUSES))

@@ -188,8 +188,7 @@ def _is_result(path: Path) -> bool:
 
 
 def _export_result(path: Path, target: Path) -> None:
-    from instrument.reconstruction.result_export import export_result
-    from instrument.reconstruction.stored_result import open_result
+    from instrument.reconstruction.stored_result import export_result, open_result
 
     result = open_result(path)
     try:
@@ -316,10 +315,8 @@ def resume(
     cut off is closed, so that it reads as what it is. A sweep of calibrate becomes its calibration when its
     last frame is there, a run of calibrate angular or dpc its response or surface.
     """
-    from calibration_routines import is_sweep, watch_resumed
-    from calibration_routines.psf.sweep import FOLDER
-    from calibration_routines.psf.sweep_procedure import event_lines
-    from instrument.cli.calibrate import print_lines
+    from calibration_routines.plan_procedures import routine_of
+    from instrument.cli.calibrate import TerminalListener
 
     found = Run.open(run)
     if found.plan is None:
@@ -327,9 +324,7 @@ def resume(
         return
     if found.condition is RunCondition.COMPLETED and not found.missing():
         typer.echo(f"{run}: complete already, {found.n_frames} frames. diffuserbench verify reads them all.")
-        if is_sweep(run) and not (run / FOLDER).exists():
-            _finish(run, None)
-        _finish_others(found)
+        _finish(found, None)
         return
     with open_and_say(bench or run / BENCH_TOML) as opened:
         home_if_needed(opened, found.plan)
@@ -339,34 +334,22 @@ def resume(
                 opened, run, on_verify=lambda done, _: bar.update(task, completed=done)
             )
         typer.echo(f"Found {findings}", err=True)
-        if is_sweep(run):
-            console = Console(stderr=True)
-            watch_resumed(opened, runner, lambda event: print_lines(console, event_lines(event)))
+        routine = routine_of(run)
+        if routine is not None and routine.watch is not None:
+            routine.watch(opened, runner, TerminalListener(Console(stderr=True)))
         done = carry_out(opened, runner)
         if done.condition is RunCondition.COMPLETED:
-            if is_sweep(run):
-                _finish(run, opened)
-            _finish_others(done)
+            _finish(done, opened)
 
 
-def _finish(run: Path, bench: Bench | None) -> None:
-    """Make a sweep's calibration of its complete run, with retakes where there is a bench."""
-    from calibration_routines import finish_sweep
-    from calibration_routines.psf.sweep_procedure import sweep_outcome
-    from instrument.cli.calibrate import print_outcome
+def _finish(run: Run, bench: Bench | None) -> None:
+    """Make the result of a routine's complete run that has none yet, with retakes where there is a bench."""
+    from calibration_routines.plan_procedures import finished
+    from instrument.cli.calibrate import TerminalListener, print_outcome
+    from instrument.runs.run_control import RunControl
 
-    with one_task("Analysing") as advance:
-        done = finish_sweep(run, bench, on_analysis=advance)
-    print_outcome(Console(), sweep_outcome(done))
-
-
-def _finish_others(run: Run) -> None:
-    """Make the result of a complete run of calibrate angular or dpc that has none yet."""
-    from calibration_routines.plan_procedures import finish_simple
-    from instrument.cli.calibrate import print_outcome
-
-    with one_task("Analysing"):
-        outcome = finish_simple(run)
+    with TerminalListener() as listener:
+        outcome = finished(run, bench, RunControl(), listener)
     if outcome is not None:
         print_outcome(Console(), outcome)
 

@@ -15,7 +15,7 @@ from instrument.reconstruction.job import Job
 from instrument.reconstruction.options import OutputOptions
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned, solve_patterned
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, iteration_limit
-from instrument.reconstruction.result_file import Outputs, write_reconstruction
+from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from instrument.reconstruction.video import (
     PreparedVideo,
     VideoRequest,
@@ -24,12 +24,11 @@ from instrument.reconstruction.video import (
     solve_video,
 )
 from instrument.reconstruction.video_work import BlockReport, require_crew
-from instrument.reconstruction.volume_file import write_volume
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.solvers.base import IterationRecord, StopReason
-from recon.verdict.verdict import Verdict
+from recon.verdict.judge import Verdict
 
 
 def reconstruct_photograph(

@@ -1,16 +1,20 @@
-"""What was photographed, and what is known of the photograph: background, erased pixels, noise."""
+"""What was photographed, what is known of the photograph (background, erased pixels, noise), through what."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, require_finite, require_options, saturated_share
+from recon.base.checks import as_channels, require_finite, require_options, saturated_share, select_psf
 from recon.base.noise import NoiseModel, estimate_deviation
+from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
+from recon.camera.field_registration import one_psf
 from recon.errors import InputError
+from recon.reconstruction.options import ReconstructionOptions
+from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -175,6 +179,42 @@ def require_same_channels(psfs: Array, data: Array) -> None:
         )
 
 
+def depths_of(
+    calibration: Calibration, options: ReconstructionOptions
+) -> tuple[Calibration, Depths, list[str]]:
+    """Return the depths that take part, sorted and registered, and warnings."""
+    if len(calibration.psfs) == 0:
+        raise InputError("The calibration holds no PSF: at least one is needed.")
+    if options.z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
+        return calibration, sort_by_depth(calibration), []
+    if options.model == "convolution":
+        psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
+        same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
+        own = slice(same, same + 1)
+        calibration = replace(
+            calibration,
+            psfs=calibration.psfs[own],
+            source_positions_um=calibration.source_positions_um[own],
+        )
+        return calibration, sort_by_depth(calibration), []
+    depth = one_depth(calibration, options.z_um)
+    try:
+        return depth, sort_by_depth(depth), []
+    except InputError as error:
+        if options.model != "auto":
+            raise
+        depth = central(depth)
+        return depth, sort_by_depth(depth), [f"One PSF for the whole field: {error}"]
+
+
+def central(calibration: Calibration) -> Calibration:
+    """Return one PSF for the whole field of one depth: the one on the axis."""
+    positions = calibration.source_positions_um
+    nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
+    own = slice(nearest, nearest + 1)
+    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])
+
+
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
     """Return frames that fit their patterns."""
     data = np.asarray(frames, np.float32)
@@ -206,3 +246,9 @@ def _doubt(channel: int, values: Array) -> str:
 
 def _size(channels: Array) -> str:
     return f"{channels.shape[1]} x {channels.shape[2]}"
+
+
+def _asked(calibration: Calibration, z_um: float | None) -> float | None:
+    """Return the depth to look for: of PSFs of one depth, theirs."""
+    z = calibration.source_positions_um[:, 2]
+    return float(z[0]) if z_um is None and np.isfinite(z[0]) else z_um

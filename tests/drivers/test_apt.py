@@ -27,8 +27,8 @@ from drivers.apt.protocol import (
     short,
 )
 from drivers.apt.stage import AptOptions, AptStage
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.registry.discovery import FoundDevice
 from drivers.testing.stage import StageContract
 from tests.mocks.apt_controller import STATUS_WITHOUT_SIGN_OF_LIFE, AptController
 from tests.mocks.moving_axis import MovingAxis

@@ -14,13 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from serial.tools import list_ports
 
-from drivers.device import Device, port_claim
+from drivers.device import Device, FoundDevice, port_claim
 from drivers.dlpc900.link import HidLink
 from drivers.errors import DeviceError
-from drivers.registry import buses, listing
+from drivers.registry import buses, registry
 from drivers.registry.claim import Claim
-from drivers.registry.discovery import FoundDevice
-from drivers.registry.listing import Listing, list_devices
+from drivers.registry.registry import Listing, list_devices
 from instrument.cli.bench import _listing_words
 
 
@@ -104,7 +103,7 @@ def drivers(monkeypatch: pytest.MonkeyPatch) -> list[type[Any]]:
     """The drivers that are asked, none at first."""
     asked: list[type[Any]] = []
     monkeypatch.setattr(
-        listing, "_drivers", lambda unavailable: ((driver.__name__.lower(), driver) for driver in asked)
+        registry, "_drivers", lambda unavailable: ((driver.__name__.lower(), driver) for driver in asked)
     )
     return asked
 

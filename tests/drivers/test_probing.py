@@ -13,8 +13,8 @@ from serial.tools import list_ports
 from drivers.apt.stage import AptStage
 from drivers.grbl.stage import GrblStage
 from drivers.illuminate.led_array import IlluminateLedArray
-from drivers.registry import buses, listing
-from drivers.registry.listing import list_devices
+from drivers.registry import buses, registry
+from drivers.registry.registry import list_devices
 from drivers.zaber.stage import ZaberStage
 from instrument.bench.config_file import load_config
 from instrument.files.errors import ConfigError
@@ -62,7 +62,7 @@ def plugged_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call
             )
             monkeypatch.setattr(list_ports, "comports", lambda: [port])
             # Those that take part; starting Qt to look at displays takes longer than all probes.
-            monkeypatch.setattr(listing, "_drivers", lambda _: iter(DRIVERS.items()))
+            monkeypatch.setattr(registry, "_drivers", lambda _: iter(DRIVERS.items()))
             return device
 
         yield plug_in

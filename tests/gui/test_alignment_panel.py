@@ -16,7 +16,7 @@ from gui.main_window import MainWindow
 from gui.panels.alignment import AlignmentPanel
 from gui.procedure_run import Situation
 from gui.widgets.run_bar import RunBar
-from instrument.bench.config_file import display_text
+from instrument.bench.config_file import template
 from recon.holography.pose import NODES, Pose
 
 LEFT = Qt.MouseButton.LeftButton
@@ -36,7 +36,7 @@ SMALL = {
 
 @pytest.fixture
 def bench_text() -> str:
-    text = display_text()
+    text = template("display")
     for key, value in SMALL.items():
         text = re.sub(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
     return text

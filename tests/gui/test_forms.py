@@ -10,15 +10,14 @@ import pytest
 
 from calibration_routines.display.mask_alignment import AlignmentProcedure
 from calibration_routines.optics.beads import BeadProcedure
-from calibration_routines.options import Size
 from calibration_routines.plan_procedures import PlanProcedure
-from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.procedure import Outcome, Outlook, Size
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.forms.routines import PLAN, forms
 from gui.procedure_run import script
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import display_text, led_microscope_text
+from instrument.bench.config_file import template
 from instrument.files.errors import BenchError, SettingsError
 
 ROUTINES = {form.name: form for form in (*forms(), *forms("align"))}
@@ -100,9 +99,9 @@ positions = { kind = "points", points_um = [[0, 0, 8e4], [0, 0, 9e4]] }
 def bench_for(form: Any) -> str:
     """A small bench that has what a routine needs."""
     if form is DPC:
-        return led_microscope_text().replace("pixels = 384", "pixels = 96")
+        return template("led_microscope").replace("pixels = 384", "pixels = 96")
     if form is SLM:
-        return display_text().replace("[360, 640]", "[100, 140]")
+        return template("display").replace("[360, 640]", "[100, 140]")
     return BENCH
 
 
@@ -150,7 +149,7 @@ def test_the_python_of_what_takes_minutes_asks_for_what_the_form_says(
     form: Any, kind: Any, changed: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = tmp_path / "bench.toml"
-    bench.write_text(display_text().replace("[360, 640]", "[100, 140]") if form is ALIGNMENT else BENCH)
+    bench.write_text(template("display").replace("[360, 640]", "[100, 140]") if form is ALIGNMENT else BENCH)
     asked: list[Any] = []
 
     def carry_out(procedure: Any, opened: Bench) -> Outcome:

@@ -10,13 +10,13 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.sweeps import SweepsPanel
-from instrument.bench.config_file import led_microscope_text
+from instrument.bench.config_file import template
 from instrument.files.calibration_file import load_calibration
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 120_000
 """Against a hang, not a slow machine."""
-MICROSCOPE = led_microscope_text().replace("pixels = 384", "pixels = 96")
+MICROSCOPE = template("led_microscope").replace("pixels = 384", "pixels = 96")
 SLIDES = """
 [bench]
 data_folder = "runs"

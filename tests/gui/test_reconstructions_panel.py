@@ -24,7 +24,7 @@ from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import open_result
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 
 WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4

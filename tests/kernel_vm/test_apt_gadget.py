@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from drivers.apt.stage import AptOptions, AptStage
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError
-from drivers.registry.discovery import FoundDevice
 from tests.mocks.apt_controller import AptController, split_messages
 from tests.mocks.moving_axis import MovingAxis
 from tests.mocks.usb_gadget import UsbSerialGadget

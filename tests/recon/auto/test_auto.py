@@ -15,10 +15,10 @@ from recon.base.blocks import block_mean, enlarged
 from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.planes import put_back
-from recon.reconstruction.precision import drift, precision_of
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.rules import drift, precision_of
 from recon.solvers.base import StopReason
 
 solving = sys.modules[recon.solve.__module__]
@@ -233,7 +233,7 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
         "y": {"values": [32, 64]},
         "methods": {"admm tv": {"error": [[1e-4, 1e-3], [1e-3, 1e-2]]}},
     }}  # fmt: skip
-    monkeypatch.setattr("recon.reconstruction.precision.shipped_maps", lambda: rough)
+    monkeypatch.setattr("recon.reconstruction.rules.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
     assert precision_of(Overrides(), 1000, 64).value == "float64"
     assert precision_of(Overrides(precision="float32"), 1000, 64).value == "float32"
@@ -332,7 +332,7 @@ def test_a_strong_background_is_noticed_and_none_is_added_to_one_that_was_given(
 @pytest.mark.parametrize("factor", [2, 3])
 def test_binned_and_enlarged_keep_place_and_light(n, factor):
     rng = np.random.default_rng(0)
-    from recon.camera.convolution import PadCropConvolution
+    from recon.camera.convolution import Convolution
 
     psf = np.zeros((1, n, n), np.float32)
     psf[0, n // 2, n // 2] = 1
@@ -342,7 +342,7 @@ def test_binned_and_enlarged_keep_place_and_light(n, factor):
     # A point two blocks' worth off the axis: the binned camera finds it at its binned place.
     small_psf, small = (block_mean(i, factor, about_axis=True) for i in (psf, image))
     m = small.shape[0]
-    camera = PadCropConvolution(small_psf / small_psf.sum(), (m, m))
+    camera = Convolution(small_psf / small_psf.sum(), (m, m))
     x = np.zeros(camera.domain_shape, np.float32)
     x[0, camera.centre[0] + 1, camera.centre[1]] = 1
     seen = camera.forward(x)[0]

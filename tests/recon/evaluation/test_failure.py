@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.solvers.base import IterationRecord, StopReason
-from recon.verdict.failure import (
+from recon.verdict.map import (
     WORST,
     Failure,
     bounded,

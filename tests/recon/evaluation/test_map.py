@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.errors import InputError
+from recon.evaluation.map_trials import _OffBalance
 from recon.evaluation.maps import MAPS, map_named, run_map
-from recon.evaluation.maps_solver import _OffBalance
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.verdict.failure import Failure
-from recon.verdict.map import Axis, Cell, StressMap, Trial, boundary, severity_grid
+from recon.verdict.map import Axis, Cell, Failure, StressMap, Trial, boundary, severity_grid
 
 X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
 Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))
@@ -68,7 +67,7 @@ def test_the_catalogue_is_in_order() -> None:
 
 
 def test_penalties_off_balance_are_those_of_the_solver_times_a_factor() -> None:
-    operator = PadCropConvolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
+    operator = Convolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
     data = np.random.default_rng(1).random((1, 8, 8)).astype(np.float32)
     prior = TotalVariation(0.1) + NonNegativity()
     own = SensorAdmm(operator, data, prior)._mu
