@@ -46,7 +46,7 @@ def carry_out(qtbot: QtBot, window: MainWindow, name: str, **numbers: str) -> Sw
     """Choose a routine, fill in its form, start it, and wait for its end."""
     panel = window.show_panel("sweeps")
     assert isinstance(panel, SweepsPanel)
-    panel.choice.setCurrentIndex([form.name for form in panel.forms].index(name))
+    panel.choice.setCurrentIndex([routine.name for routine in panel.routines].index(name))
     for field_name, text in numbers.items():
         field: Any = panel.view.widgets[field_name]
         if not field.isVisible():
