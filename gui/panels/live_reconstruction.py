@@ -22,10 +22,11 @@ from PySide6.QtWidgets import (
 )
 
 from gui.background import LiveFollower
-from gui.forms.options_form import FOLDED, OptionsForm, scrolled
+from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.building import scrolled
 from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
