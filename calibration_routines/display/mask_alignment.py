@@ -17,7 +17,6 @@ nothing moves at first: each picture holds many spots, each computed for another
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import (
     DisplayBench,
-    SpotLook,
     approach_from_below,
     refuse_existing,
     require_slm,
@@ -39,7 +37,6 @@ from calibration_routines.display.mask_search import (
     AlignmentSession,
     AlignmentSettings,
     Measured,
-    Progress,
     measure_sections,
     refine_pose,
     search_pose,
@@ -125,10 +122,8 @@ class MaskAlignment:
     display : Display
         What is known of the display; its displacement is not used.
     settings : AlignmentSettings
-    progress : callable, optional
-        ``progress(words, frames_taken)``; may raise to end the alignment.
-    on_look : callable, optional
-        Called with every picture of spots.
+    listener : Listener, optional
+        What is found is said to it, and every picture of spots shown; may raise to end the alignment.
     """
 
     def __init__(
@@ -136,13 +131,11 @@ class MaskAlignment:
         io: DisplayBench,
         display: Display,
         settings: AlignmentSettings | None = None,
-        *,
-        progress: Progress | None = None,
-        on_look: Callable[[SpotLook], object] | None = None,
+        listener: Listener | None = None,
     ) -> None:
         self.io = io
         self.settings = settings or AlignmentSettings()
-        self.session = AlignmentSession(io, display, self.settings, progress, on_look)
+        self.session = AlignmentSession(io, display, self.settings, listener or Listener())
         self._cost = PlacementCost(self.session.display)
         self._repeatability_db = float("nan")
         self._directions: dict[str, int] = {}
@@ -279,17 +272,17 @@ class AlignmentProcedure(Procedure):
         out = writable(bench, folder, settings.out, "alignment")
         correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        io = DisplayBench(bench, bench.config.display.slm_binning, correction)
+        io = DisplayBench(
+            bench,
+            bench.config.display.slm_binning,
+            correction,
+            check=control.check,
+            on_frame=lambda frames: listener.share(frames, settings.max_frames, at_most=True),
+        )
         if settings.moves:
             home_if_needed(bench, listener)
         listener.step("aligning the mask")
-
-        def on_progress(words: str, frames: int) -> None:
-            control.check()
-            listener.said(words)
-            listener.share(frames, settings.max_frames, at_most=True)
-
-        report = MaskAlignment(io, display, settings, progress=on_progress, on_look=listener.look).run()
+        report = MaskAlignment(io, display, settings, listener).run()
         alignment = _alignment(report, bench, display.mask.shape)
         bench.safe_state()
         figure = out.with_suffix(".png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases_from_frames
 
 Array = npt.NDArray[Any]
-Progress = Callable[[str, int], object]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
 _FLATNESS_FRAMES = 22
@@ -60,9 +58,7 @@ class SlmCalibration:
     frames: int
 
 
-def measure_look_up_table(
-    io: DisplayBench, *, n_levels: int = 33, seed: int = 0, progress: Progress | None = None
-) -> SlmCalibration:
+def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0) -> SlmCalibration:
     """Let half of the SLM's pixels interfere with the other half at one level after the other.
 
     Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`.
@@ -83,8 +79,6 @@ def measure_look_up_table(
         picture = io.photograph(exposure_ms)
         # Every fourth pixel has more than enough light.
         frames.append(picture[::2, ::2])
-        if progress is not None:
-            progress(f"level {level}", len(frames))
     phases = phases_from_frames(np.array(frames))
     from scipy.interpolate import PchipInterpolator
 
@@ -100,7 +94,6 @@ def measure_flatness(
     *,
     rest: Array | None = None,
     pictures: int = 10,
-    progress: Progress | None = None,
 ) -> SlmCalibration:
     """Find the SLM's smooth phase error by spots that take off more and less of it, a pair a mode.
 
@@ -137,8 +130,6 @@ def measure_flatness(
             phases = [np.tensordot(c, modes, 1) for c in (*trials, found)]
             brightness, _ = eye.measure_with_phases(pose, phases)
             total += np.sqrt(np.maximum(brightness, 0))
-            if progress is not None:
-                progress("flatness", io.frames)
         if total[-1] ** 2 / count**2 < 0.03 * eye.ideal(len(total)):
             raise BenchError("Flatness cannot be measured: the spots are too weak. Align the mask first.")
         plus, minus = total[0:-1:2], total[1:-1:2]
@@ -204,19 +195,19 @@ class SlmProcedure(Checked, Procedure):
         """Measure, and save what ``align mask`` and ``show`` take."""
         slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
-        io = DisplayBench(bench, bench.config.display.slm_binning)
-
-        def on_frame(_words: str, _n: int) -> None:
-            control.check()
-            listener.share(io.frames, self.frames)
-
+        io = DisplayBench(
+            bench,
+            bench.config.display.slm_binning,
+            check=control.check,
+            on_frame=lambda frames: listener.share(frames, self.frames),
+        )
         listener.step("measuring the look-up table")
-        found = measure_look_up_table(io, n_levels=self.levels, progress=on_frame)
+        found = measure_look_up_table(io, n_levels=self.levels)
         if place is not None:
             listener.step("measuring flatness")
             bring_mask(bench, place.stage_position)
             display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-            found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=on_frame)
+            found = measure_flatness(io, display, place.pose, found, rest=place.rest)
         bench.safe_state()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)

@@ -11,8 +11,9 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QPixmap
 from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxLayout, QWidget
 
-from calibration_routines import Photograph, SweepCalibration
+from calibration_routines.optics.photograph import Photograph
 from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.psf.sweep import SweepCalibration
 from calibration_routines.psf.sweep_watch import PointTaken
 from gui.forms.routines import PLAN, forms
 from gui.procedure_panel import ProcedurePanel

@@ -11,10 +11,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
-from calibration_routines.demo.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.psf.sweep_plan import plan_lines
+from calibration_routines.demo import Advance, DemoResult, DemoSettings, run_demo
+from calibration_routines.psf.sweep import SweepCalibration
+from calibration_routines.psf.sweep_plan import SweepExposures, plan_lines, sweep_plan
 from calibration_routines.psf.sweep_procedure import exposure_lines, quality_lines
 from instrument.bench.bench import Bench
 from instrument.cli.app import App, examples

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibration_routines.display.hologram_photograph import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
+from calibration_routines.display import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.options import Given
 from instrument.files.errors import BenchError, FileError

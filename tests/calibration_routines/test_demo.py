@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from calibration_routines import SweepCalibration, SweepExposures
-from calibration_routines.demo.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo.demo_picture import compare, scene_field
-from calibration_routines.demo.demo_settings import DemoSettings, read_picture
+from calibration_routines.demo import Advance, DemoResult, DemoSettings, read_picture, run_demo
+from calibration_routines.demo_picture import compare, scene_field
 from drivers.errors import DeviceError
 from instrument.bench.bench import Bench
 from instrument.cli import main
@@ -193,9 +192,9 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 
 PROGRAM = """
 import sys
-from calibration_routines.demo import demo_settings
+from calibration_routines import demo
 from instrument.cli import main
-small = demo_settings.DemoSettings(
+small = demo.DemoSettings(
     preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,
     half_field_deg=5.0, reconstruction_s=5.0, time_scale=1.0,
 )

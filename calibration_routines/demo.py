@@ -14,15 +14,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from calibration_routines.demo.demo_picture import Comparison, Viewer, compare, write_pictures
-from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.optics.photograph import Photograph, photograph
+from calibration_routines.demo_picture import Comparison, Viewer, compare, write_pictures
+from calibration_routines.optics.photograph import (
+    FieldResponse,
+    Photograph,
+    measure_field_response,
+    photograph,
+)
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import expose_scene
-from calibration_routines.psf.field_response import FieldResponse, measure_field_response
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
+from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_plan import SweepExposures, expose_sweep
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
@@ -32,8 +38,120 @@ from instrument.files.errors import FileError
 from instrument.runs.finish import CtrlC
 from instrument.runs.runner import RunStatus
 from recon import Reconstruction, reconstruct
+from recon.base.declare import option
+from recon.optics.scene import Scene, picture
 
 FILE = "demo.json"
+PICTURE = Path(__file__).with_name("demo_picture.jpg")
+"""A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
+
+
+_HIDDEN: dict[str, Any] = {"flags": ("",)}  # not offered: the demo is the same for everybody
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """The demo's settings; everything that could flatter the result is here, in the open."""
+
+    preset: str = option(
+        "pco",
+        help="The simulated optics; pco: the dissertation's prototype (Kuo 2020, Sec. 4.3).",
+        **_HIDDEN,
+    )
+    camera_binning: int = option(2, least=1, help="In the camera, 2 as in Kuo 2020, Sec. 4.3.", **_HIDDEN)
+    binning: int = option(
+        2, least=1, help="Of PSFs and photograph in software: to the optical resolution.", **_HIDDEN
+    )
+    z_mm: tuple[float, float] = option(
+        (100.0, 500.0), unit="mm", help="Nearest and farthest plane of the sweep.", **_HIDDEN
+    )
+    planes: int = option(7, least=1, help="Planes of the sweep.", **_HIDDEN)
+    scene_plane: int = option(
+        5, least=0, help="The plane, counted from the nearest, in which the scene stands.", **_HIDDEN
+    )
+    half_field_deg: float = option(
+        18.0, unit="deg", help="Half the angle under which the picture's width is seen.", **_HIDDEN
+    )
+    average: int = option(4, least=1, help="Frames averaged, for PSFs and for the photograph.", **_HIDDEN)
+    reconstruction_s: float = option(
+        12.0,
+        unit="s",
+        least=0.1,
+        flags=("--reconstruction-s",),
+        metavar="S",
+        help="Time for the reconstruction.",
+    )
+    time_scale: float = option(
+        1.0, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
+    )
+    seed: int = option(0, least=0, help="Of the simulated diffuser, sensor and noise.")
+
+    @property
+    def sweep(self) -> AxialSweep:
+        """The axial sweep."""
+        return AxialSweep(
+            z_min_um=1e3 * self.z_mm[0],
+            z_max_um=1e3 * self.z_mm[1],
+            planes=self.planes,
+            average=self.average,
+            binning=self.binning,
+        )
+
+    @property
+    def scene_z_um(self) -> float:
+        """Depth of the scene."""
+        return self.sweep.z_um[self.scene_plane]
+
+    @property
+    def scene_size_um(self) -> tuple[float, float]:
+        """Height and width of the picture on the screen."""
+        width = 2 * self.scene_z_um * float(np.tan(np.radians(self.half_field_deg)))
+        rows, columns = read_picture().shape
+        return width * rows / columns, width
+
+    def scene(self) -> Scene:
+        """Return the scene: the picture on a screen that glows in the colour of the point source."""
+        radiance = np.zeros((*read_picture().shape, 3), np.float32)
+        radiance[..., 1] = read_picture()
+        return picture(radiance, self.scene_z_um, self.scene_size_um[1], name="a cup of coffee on a screen")
+
+    def bench_toml(self) -> str:
+        """Return the configuration of the demo's bench."""
+        return f"""\
+# The bench of diffuserbench demo: SIMULATED.
+[bench]
+name = "demo bench"
+data_folder = "."
+
+[camera]
+driver = "simulated"
+binning = {self.camera_binning}
+
+[stage]
+driver = "simulated"
+
+[led_array]
+driver = "simulated"
+
+[source]
+rgb = [0, 255, 0]
+
+[scene]
+control = "simulated"
+
+[simulated]
+preset = "{self.preset}"
+seed = {self.seed}
+time_scale = {self.time_scale:g}
+"""
+
+
+def read_picture() -> npt.NDArray[np.float32]:
+    """Return the demo's picture as light from a screen: linear, 0 to 1, grey, (height, width) float32."""
+    levels = cv2.imread(str(PICTURE), cv2.IMREAD_GRAYSCALE)
+    if levels is None:
+        raise FileNotFoundError(f"The demo's picture {PICTURE} is missing: install diffuserbench again.")
+    return (np.asarray(levels, np.float32) / 255.0) ** np.float32(2.2)
 
 
 def new_folder(parent: Path) -> Path:
