@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,7 +29,8 @@ from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
 from calibration_routines.psf.sweep_options import AxialSweep
-from calibration_routines.psf.sweep_plan import SweepExposures, expose_sweep
+from calibration_routines.psf.sweep_plan import expose_sweep, plan_lines, sweep_plan
+from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -210,24 +211,26 @@ class Journal:
         write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
 
 
-Advance = Callable[[float, float], None]
-Stage = Callable[[str], AbstractContextManager[Advance]]
+class _Stages(Listener):
+    """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
+    def __init__(self, journal: Journal, listener: Listener, ctrl_c: CtrlC) -> None:
+        self._journal, self._listener, self._ctrl_c = journal, listener, ctrl_c
 
-class Audience(Protocol):
-    """Whom the demo tells what it does."""
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Enter a stage."""
+        with self._journal.stage(name):
+            self._listener.step(name)
+            yield
+            self._ctrl_c.check()
 
-    def stage(self, name: str) -> AbstractContextManager[Advance]:
-        """Enter a stage; gives what is called with how much of it is done and how much there is."""
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        self._ctrl_c.check()
+        self._listener.share(done, total, at_most=at_most)
 
-    def on_bench(self, bench: Bench, folder: Path) -> None:
-        """Learn which bench is used, and where everything goes."""
-
-    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
-        """Learn the exposures, and what the sweep will do and cost, before it starts."""
-
-    def on_sweep(self, done: SweepCalibration) -> None:
-        """Learn how good the sweep is."""
+    def frame(self, status: RunStatus) -> None:
+        self.share(status.done, status.total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +269,9 @@ class DemoResult:
     files: dict[str, Path]
 
 
-def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | None = None) -> DemoResult:
+def run_demo(
+    folder: Path | str, listener: Listener | None = None, settings: DemoSettings | None = None
+) -> DemoResult:
     """Run the main job on the simulated bench, into a new folder inside ``folder``.
 
     Its ``demo.json`` always says how far it came: ``state`` is ``running``, ``completed``, ``failed`` or
@@ -285,7 +290,7 @@ def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | No
     try:
         journal.note(state="running")
         with CtrlC() as ctrl_c:
-            return _run(place, audience, settings, journal, ctrl_c)
+            return _run(place, listener or Listener(), settings, journal, ctrl_c)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -294,40 +299,32 @@ def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | No
 
 
 def _run(
-    place: Path, audience: Audience, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
+    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
 ) -> DemoResult:
-    @contextmanager
-    def stage(name: str) -> Iterator[Advance]:
-        with journal.stage(name), audience.stage(name) as tell:
-
-            def advance(done: float, total: float) -> None:
-                ctrl_c.check()
-                tell(done, total)
-
-            yield advance
-            ctrl_c.check()
-
+    stages = _Stages(journal, listener, ctrl_c)
+    stage = stages.stage
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
     with bench:
         journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
-        audience.on_bench(bench, place)
+        listener.said(f"Bench: {bench.label}")
+        listener.said(f"Everything goes to {place}")
         try:
-            measured = _measure(bench, place, settings, audience, stage)
+            measured = _measure(bench, place, settings, listener, stages)
         finally:
             bench.safe_state()
             journal.note(left=_state_of(bench))
         viewer = Viewer(_world(bench), settings, measured)
     with stage("compile kernels (kept)"):
         _warm_up()
-    with stage("reconstruct") as advance:
+    with stage("reconstruct"):
         result = reconstruct(
             measured.photo.measurement,
             measured.calibration.calibration,
             z_um=settings.scene_z_um,
             time_s=settings.reconstruction_s,
-            on_progress=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
+            on_progress=viewer.watch(lambda seconds: stages.share(seconds, settings.reconstruction_s)),
         )
     comparison = compare(viewer.picture(result.image), viewer.truth, viewer.field)
     with stage("write the pictures"):
@@ -338,8 +335,11 @@ def _run(
     return DemoResult(place, settings, measured, result, comparison, dict(journal.seconds), files)
 
 
-def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audience, stage: Stage) -> Measured:
+def _measure(
+    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: _Stages
+) -> Measured:
     """Do everything that needs the bench."""
+    stage = stages.stage
     if bench.stage is None:
         raise ValueError("The demo's bench has a stage.")
     sweep = settings.sweep.points()
@@ -349,11 +349,13 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
         bench.place_source(*sweep.points_um[0])
     with stage("expose without saturating"):
         exposures = expose_sweep(bench, sweep)
-    audience.on_exposures(bench, settings, exposures)
-    with stage("dark frames and axial sweep") as advance:
-        done = calibrate_sweep(bench, sweep, place, exposures=exposures, listener=_Frames(advance))
-    audience.on_sweep(done)
-    with stage("response over the field") as advance:
+    listener.exposures(exposures)
+    listener.planned(plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), None))
+    with stage("dark frames and axial sweep"):
+        done = calibrate_sweep(bench, sweep, place, exposures=exposures, listener=stages)
+    for line in quality_lines(done):
+        listener.said(line)
+    with stage("response over the field"):
         height, width = settings.scene_size_um
         response = measure_field_response(
             bench,
@@ -361,9 +363,9 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             settings.scene_z_um,
             exposures.exposures_ms[settings.scene_plane],
             place,
-            listener=_Frames(advance),
+            listener=stages,
         )
-    with stage("photograph the scene") as advance:
+    with stage("photograph the scene"):
         _world(bench).set_scene(settings.scene())
         exposure = expose_scene(bench)
         photo = photograph(
@@ -373,7 +375,7 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             average=settings.average,
             dark_frames=settings.average,
             binning=settings.binning,
-            listener=_Frames(advance),
+            listener=stages,
         )
     return Measured(done, response, photo, bench.label)
 
@@ -383,14 +385,6 @@ def _warm_up() -> None:
     psf = np.zeros((16, 16), np.float32)
     psf[4:12:3, 5:11:2] = 1.0
     reconstruct(psf + 1.0, psf, iterations=2)
-
-
-class _Frames(Listener):
-    def __init__(self, advance: Advance) -> None:
-        self._advance = advance
-
-    def frame(self, status: RunStatus) -> None:
-        self._advance(status.done, status.total)
 
 
 def _world(bench: Bench) -> SimulatedWorld:

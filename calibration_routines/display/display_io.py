@@ -19,7 +19,7 @@ from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.files.atomic import check_writable
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection, phase_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.writer import dated_name, free_name
@@ -192,18 +192,6 @@ def require_slm(bench: Bench) -> Slm:
     return bench.slm
 
 
-def refuse_existing(file: Path | None, *, overwrite: bool) -> None:
-    """Refuse to write over a file that nobody allowed to be replaced.
-
-    Raises
-    ------
-    FileError
-        When it exists.
-    """
-    if file is not None and file.exists() and not overwrite:
-        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
-
-
 def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) -> Path:
     """Return the file to write in the end, by default one with a date, sure now that it can be written."""
     if out is None:
@@ -248,8 +236,6 @@ class SpotCamera:
 
     Parameters
     ----------
-    io : DisplayBench
-    display : Display
     before_frame : callable, optional
         Called before every photograph; raises to end the work.
     on_look : callable, optional
@@ -325,8 +311,6 @@ class SpotCamera:
 
         Parameters
         ----------
-        pose : Pose
-        sections : Sections
         shifts : ndarray, (sections, hypotheses, 2)
             ``(y, x)``, mask pixels.
 

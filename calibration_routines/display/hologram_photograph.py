@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display import CaptureOptions
 from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import Alignment, bench_display
+from instrument.display.hologram import Alignment, CaptureOptions, bench_display
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
@@ -101,7 +100,6 @@ class HologramCamera:
         ----------
         fields : sequence of ndarray, complex, (height, width)
             Time-multiplexed frames.
-        target : Target
         average : int
             Photographs of each frame.
         """
@@ -141,7 +139,6 @@ class HologramCamera:
         ----------
         slm : ndarray, complex, (1, height, width)
             Start, from :func:`recon.holography.compute_hologram` for this display.
-        target : Target
         options : CaptureOptions
             Rounds, and photographs averaged in each.
         progress : callable, optional
@@ -232,12 +229,10 @@ def photograph_hologram(
 
     Parameters
     ----------
-    io : DisplayBench
     fields : sequence of ndarray, complex, (height, width)
         Time-multiplexed frames; one where it is to be refined.
     display : Display
         With the mask's displacement where it is known.
-    target : Target
     options : CaptureOptions, optional
     progress : callable, optional
         ``progress(round, psnr_db)``.

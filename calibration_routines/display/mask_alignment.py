@@ -27,7 +27,6 @@ import numpy.typing as npt
 from calibration_routines.display.display_io import (
     DisplayBench,
     approach_from_below,
-    refuse_existing,
     require_slm,
     writable,
 )
@@ -45,6 +44,7 @@ from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, save_alignment
+from instrument.files.atomic import require_new
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
@@ -118,10 +118,8 @@ class MaskAlignment:
 
     Parameters
     ----------
-    io : DisplayBench
     display : Display
         What is known of the display; its displacement is not used.
-    settings : AlignmentSettings
     listener : Listener, optional
         What is found is said to it, and every picture of spots shown; may raise to end the alignment.
     """
@@ -251,8 +249,9 @@ class AlignmentProcedure(Procedure):
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
         slm = require_slm(bench)
-        for file in (self.settings.out, self.settings.out and self.settings.out.with_suffix(".png")):
-            refuse_existing(file, overwrite=self.settings.overwrite)
+        if (out := self.settings.out) is not None:
+            for file in (out, out.with_suffix(".png")):
+                require_new(file, overwrite=self.settings.overwrite)
         if self.settings.slm_calibration is not None:
             load_slm_correction(self.settings.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))

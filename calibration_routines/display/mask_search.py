@@ -101,10 +101,8 @@ class AlignmentSession:
 
     Parameters
     ----------
-    io : DisplayBench
     display : Display
         What is known of the display; its displacement is not used.
-    settings : AlignmentSettings
     listener : Listener
         What is found is said to it, and every picture of spots shown.
     """

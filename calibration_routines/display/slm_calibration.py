@@ -13,13 +13,13 @@ from calibration_routines.display.display_io import (
     DisplayBench,
     SpotCamera,
     bring_mask,
-    refuse_existing,
     require_slm,
     writable,
 )
 from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
@@ -99,8 +99,6 @@ def measure_flatness(
 
     Parameters
     ----------
-    io : DisplayBench
-    display : Display
     pose : Pose
         Of the mask, from an alignment; the stage must be where that left it.
     table : SlmCalibration
@@ -186,7 +184,8 @@ class SlmProcedure(Checked, Procedure):
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
         require_slm(bench)
-        refuse_existing(self.out, overwrite=self.overwrite)
+        if self.out is not None:
+            require_new(self.out, overwrite=self.overwrite)
         if self.alignment is not None:
             load_alignment(self.alignment)
         return Outlook((f"{self.levels} grey levels, {self.frames} frames at most",))

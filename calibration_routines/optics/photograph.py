@@ -239,7 +239,6 @@ def measure_field_response(
         Open, its stage homed.
     half_field_um : (float, float)
         Half the field's height and width at ``z_um``.
-    z_um : float
     exposure_ms : float
         One that does not saturate on the axis.
     folder : path, optional

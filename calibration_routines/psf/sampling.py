@@ -48,7 +48,6 @@ def lateral_spacing(response: FallOff | None, z_um: float, *, along: str = "x") 
     ----------
     response : callable, optional
         The sensor's angular response (:mod:`recon.optics.fall_off`); None: not known, or none.
-    z_um : float
     along : {"x", "y"}
     """
     if response is None:
@@ -87,8 +86,6 @@ def axial_planes(
 
     Parameters
     ----------
-    z_min_um, z_max_um : float
-    geometry : Geometry
     lenslet_um : float, optional
         Diameter p of a microlens diffuser's lenslets: then ``1/z1 - 1/z2 <= 4 wavelength / p^2`` (Kuo 2020,
         Eq. 5.10). Else the edge of the pattern moves by two pixels at most (Eq. 4.7).
@@ -316,7 +313,6 @@ def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None
 
     Parameters
     ----------
-    bench : Bench
     places : mapping
         Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
     """
@@ -354,31 +350,3 @@ def _rounded_down(length_um: float) -> float:
     """Return a length with two digits, not longer."""
     unit = 10.0 ** (math.floor(math.log10(length_um)) - 1)
     return unit * math.floor(length_um / unit + 1e-9)
-
-
-def planes_for(
-    bench: Bench,
-    z_min_um: float,
-    z_max_um: float,
-    *,
-    lenslet_um: float | None = None,
-    wavelength_nm: float | None = None,
-) -> tuple[int, tuple[str, ...]]:
-    """Return how many planes the bench's optics need (:func:`axial_planes`), and why.
-
-    Raises
-    ------
-    SettingsError
-        When they are more than :data:`MOST_PLANES`.
-    """
-    needed = axial_planes(
-        z_min_um, z_max_um, bench.geometry, lenslet_um=lenslet_um, wavelength_nm=wavelength_nm
-    )
-    number = int(needed.value)
-    if number > MOST_PLANES:
-        words = (
-            f"from {z_min_um / 1e3:g} to {z_max_um / 1e3:g} mm these optics need {number} planes, more than "
-            f"{MOST_PLANES}: narrow the range, or say how many planes"
-        )
-        raise SettingsError([("planes", words)])
-    return number, (f"{needed.reason}. Another number of planes can be chosen.",)

@@ -112,7 +112,8 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._all())
 
     def _all(self) -> dict[str, T]:
-        return {**self._known_own(), **self._foreign}
+        own = self._known_own()
+        return {**own, **self._foreign} if self._foreign else own
 
     def _known_own(self) -> dict[str, T]:
         if self._loaded and self._own is not None:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.base import Array, Composition, LinearOperator
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.errors import InputError, StructureError
 
 
@@ -61,12 +61,12 @@ class CroppedConvolution:
 
     Attributes
     ----------
-    convolution : PadCropConvolution
+    convolution : Convolution
     weight : ndarray, ``range_shape``
         1 where the pixel was measured, 0 where it was erased.
     """
 
-    convolution: PadCropConvolution
+    convolution: Convolution
     weight: Array
 
 
@@ -83,11 +83,11 @@ def as_cropped_convolution(operator: LinearOperator) -> CroppedConvolution:
     while isinstance(inner, Composition) and isinstance(inner.outer, Erasures):
         weight *= inner.outer.valid
         inner = inner.inner
-    if isinstance(inner, PadCropConvolution):
+    if isinstance(inner, Convolution) and inner.is_picture:
         return CroppedConvolution(inner, weight)
     raise StructureError(
-        f"This solver needs a PadCropConvolution, with or without Erasures; got {type(inner).__name__}. "
-        "Fista takes any operator."
+        f"This solver needs a Convolution of a picture, with or without Erasures; got "
+        f"{type(inner).__name__}. Fista takes any operator."
     )
 
 

@@ -135,7 +135,7 @@ def _admm_refuses(problem: Problem) -> str | None:
 
 
 def _admm(part: Part, start: Array | None) -> Runs:
-    from recon.camera.convolution3d import Convolution3D
+    from recon.camera.convolution import Convolution
     from recon.solvers.admm import Admm
     from recon.solvers.splitting import Room, SensorData, Tuning
     from recon.solvers.tv_admm_volume import volume_solver
@@ -143,7 +143,7 @@ def _admm(part: Part, start: Array | None) -> Runs:
     problem, camera = part.problem, part.camera
     if problem.together:
         return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
-    if not isinstance(camera, Convolution3D):
+    if not isinstance(camera, Convolution):
         return _varying_admm(part, camera, start)
     data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(problem.axis_weights, (False, True, True))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -95,7 +95,8 @@ class Evidence:
 
     def as_json(self) -> dict[str, float]:
         """Return the numbers by name, but for those that were not measured."""
-        return {name: float(value) for name, value in asdict(self).items() if value is not None}
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return {name: float(value) for name, value in values if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,9 +230,8 @@ def _ambiguity(psf: Array) -> float:
 
 def averaged(channels: list[Evidence]) -> Evidence:
     """Return the mean over channels, the worst of what must not average."""
-    numbers: Mapping[str, list[float]] = {
-        k: [c.as_json()[k] for c in channels] for k in channels[0].as_json()
-    }
+    known = [c.as_json() for c in channels]
+    numbers: Mapping[str, list[float]] = {k: [c[k] for c in known] for k in known[0]}
     mean = {k: float(np.mean(v)) for k, v in numbers.items()}
     worst = {k: max(numbers[k]) for k in ("unexplained", "saturated", "unsettled", "load")}
     return Evidence(**{**mean, **worst, "planes": int(numbers["planes"][0])})  # type: ignore[arg-type]

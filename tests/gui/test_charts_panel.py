@@ -11,9 +11,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from gui.panels.charts import ChartsPanel
-from gui.widgets.chart_view import describe
-from instrument.evaluation.chart_data import read_chart
+from gui.panels.charts import ChartsPanel, describe
+from instrument.evaluation.chart import read_chart
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.stability_file import read_stability
@@ -169,7 +168,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     assert rows == [["● admm tv", "26", "0.4"], ["fista tv", "25", "0.8"], ["● wiener", "12", "0.01"]]
     assert "SIMULATED" in panel.heading.text()
     assert "local tv: one PSF only" in panel.heading.toolTip()
-    assert "volume l1: no time" in panel.heading.toolTip()
+    assert "admm l1: no time" in panel.heading.toolTip()
     # Less is better for errors, and scores that nobody knows are not on offer.
     assert [view.measure.itemData(i) for i in range(view.measure.count())] == ["psnr_db", "held_out"]
     view.measure.setCurrentIndex(1)

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from instrument.cli.stability import app
-from instrument.evaluation.stability_figure import ticks_of
+from instrument.evaluation.figures import ticks_of
 from instrument.files.errors import BenchError, FileError
 from instrument.files.stability_file import CellLog, read_stability
 from recon.evaluation import maps

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import griddata
 
+from recon.analysis.gram import WindowProblem
 from recon.analysis.points import Noise, PointGrid, try_points
 from recon.analysis.resolution import axial_resolution
-from recon.analysis.window import WindowProblem
 from recon.evaluation.lenslets import build_camera
 from recon.evaluation.map_trials import local_condition
 from recon.evaluation.maps import map_named

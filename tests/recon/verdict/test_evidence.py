@@ -189,7 +189,7 @@ def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(sys.modules[recon.solve.__module__], "evidence_of", fail)
+    monkeypatch.setattr(sys.modules[recon.judged.__module__], "evidence_of", fail)
     volume = make_scene(SceneSpec("beads", size=32, depths=2))
     picture = make_scene(SceneSpec("sparse-picture", size=32))
     for result in (
