@@ -313,7 +313,7 @@ def _run(
         try:
             measured = _measure(bench, place, settings, listener, stages)
         finally:
-            bench.safe_state()
+            bench.stop()
             journal.note(left=_state_of(bench))
         viewer = Viewer(_world(bench), settings, measured)
     with stage("compile kernels (kept)"):

@@ -283,7 +283,7 @@ class AlignmentProcedure(Procedure):
         listener.step("aligning the mask")
         report = MaskAlignment(io, display, settings, listener).run()
         alignment = _alignment(report, bench, display.mask.shape)
-        bench.safe_state()
+        bench.stop()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
         from instrument.display.hologram_files import (
