@@ -125,6 +125,7 @@ def test_the_terminal_offers_and_runs_them_and_says_that_they_are_not_judged(fre
 def test_charts_and_maps_offer_them(fresh: Fresh) -> None:
     said = fresh.run("-c", PROGRAM, "stability", "--list")
     assert "landweber tv" in said
+    assert "admm vignetting tv" in said
     assert "colour-groups of volumes" in said
     assert "admm vignetting tv" in said
     made = fresh.run("-c", PROGRAM, "stability", "light-points", "--method", "admm vignetting tv")
