@@ -29,6 +29,7 @@ import numpy.typing as npt
 
 from recon.analysis.resolution import axial_resolution, lateral_resolution
 from recon.camera.camera_model import ModelName
+from recon.camera.refocus import central_psfs
 from recon.errors import InputError
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.evaluation.trial import Setting
@@ -173,7 +174,7 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     """Return error and severities of a picture or volume (n_z, height, width)."""
     from scipy.ndimage import gaussian_filter
 
-    psf = central_psfs(scene)
+    psf = central_psfs(scene.calibration)[1].mean(axis=1)
     resolved_px = lateral_resolution(psf[len(psf) // 2], LEVEL).mean_px
     # What lies within the optics' own spot cannot be asked for.
     blur = (0.7 if len(found) > 1 else 0.0, 0.5 * resolved_px, 0.5 * resolved_px)
@@ -190,17 +191,6 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     elif len(found) == 1:
         severities[Failure.RESOLUTION] = resolution_severity(seen[0], wanted[0], nominal_px)
     return error, severities
-
-
-def central_psfs(scene: TestScene) -> Image:
-    """Return the PSF nearest to the axis at each depth, the nearest depth first, (n_z, height, width)."""
-    positions = scene.calibration.source_positions_um
-    planes = []
-    for z in scene.z_um:
-        members = np.flatnonzero(positions[:, 2] == z)
-        nearest = members[np.argmin(np.hypot(*positions[members, :2].T))]
-        planes.append(scene.calibration.psfs[nearest].mean(axis=0))
-    return np.stack(planes)
 
 
 def back_projection(scene: TestScene, psf: Image) -> Image:
