@@ -6,7 +6,7 @@ Nothing here knows the truth. Everything is relative, so that it means the same 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -229,9 +229,8 @@ def _ambiguity(psf: Array) -> float:
 
 def averaged(channels: list[Evidence]) -> Evidence:
     """Return the mean over channels, the worst of what must not average."""
-    numbers: Mapping[str, list[float]] = {
-        k: [c.as_json()[k] for c in channels] for k in channels[0].as_json()
-    }
+    each = [channel.as_json() for channel in channels]
+    numbers = {name: [channel[name] for channel in each] for name in each[0]}
     mean = {k: float(np.mean(v)) for k, v in numbers.items()}
     worst = {k: max(numbers[k]) for k in ("unexplained", "saturated", "unsettled", "load")}
     return Evidence(**{**mean, **worst, "planes": int(numbers["planes"][0])})  # type: ignore[arg-type]
