@@ -173,11 +173,6 @@ def _made_sure(
 def try_all(steps: Iterable[SafeStep]) -> None:
     """Run every step in order, each even if those before it failed or were interrupted.
 
-    Parameters
-    ----------
-    steps : iterable of (str, callable)
-        The step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it.
-
     Raises
     ------
     KeyboardInterrupt, SystemExit

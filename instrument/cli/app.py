@@ -16,7 +16,7 @@ import typer
 
 from drivers.errors import DeviceError, LimitError
 from instrument.cli.options import GroupedCommand, flat
-from instrument.files.errors import BenchError, FileError, OperatorNeededError, in_words
+from instrument.files.errors import BenchError, OperatorNeededError, in_words
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
@@ -116,18 +116,6 @@ def naming_as_is() -> Iterator[None]:
         raise OperatorNeededError(
             f"{error} Or, where the light already is as it must be, add --as-is."
         ) from None
-
-
-def require_new(file: Path, *, overwrite: bool) -> None:
-    """Refuse to write over a file.
-
-    Raises
-    ------
-    FileError
-        When it exists, unless it may be overwritten.
-    """
-    if file.exists() and not overwrite:
-        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from instrument.bench.photograph import (
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
 from instrument.cli.progress import keys, progress_bar
 from instrument.files.errors import duration, size
-from instrument.runs.recorder import RecordingStatus, prepare_recording
+from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
 from recon.base.declare import option
 
@@ -101,23 +101,9 @@ class SnapOptions(CaptureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordOptions(CaptureOptions):
-    """A recording."""
+class RecordingFiles:
+    """Where a recording goes."""
 
-    seconds: float | None = option(
-        None, help="How long.", unit="s", least=0, flags=("--seconds", "-s"), group=_CAMERA
-    )
-    frames: int | None = option(
-        None, help="How many frames, lost ones counted.", least=1, flags=("--frames", "-n"), group=_CAMERA
-    )
-    buffers: int | None = option(
-        None,
-        help="Frames that may wait in memory for the disk.",
-        default_words="what fits into 256 MB",
-        least=16,
-        group=_CAMERA,
-    )
-    label: str = option("recording", help="Becomes part of the folder's name.", group=_FILES)
     out: Path | None = option(
         None,
         help="Where the run's folder is made.",
@@ -188,26 +174,21 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
         "diffuserbench record --seconds 10", "diffuserbench record --frames 600 --exposure-ms 5 --source"
     ),
 )
-def record(options: RecordOptions, bench: BenchOption = None) -> None:
+def record(
+    capture: CaptureOptions, options: RecordingOptions, files: RecordingFiles, bench: BenchOption = None
+) -> None:
     """Record every frame of the camera with its metadata, until a number of frames or seconds, or until q.
 
     Frames that the camera dropped, or that the disk was too slow for, are counted and keep their numbers: the
     recording has gaps there, never a shifted index.
     """
-    light = options.light()
-    with naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
-        options.set_camera(opened)
+    light = capture.light()
+    with naming_as_is(), open_and_say(bench, as_is=capture.as_is) as opened:
+        capture.set_camera(opened)
         switch_light(opened, light)
-        recorder = prepare_recording(
-            opened,
-            options.out,
-            label=options.label,
-            n_frames=options.frames,
-            seconds=options.seconds,
-            n_buffers=options.buffers,
-        )
+        recorder = prepare_recording(opened, files.out, options)
         with progress_bar() as bar:
-            task = bar.add_task("Frames", total=options.frames, note="q ends")
+            task = bar.add_task("Frames", total=options.n_frames, note="q ends")
             recorder.on_progress = lambda status: bar.update(
                 task, completed=status.numbered, note=_note(status)
             )

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from instrument.cli.app import App, BenchOption, examples, load_and_say, require_new, saying_what_is_left
+from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
 from instrument.cli.progress import first_interrupt_cancels, progress_bar
 from instrument.display.hologram import (
     HologramResult,
@@ -25,6 +25,7 @@ from instrument.display.hologram import (
     slm_size,
 )
 from instrument.display.hologram_files import HologramFiles, rows, write_chart, write_csv
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.images import Pixels, read_image, read_stack
 from instrument.files.sample_images import DEFAULT_SAMPLES, SAMPLES, load_sample

@@ -82,11 +82,7 @@ class ConfigProblem:
 class ConfigError(BenchError):
     """A configuration file with mistakes: all of them, in the order of their lines.
 
-    Parameters
-    ----------
-    path : path or str
-        The file, or a name for a text that is no file.
-    problems : sequence of ConfigProblem
+    ``path`` is the file, or a name for a text that is no file.
     """
 
     def __init__(self, path: Path | str, problems: Sequence[ConfigProblem]) -> None:

@@ -24,53 +24,35 @@ BYTES_A_FRAME_BESIDE_THE_IMAGE = 6_000
 
 @dataclass(frozen=True)
 class BenchAbilities:
-    """What a plan is checked against: the bench's limits as they were read once.
-
-    Attributes
-    ----------
-    frame_shape : tuple of int
-        ``(height, width)`` or ``(height, width, 3)`` of the camera's frames.
-    frame_dtype : numpy dtype
-    exposure_ms, exposure_limits_ms, gain_limits
-        The camera's present exposure and its limits.
-    stage_axes : tuple of StageAxis
-        Empty without a stage.
-    stage_position : mapping
-        Where the stage is now.
-    stage_homed : bool
-        Whether the stage's positions refer to a known reference.
-    stage_target : callable, optional
-        The stage position that puts the point source at ``(x, y, z)`` micrometres; None without a source
-        that can be placed.
-    can_switch_source, can_switch_scene : bool
-        Whether the point source and the scene can be lit and darkened, by a device or by asking the
-        operator.
-    n_leds : int
-        0 without an LED array.
-    led_array : LedPlaces, optional
-        Where its LEDs are, for patterns by name.
-    slm_shape : tuple of int, optional
-    slm_settle_ms : float
-    free_bytes : int, optional
-        Free space where the run will be kept; None leaves the disk unchecked.
-    """
+    """What a plan is checked against: the bench's limits as they were read once."""
 
     frame_shape: tuple[int, ...]
+    """``(height, width)`` or ``(height, width, 3)`` of the camera's frames."""
     frame_dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
     exposure_ms: float
     exposure_limits_ms: tuple[float, float]
     gain_limits: tuple[float, float]
+    """The camera's present exposure and its limits."""
     stage_axes: tuple[StageAxis, ...] = ()
+    """Empty without a stage."""
     stage_position: Mapping[str, float] | None = None
+    """Where the stage is now."""
     stage_homed: bool = True
+    """Whether the stage's positions refer to a known reference."""
     stage_target: Callable[[SourcePosition], Mapping[str, float]] | None = None
+    """The stage position that puts the point source at ``(x, y, z)`` micrometres; None without a source that
+    can be placed."""
     can_switch_source: bool = True
     can_switch_scene: bool = True
+    """Whether source and scene can be lit and darkened, by a device or by asking the operator."""
     n_leds: int = 0
+    """0 without an LED array."""
     led_array: LedPlaces | None = None
+    """Where its LEDs are, for patterns by name."""
     slm_shape: tuple[int, int] | None = None
     slm_settle_ms: float = 0.0
     free_bytes: int | None = None
+    """Free space where the run will be kept; None leaves the disk unchecked."""
 
     def target(self, step: Step) -> Mapping[str, float]:
         """Return where a step puts the stage; empty where it stays."""
@@ -155,14 +137,8 @@ def check(
 ) -> None:
     """Refuse a plan that the bench cannot carry out.
 
-    Parameters
-    ----------
-    plan : Plan
-    abilities : BenchAbilities
-    todo : collection of int, optional
-        Indices of the steps that will be done; None means all.
-    start : Step, optional
-        The bench's state before the first step, for what the plan leaves as it is.
+    Only the steps that are ``todo`` (None: all) are looked at; ``start`` is the bench's state before the
+    first, for what the plan leaves as it is.
 
     Raises
     ------

@@ -23,14 +23,6 @@ def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: i
     :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
     :mod:`instrument.reconstruction.patterned` reads them from runs.
 
-    Parameters
-    ----------
-    lights : sequence of Light
-        Patterns by name, or of :func:`group_lights`.
-    exposure_ms : float
-    average : int
-        Frames averaged for each pattern.
-
     Raises
     ------
     BenchError

@@ -34,18 +34,13 @@ class LedShape(ABC):
     """One named pattern; a subclass declares its options and which LEDs it lights.
 
     Registered in :mod:`instrument.plan.patterns`, it can be lit by plans, on the terminal and in the window.
-
-    Attributes
-    ----------
-    name, help : str
-        How it is called, and one line for those who choose.
-    presets : mapping of str to mapping
-        What the window offers as buttons: their words, and the options that differ from the defaults.
     """
 
     name: ClassVar[str]
     help: ClassVar[str]
+    """One line for those who choose."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """What the window offers as buttons: their words, and the options that differ from the defaults."""
 
     @abstractmethod
     def lit(self, array: LedPlaces) -> LitLeds:

@@ -13,8 +13,9 @@ import numpy.typing as npt
 import tifffile
 
 from instrument.bench.photograph import Progress
-from instrument.files.atomic import check_writable, whole_file
+from instrument.files.atomic import check_writable, require_new, whole_file
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import write_image
 from instrument.runs.run import Run, RunError
 
 Image = npt.NDArray[Any]
@@ -38,7 +39,6 @@ def export(
 
     Parameters
     ----------
-    run : Run
     target : path
         Must not exist, except as a folder for PNG files.
     frames : sequence of int, optional
@@ -87,8 +87,7 @@ def export(
         raise FileError(
             target, f"no known format. Choose a name ending in {', '.join(writers)}, or a folder."
         )
-    if target.exists():
-        raise FileError(target, "exists already and was left as it is.")
+    require_new(target)
     check_writable(target, 0 if name.endswith(".mp4") else sum(run.records[i].n_bytes for i in indices))
     with whole_file(target) as temporary:
         writer(temporary)
@@ -182,14 +181,8 @@ def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) ->
     digits = len(str(max(indices)))
     for index, image in zip(indices, images, strict=True):
         path = folder / f"frame-{index:0{digits}d}.png"
-        if path.exists():
-            raise FileError(path, "exists already and was left as it is.")
-        shown = image[..., ::-1] if image.ndim == 3 else image
-        done, data = cv2.imencode(".png", np.ascontiguousarray(shown))
-        if not done:
-            raise FileError(path, "could not be encoded as PNG.")
-        with whole_file(path) as temporary:
-            temporary.write_bytes(data.tobytes())
+        require_new(path)
+        write_image(path, image)
 
 
 def _mp4(run: Run, path: Path, images: Iterator[Image], frames_per_s: float) -> None:

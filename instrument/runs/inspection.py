@@ -8,27 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import Progress
-from instrument.files.atomic import whole_file
+from instrument.files.figures import save_figure
 from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What reading a whole run found.
-
-    Attributes
-    ----------
-    frames : int
-        Frames that are as they were written.
-    damaged : tuple of DamagedFrame
-        Frames that the log calls written and that are not as they were.
-    problems : tuple of str
-        Whatever else contradicts itself.
-    """
+    """What reading a whole run found."""
 
     frames: int
+    """Frames that are as they were written."""
     damaged: tuple[DamagedFrame, ...]
+    """Frames that the log calls written and that are not as they were."""
     problems: tuple[str, ...]
+    """Whatever else contradicts itself."""
 
     @property
     def is_sound(self) -> bool:
@@ -129,8 +122,7 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
             fontsize=8,
         )
         axes.set_axis_off()
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
+    save_figure(figure, path)
     return indices
 
 
@@ -149,26 +141,15 @@ def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.floa
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """One run of a folder.
-
-    Attributes
-    ----------
-    path : Path
-    condition : RunCondition or None
-        None when it cannot be read; ``problem`` says why.
-    label : str
-    stored, frames : int
-        Frames on the disk, and those that belong to it.
-    is_recording : bool
-    is_simulated : bool
-    problem : str
-    """
+    """One run of a folder."""
 
     path: Path
     condition: RunCondition | None = None
+    """None when it cannot be read; ``problem`` says why."""
     label: str = ""
     stored: int = 0
     frames: int = 0
+    """Frames on the disk, and those that belong to it."""
     is_recording: bool = False
     is_simulated: bool = False
     problem: str = ""

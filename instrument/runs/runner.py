@@ -50,41 +50,28 @@ class RunState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
-    """A snapshot of a runner, for a progress bar or a window.
-
-    Attributes
-    ----------
-    done, total : int
-        Steps whose frames are on the disk, and steps of the plan.
-    step : Step or None
-        The step being done, or the last one.
-    done_here : int
-        Steps among ``done`` that this runner did: those of a run that goes on were done before.
-    seconds : float
-        Since the run was started or resumed.
-    seconds_left : float or None
-        Estimated from the steps done so far; None before the first.
-    dropped : int
-        Frames that the camera dropped during exposures of this run.
-    saturated_fraction : float
-        Of the newest frame.
-    reason : FinishReason or None
-        Why it ended, once it has.
-    newest : Snapshot or None
-        The photograph that was stored last.
-    """
+    """A snapshot of a runner, for a progress bar or a window."""
 
     state: RunState
     done: int
     total: int
+    """Steps whose frames are on the disk, and steps of the plan."""
     done_here: int = 0
+    """Steps among ``done`` that this runner did: those of a run that goes on were done before."""
     step: Step | None = None
+    """The step being done, or the last one."""
     seconds: float = 0.0
+    """Since the run was started or resumed."""
     seconds_left: float | None = None
+    """Estimated from the steps done so far; None before the first."""
     dropped: int = 0
+    """Frames that the camera dropped during exposures of this run."""
     saturated_fraction: float = 0.0
+    """Of the newest frame."""
     reason: FinishReason | None = None
+    """Why it ended, once it has."""
     newest: Snapshot | None = field(default=None, compare=False, repr=False)
+    """The photograph that was stored last."""
 
 
 RunProgress = Callable[[RunStatus], None]
@@ -170,7 +157,6 @@ class Runner:
     ----------
     bench : Bench
         Open.
-    plan : Plan
     writer : RunWriter
         The run; the runner finishes and closes it.
     todo : sequence of int, optional
