@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
-from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
+from drivers.errors import DeviceError, DeviceNotOpenError
 from drivers.second_display.outputs import Output, SecondDisplayOptions
-from drivers.slm import Slm
+from drivers.slm import Slm, read_only
 
 _INSTALL = 'Install it: pip install "diffuserbench[gui]".'
 
@@ -151,13 +151,8 @@ class SecondDisplaySlm(Slm):
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels: drawn, confirmed by the display server, sent and settled when this returns."""
         with self._lock:
-            output, window = self._require(), self._window
-            if levels.shape != (output.height, output.width) or levels.dtype != np.uint8:
-                raise LimitError(
-                    self.name,
-                    f"cannot show {levels.dtype} {levels.shape}.",
-                    f"It takes uint8 {(output.height, output.width)}.",
-                )
+            self._check(levels)
+            window = self._window
             assert window is not None
             shown = levels.copy()
             self._displayed = None
@@ -171,9 +166,7 @@ class SecondDisplaySlm(Slm):
         self._require()
         if self._displayed is None:
             raise DeviceError(self.name, "what it shows is unknown after a failure.", "Display again.")
-        view = self._displayed.view()
-        view.flags.writeable = False
-        return view
+        return read_only(self._displayed)
 
     def _require(self) -> Output:
         lost = self._lost
