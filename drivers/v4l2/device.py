@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drivers.common.pixels import Bytes
+from drivers.device import DeviceIdentity
 from drivers.errors import DeviceError, DeviceLostError, DeviceNotOpenError
 from drivers.registry.claim import DeviceBusyError
 from drivers.v4l2 import api
@@ -43,6 +44,7 @@ def lasting_path(node: str) -> str:
     return node
 
 
+_VIRTUAL_DRIVERS = ("vivid", "vimc")
 _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 
@@ -115,6 +117,22 @@ class VideoDevice:
         except BaseException:
             self.close()
             raise
+
+    def identity(self) -> DeviceIdentity:
+        """Return who the kernel says the camera is."""
+        found = self.capability()
+        driver = found.driver.decode(errors="replace")
+        usb = usb_strings(self.path)
+        version = found.version
+        return DeviceIdentity(
+            kind="camera",
+            driver="v4l2",
+            vendor=usb.get("manufacturer") or driver,
+            model=found.card.decode(errors="replace"),
+            serial_number=usb.get("serial") or found.bus_info.decode(errors="replace"),
+            firmware=f"{driver} of Linux {version >> 16}.{version >> 8 & 255}.{version & 255}",
+            simulated=driver in _VIRTUAL_DRIVERS,
+        )
 
     def close(self) -> None:
         """Close the node; closing twice does nothing."""
