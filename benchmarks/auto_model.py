@@ -35,7 +35,7 @@ from auto_scenes import FAMILY_PRIOR, JUDGED, TUNING
 
 import recon
 from recon.base.threads import set_threads
-from recon.camera import registration_cache as remembered
+from recon.camera import field_registration as remembered
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.reconstruction.choice import Choice

@@ -11,11 +11,13 @@ from __future__ import annotations
 import argparse
 import tempfile
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
-from calibration_routines.optics.angular import AngularSweep, farthest_um, measure_angular_response
-from calibration_routines.optics.dpc import DpcSetup, measure_diffuser
+from calibration_routines.optics.angular import AngularProcedure, AngularSweep, farthest_um
+from calibration_routines.optics.angular_response import AngularResponse
+from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSetup
 from drivers.simulated.led_microscope import LedMicroscopeWorld
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench
@@ -46,7 +48,8 @@ def angular(step_deg: float) -> None:
         assert bench.stage is not None
         bench.stage.home()
         sweep = AngularSweep(farthest_um(bench, 45.0), 45.0, step_deg, average=2)
-        response, _ = measure_angular_response(bench, sweep, folder)
+        response = AngularProcedure(sweep).carry_out(bench, Path(folder)).result
+        assert isinstance(response, AngularResponse)
         world = bench.shared["simulated"]
         assert isinstance(world, SimulatedWorld)
     for name, curve, sigma in (("x", response.along_x, 23.1), ("y", response.along_y, 16.7)):
@@ -66,7 +69,8 @@ def dpc(seeds: int) -> None:
     for seed in range(seeds):
         text = led_microscope_text().replace("seed = 0", f"seed = {seed}")
         with open_bench(parse_config(text, None)) as bench, tempfile.TemporaryDirectory() as folder:
-            surface, _ = measure_diffuser(bench, DpcSetup(0.1, 4.0), folder)
+            surface = DpcProcedure(DpcSetup(0.1, 4.0)).carry_out(bench, Path(folder)).result
+            assert isinstance(surface, DiffuserSurface)
             world = bench.shared["simulated_led_microscope"]
             assert isinstance(world, LedMicroscopeWorld)
             truth = level(world.true_height_um())

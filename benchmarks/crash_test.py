@@ -31,11 +31,10 @@ from pathlib import Path
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan
-from instrument.runs.acquire import prepare
-from instrument.runs.durable import read_lines
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import prepare, prepare_resume
+from instrument.runs.inspection import verify
+from instrument.runs.log import read_lines
 from instrument.runs.run import Run, RunCondition
-from instrument.runs.verification import verify
 from instrument.runs.writer import FrameToStore, RunWriter
 
 BENCH = """

@@ -19,8 +19,8 @@ import numpy as np
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from recon.analysis.field import field_of_view
-from recon.analysis.point_tests import PLANES, PointTests, point_tests
+from recon.analysis.correlation import field_of_view
+from recon.analysis.points import PLANES, PointTests, point_tests
 from recon.analysis.resolution import (
     axial_resolution,
     axial_spacing_per_um,

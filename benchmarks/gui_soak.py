@@ -43,7 +43,7 @@ from gui.session import BenchSession
 from gui.theme import apply_theme
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import save_calibration
-from instrument.plan.file import load_plan
+from instrument.plan.model import load_plan
 from instrument.runs.acquire import prepare
 from recon.types import Calibration
 

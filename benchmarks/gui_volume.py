@@ -26,8 +26,7 @@ from gui.app import application
 from gui.jobs import JobRunner
 from gui.theme import apply_theme
 from gui.widgets.volume_view import VolumeView
-from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.stored_result import open_result
+from instrument.reconstruction.stored_result import export_result, open_result
 
 TICK_MS = 5
 WAIT_S = 300.0

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from scipy.stats import spearmanr
 
 from recon.base.threads import set_threads
-from recon.evaluation.chart_reconstruction import ChartProblem, run_setting, settings_for
+from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import SETTLED_ITERATIONS, Point, even_with_best
 
@@ -45,9 +45,9 @@ def points_of(family: str, size: int, seed: int) -> list[Point]:
     )
     return [
         point
-        for setting in settings_for(problem)
+        for setting in problem.settings()
         if setting.model != "local" and setting.binning == 1 and setting.precision == "float32"
-        for point in run_setting(problem, setting, counts=COUNTS).points
+        for point in problem.run(setting, counts=COUNTS).points
     ]
 
 

@@ -13,7 +13,7 @@ from rocket_fft import c2c, c2r, r2c
 
 from recon.base import fft
 from recon.base.threads import get_threads, in_blocks
-from recon.camera._plane_kernels import FAST
+from recon.camera._kernels import FAST
 
 AXES = np.array([0, 1, 2])
 

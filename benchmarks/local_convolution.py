@@ -24,9 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from recon.base.threads import set_threads
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.interpolation import interpolation_weights
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
-from recon.camera.low_rank import low_rank, principal_psfs
+from recon.camera.varying_psfs import (
+    FieldOfPsfs,
+    interpolation_weights,
+    local_convolution,
+    low_rank,
+    principal_psfs,
+)
 
 
 @dataclass(frozen=True)

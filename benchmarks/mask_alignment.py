@@ -27,8 +27,7 @@ from calibration_routines.display.mask_alignment import AlignmentFailedError, Ma
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, parse_config
-from instrument.bench.display_setup import bench_display
-from instrument.display.hologram_job import prepare_target
+from instrument.display.hologram import bench_display, prepare_target
 from instrument.files.sample_images import load_sample
 from recon.holography import DcTerm, Display, HologramModel, compute_hologram
 from recon.holography.camera_map import register_camera

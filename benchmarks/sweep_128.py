@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from calibration_routines import AxialSweep, calibrate_sweep, expose_sweep, sweep_plan
+from calibration_routines import AxialSweep, Listener, calibrate_sweep, expose_sweep, sweep_plan
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench
@@ -71,7 +71,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the run goes; default: a temporary folder")
     arguments = parser.parse_args()
     near, far = (60e3, 250e3) if arguments.preset == "tiny" else (100e3, 500e3)
-    sweep = AxialSweep(z_min_um=near, z_max_um=far, planes=arguments.planes, average=arguments.average)
+    sweep = AxialSweep(
+        z_min_um=near, z_max_um=far, planes=arguments.planes, average=arguments.average
+    ).points()
     text = BENCH.format(preset=arguments.preset, binning=arguments.binning)
     with (
         open_bench(parse_config(text, None)) as bench,
@@ -87,13 +89,14 @@ def main() -> None:
         light, sensor = Stopwatch(world, "_psf"), Stopwatch(bench.camera, "_render")
         taken = 0.0
 
-        def watch(status: RunStatus) -> None:
-            nonlocal taken
-            if status.done == status.total:
-                taken = taken or time.perf_counter()
+        class Watch(Listener):
+            def frame(self, status: RunStatus) -> None:
+                nonlocal taken
+                if status.done == status.total:
+                    taken = taken or time.perf_counter()
 
         start = time.perf_counter()
-        done = calibrate_sweep(bench, sweep, folder, exposures=exposures, on_progress=watch)
+        done = calibrate_sweep(bench, sweep, folder, exposures=exposures, listener=Watch())
         end = time.perf_counter()
         height, width = bench.camera.frame_shape[:2]
     acquisition, planes = taken - start, arguments.planes

@@ -6,7 +6,7 @@
 
 Scenes of all five families, with seeds, diffusers (random and regular lenslets, smooth) and combinations of
 stresses that no stability map has: each scene draws its light, read noise and density, and every other
-stress with a chance of one in five. Failure is that of ``recon.verdict.failure``, from the truth; the
+stress with a chance of one in five. Failure is that of ``recon.verdict.map``, from the truth; the
 verdict sees the data alone. What is kept is evidence and severity, so that verdicts can be made again.
 
 170 of scenes 100 to 503, scenes 700 to 899 and the volumes of 1200 to 1229 come with the program, as cases
@@ -33,9 +33,8 @@ from recon.evaluation.scene import FAMILIES, SceneSpec, spec_of
 from recon.evaluation.scene_trial import Options, run_scene
 from recon.verdict.cases import cases_of, group_of, is_whole, mixed_scenes, weights_of
 from recon.verdict.evidence import Evidence
-from recon.verdict.failure import worst
-from recon.verdict.judge import verdict_on
-from recon.verdict.verdict import Region
+from recon.verdict.judge import Region, verdict_on
+from recon.verdict.map import worst
 
 FIRST_SEED = 50_000
 CASES = {*range(100, 504), *range(700, 900), *range(1200, 1230)}
@@ -48,7 +47,7 @@ DIGITS = 4
 AUTO = ", auto"
 """After a method's name: with the model that ``model="auto"`` chooses, as users reconstruct."""
 PICTURE_METHODS = ("admm tv" + AUTO, "admm tv", "admm l1", "wiener")
-VOLUME_METHODS = ("volume tv" + AUTO, "volume tv", "volume l1")
+VOLUME_METHODS = ("admm tv of volumes" + AUTO, "admm tv of volumes", "admm l1 of volumes")
 
 
 def scene(index: int) -> tuple[SceneSpec, Options]:

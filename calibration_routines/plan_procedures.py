@@ -5,30 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration_routines.errors import completed
 from calibration_routines.procedure import (
     Listener,
     Outcome,
     Outlook,
+    Procedure,
     Routine,
+    completed,
     home_if_needed,
     outlook_of,
     routines,
-    under_control,
 )
-from calibration_routines.psf.sweep import FOLDER, finish_sweep, watch_resumed
-from calibration_routines.psf.sweep_procedure import analysing, sweep_outcome
-from calibration_routines.psf.sweep_record import is_sweep
 from instrument.bench.bench import Bench
 from instrument.plan import Plan, check, estimate
-from instrument.runs.acquire import abilities_of, prepare
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import abilities_of, acquire, prepare_resume
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
 
 
 @dataclass(frozen=True, slots=True)
-class PlanProcedure:
+class PlanProcedure(Procedure):
     """Carry out a plan."""
 
     plan: Plan
@@ -39,27 +35,16 @@ class PlanProcedure:
         check(self.plan, replace(abilities_of(bench, folder), stage_homed=True))
         return outlook_of(bench, self.plan, folder)
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Home where the plan moves, and take the frames."""
-        heard = listener or Listener()
-        self.outlook(bench, folder)
-        with under_control(bench, control) as control:
-            home_if_needed(bench, heard, self.plan)
-            heard.step(self.plan.label)
-            run = prepare(bench, self.plan, folder, on_progress=heard.frame, control=control).execute()
-        return run_outcome(run)
+        home_if_needed(bench, listener, self.plan)
+        listener.step(self.plan.label)
+        return run_outcome(acquire(bench, self.plan, folder, on_progress=listener.frame, control=control))
 
 
 @dataclass(frozen=True, slots=True)
-class ResumeProcedure:
-    """Go on with a run that did not end, and make what a calibration's run was taken for."""
+class ResumeProcedure(Procedure):
+    """Go on with a run that did not end, and make what a routine's run was taken for."""
 
     run: Path
 
@@ -77,68 +62,48 @@ class ResumeProcedure:
         cost = estimate(found.plan, abilities, todo=todo, start=found.start)
         return replace(outlook_of(bench, found.plan, self.run, [words]), cost=cost)
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Verify what is stored, take the rest, and make the calibration, response or surface."""
-        heard = listener or Listener()
-        with under_control(bench, control) as control:
-            found = Run.open(self.run)
-            whole = found.condition is RunCondition.COMPLETED and not found.missing()
-            if found.plan is not None and not whole:
-                home_if_needed(bench, heard, found.plan)
-                heard.step("verifying the frames")
-                runner, findings = prepare_resume(
-                    bench, self.run, on_verify=heard.share, on_progress=heard.frame
-                )
-                heard.said(f"Found {findings}")
-                if is_sweep(self.run):
-                    watch_resumed(bench, runner, heard.event)
-                heard.step(found.label)
-                control.follow(runner)
-                found = runner.execute()
-            lacks = lacks_result(self.run)
-            if lacks:
-                completed(found, remedy="It can be resumed.")
-                heard.step("analysing")
-            if (outcome := finish_simple(found)) is not None:
-                return outcome
-            if lacks:
-                done = finish_sweep(
-                    self.run,
-                    bench,
-                    on_progress=heard.frame,
-                    on_analysis=analysing(heard, control),
-                    on_runner=control.follow,
-                )
-                return sweep_outcome(done)
-        return run_outcome(found)
+        found, routine = Run.open(self.run), routine_of(self.run)
+        if found.plan is not None and (found.condition is not RunCondition.COMPLETED or found.missing()):
+            home_if_needed(bench, listener, found.plan)
+            listener.step("verifying the frames")
+            runner, findings = prepare_resume(
+                bench, self.run, on_verify=listener.share, on_progress=listener.frame
+            )
+            listener.said(f"Found {findings}")
+            if routine is not None and routine.watch is not None:
+                routine.watch(bench, runner, listener)
+            listener.step(found.label)
+            control.follow(runner)
+            found = runner.execute()
+        return finished(found, bench, control, listener) or run_outcome(found)
+
+
+def routine_of(run: Path) -> Routine | None:
+    """Return the routine whose results are made of such runs; None for every other run."""
+    return next((one for one in routines.values() if one.purpose and one.purpose.is_of(run)), None)
 
 
 def lacks_result(run: Path) -> bool:
-    """Whether a run's frames are those of a calibration, and its result is not there yet."""
-    return (is_sweep(run) and not (run / FOLDER).exists()) or _unfinished(run) is not None
+    """Whether a run's frames are those of a routine, and its result is not there yet."""
+    routine = routine_of(run)
+    return routine is not None and routine.purpose is not None and routine.purpose.lacks_result(run)
 
 
-def finish_simple(run: Run) -> Outcome | None:
-    """Make the result of a complete run of a routine other than a sweep that has none yet.
+def finished(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome | None:
+    """Make the result of a routine's run that lacks it; None for every other run.
 
-    Returns
-    -------
-    Outcome or None
-        None for every other run.
+    Raises
+    ------
+    RunEndedError
+        When the run is not complete.
     """
-    routine = _unfinished(run.path)
-    return None if routine is None or routine.finish is None else routine.finish(run)
-
-
-def _unfinished(run: Path) -> Routine | None:
-    return next((routine for routine in routines.values() if routine.lacks_result(run)), None)
+    routine = routine_of(run.path)
+    if routine is None or routine.finish is None or not lacks_result(run.path):
+        return None
+    completed(run, remedy="It can be resumed.")
+    return routine.finish(run, bench, control, listener)
 
 
 def run_outcome(run: Run) -> Outcome:

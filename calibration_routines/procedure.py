@@ -1,32 +1,114 @@
 """A procedure from an open bench to its saved result, as command line, window and scripts call it alike.
 
 A procedure is frozen data: what a person asked for. ``outlook`` says what it will do and cost, nothing moves;
-``carry_out`` does all of it (homing, exposures, frames, analysis, files) and ends with the light off.
+``carry_out`` does all of it (homing, exposures, frames, analysis, files) and ends with the light off. What
+routines share is here too: errors, declared options, the record of what a run's frames are for, the registry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from instrument.bench.bench import Bench
+from instrument.files.errors import BenchError, FileError, SettingsError
+from instrument.files.record import RecordFormat, plain
 from instrument.plan import Plan, PlanEstimate, Step, estimate
-from instrument.runs.acquire import abilities_of
-from instrument.runs.run import Run
+from instrument.runs.acquire import abilities_of, prepare
+from instrument.runs.run import Run, RunCondition
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import RunStatus
+from instrument.runs.runner import Runner, RunStatus
+from recon.base.declare import options_of
+from recon.base.option_text import size
 from recon.base.registry import Registry
 
 if TYPE_CHECKING:
     from calibration_routines.display.display_io import SpotLook
-    from calibration_routines.psf.exposure import SweepExposures
+    from calibration_routines.psf.sweep_plan import SweepExposures
     from calibration_routines.psf.sweep_watch import SweepEvent
 
+T = TypeVar("T")
 
+
+# Errors ------------------------------------------------------------------------------------------------
+class CalibrationError(BenchError):
+    """A calibration that cannot be taken, or was ended before its last frame."""
+
+    exit_code = 1
+
+
+class RunEndedError(CalibrationError):
+    """The run behind a calibration was ended before its last frame; its frames are kept.
+
+    Parameters
+    ----------
+    what : str
+        Begins the sentence: ``"The sweep"``.
+    run : Run
+    remedy : str
+        What to do about it.
+    """
+
+    def __init__(self, what: str, run: Run, remedy: str = "") -> None:
+        self.run = run
+        self.words = f"{what} ended early ({run.condition}); what was taken is in {run.path}."
+        """Without the remedy, which is not the same on the command line and in a window."""
+        super().__init__(self.words + (f" {remedy}" if remedy else ""))
+
+
+def completed(run: Run, what: str = "The run", remedy: str = "") -> Run:
+    """Return a run that has all its frames; RunEndedError when it was ended before its last one."""
+    if run.condition is not RunCondition.COMPLETED:
+        raise RunEndedError(what, run, remedy)
+    return run
+
+
+# Options -----------------------------------------------------------------------------------------------
+MM: dict[str, Any] = {"unit": "um", "shown_unit": "mm", "shown_factor": 1e3}
+"""For ``option``: lengths in micrometres, which people think of in millimetres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Rows and columns, written as ``5x5``."""
+
+    rows: int
+    columns: int
+
+    @classmethod
+    def of(cls, text: str) -> Size:
+        """Read ``ROWSxCOLUMNS``; ValueError when the text is none."""
+        return cls(*size(text))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(rows, columns)``."""
+        return self.rows, self.columns
+
+    def __str__(self) -> str:
+        return f"{self.rows}x{self.columns}"
+
+
+class Checked:
+    """Base of a routine's options: all that is wrong with them is one SettingsError when they are made."""
+
+    def __post_init__(self) -> None:
+        found = ((o.name, o.mistake(getattr(self, o.name))) for o in options_of(self))
+        problems = [(name, words.rstrip(".")) for name, words in found if words is not None]
+        problems += self.disagreements({name for name, _ in problems})
+        if problems:
+            raise SettingsError(problems)
+
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """Return what does not fit together: a setting's name, and words; ``wrong`` are named already."""
+        return []
+
+
+# What a procedure says ---------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Outlook:
     """What a procedure will do, as far as that is known before it starts.
@@ -116,9 +198,10 @@ class Listener:
         """Hear what a picture of spots showed: a frame of a mask alignment."""
 
 
-class Procedure(Protocol):
-    """What windows and scripts carry out."""
+class Procedure(ABC):
+    """What commands, windows and scripts carry out; a frozen dataclass of what was asked for."""
 
+    @abstractmethod
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Check everything that can be checked before something moves.
 
@@ -143,7 +226,7 @@ class Procedure(Protocol):
         control: RunControl | None = None,
         listener: Listener | None = None,
     ) -> Outcome:
-        """Do it; the light is off and nothing moves when this returns or raises.
+        """Check it, then do it; the light is off and nothing moves when this returns or raises.
 
         Raises
         ------
@@ -152,6 +235,65 @@ class Procedure(Protocol):
         BenchError, DeviceError
             When it cannot be done or a device fails.
         """
+        self.outlook(bench, folder)
+        control = control or RunControl()
+        with control.procedure(bench):
+            return self.perform(bench, folder, control, listener or Listener())
+
+    @abstractmethod
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        """Do what was checked: ``control`` has the bench, and is asked between steps whether to go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Purpose(Generic[T]):
+    """What a run's frames are for: a record in its folder, of which its result is made, later too.
+
+    Attributes
+    ----------
+    kind : type
+        Dataclass of the record.
+    file, result : str
+        Names in the run's folder: of the record, and of the result once there is one.
+    format : RecordFormat
+    """
+
+    kind: type[T]
+    file: str
+    result: str
+    format: RecordFormat
+
+    def is_of(self, run: Path | str) -> bool:
+        """Whether a run's frames are for this."""
+        return (Path(run) / self.file).is_file()
+
+    def lacks_result(self, run: Path) -> bool:
+        """Whether they are, and the result is not there yet."""
+        return self.is_of(run) and not (run / self.result).exists()
+
+    def read(self, run: Path) -> T:
+        """Read the record of a run; CalibrationError when there is none, or it is damaged."""
+        path = run / self.file
+        if not self.is_of(run):
+            raise CalibrationError(f"{run} is no {self.format.thing}: it has no {self.file}.")
+        try:
+            return self.format.value(self.kind, self.format.read(path), path)
+        except (FileError, SettingsError) as error:
+            raise CalibrationError(f"{path} cannot be read: {error}") from error
+
+    def prepare(
+        self,
+        bench: Bench,
+        plan: Plan,
+        folder: Path | None,
+        record: T,
+        control: RunControl,
+        listener: Listener,
+    ) -> Runner:
+        """Return the runner of a plan whose run has the record; errors as ``prepare``."""
+        runner = prepare(bench, plan, folder, on_progress=listener.frame, control=control)
+        self.format.write(runner.path / self.file, plain(record))
+        return runner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,10 +321,13 @@ class Routine:
         Command lines.
     start : callable, optional
         Gives values for a form to begin with, by name, that follow from the bench.
-    lacks_result : callable, optional
-        Of routines whose runs become results later, too: whether a folder is such a run, without its result.
+    purpose : Purpose, optional
+        Of runs that become results later, too.
     finish : callable, optional
-        Makes the result of such a run.
+        Makes the result of such a complete run: takes it, the bench for retakes (or None), control and
+        listener.
+    watch : callable, optional
+        Makes the runner of such a run that goes on look at its frames as from its beginning.
     file : str
         Where the command line writes the result when nothing else is said, of options with an ``out``.
     command : str
@@ -198,8 +343,9 @@ class Routine:
     needs: tuple[str, ...] = ()
     examples: tuple[str, ...] = ()
     start: Callable[[Bench], Mapping[str, Any]] | None = None
-    lacks_result: Callable[[Path], bool] = lambda _: False
-    finish: Callable[[Run], Outcome] | None = None
+    purpose: Purpose[Any] | None = None
+    finish: Callable[[Run, Bench | None, RunControl, Listener], Outcome] | None = None
+    watch: Callable[[Bench, Runner, Listener], None] | None = None
     file: str = ""
     command: str = "calibrate"
 
@@ -235,10 +381,10 @@ def outlook_of(
     """
     abilities = abilities_of(bench, folder or bench.config.data_folder)
     path = path_of(plan)
-    told = list(reasons)
+    words = list(reasons)
     if path and bench.stage is not None and (homes or not bench.stage.is_homed):
-        told.append("The stage is homed first, every axis to its reference: its way must be free.")
-    return Outlook(tuple(told), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
+        words.append("The stage is homed first, every axis to its reference: its way must be free.")
+    return Outlook(tuple(words), plan, estimate(plan, abilities), abilities.free_bytes, path=path)
 
 
 def path_of(plan: Plan) -> tuple[dict[str, float], ...]:
@@ -256,14 +402,6 @@ def place_of(step: Step) -> dict[str, float]:
     if step.source_um is not None:
         return dict(zip(("x_um", "y_um", "z_um"), step.source_um, strict=True))
     return dict(step.stage)
-
-
-@contextmanager
-def under_control(bench: Bench, control: RunControl | None) -> Iterator[RunControl]:
-    """Give the control of a procedure that is carried out in the block, a new one where nobody has one."""
-    control = control or RunControl()
-    with control.procedure(bench):
-        yield control
 
 
 def home_if_needed(bench: Bench, listener: Listener, plan: Plan | None = None) -> None:

@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Qt, Signal
 
 from gui.jobs import Job, JobRunner
 from instrument.files.errors import FileError
-from instrument.files.volume_source import Plane, VolumeSource
+from instrument.files.volumes import Plane, VolumeSource
 
 Read = Callable[[], Any]
 Done = Callable[[Any], object]

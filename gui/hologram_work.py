@@ -21,23 +21,26 @@ from calibration_routines.display.hologram_photograph import (
     photograph_hologram,
     write_capture,
 )
-from calibration_routines.procedure import under_control
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
 from gui.widgets.entry import existing_path
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
-from instrument.bench.display_setup import bench_display
 from instrument.bench.safety import StepsFailedError
-from instrument.display.hologram_file import HologramFiles
-from instrument.display.hologram_job import HologramResult, compute_and_judge, prepare_target
-from instrument.files.alignment_file import load_alignment
+from instrument.display.hologram import (
+    HologramResult,
+    bench_display,
+    compute_and_judge,
+    load_alignment,
+    prepare_target,
+)
+from instrument.display.hologram_files import HologramFiles
 from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.slm_image import load_slm_correction
-from instrument.reconstruction.result_list import free_result
+from instrument.reconstruction.stored_result import free_result
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
@@ -225,7 +228,7 @@ def photograph(
 
     context.on_cancel(cancel)
     try:
-        with _exposure_kept(bench.camera), under_control(bench, control):
+        with _exposure_kept(bench.camera), control.procedure(bench):
             if computed.order.alignment is not None:
                 bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
             found = photograph_hologram(
@@ -269,11 +272,11 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
     imports = Imports(
         {
             ("instrument.bench.config_file", "load_config"),
-            ("instrument.bench.display_setup", "bench_display"),
-            ("instrument.bench.display_setup", "slm_size"),
-            ("instrument.display.hologram_file", "HologramFiles"),
-            ("instrument.display.hologram_job", "compute_and_judge"),
-            ("instrument.display.hologram_job", "prepare_target"),
+            ("instrument.display.hologram", "bench_display"),
+            ("instrument.display.hologram", "slm_size"),
+            ("instrument.display.hologram_files", "HologramFiles"),
+            ("instrument.display.hologram", "compute_and_judge"),
+            ("instrument.display.hologram", "prepare_target"),
             ("instrument.files.images", "read_image"),
         }
     )
@@ -287,7 +290,7 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
         "display = options.display_of(bench_display(config, slm_size(config), expansion=options.expansion))",
     ]
     if order.alignment is not None:
-        imports.names.add(("instrument.files.alignment_file", "load_alignment"))
+        imports.names.add(("instrument.display.hologram", "load_alignment"))
         lines.append(f"display = load_alignment({expression(order.alignment, imports)}).of(display)")
     lines += [
         f"planes = {expression([(order.picture, order.z_mm), *order.further], imports)}",

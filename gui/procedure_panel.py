@@ -28,8 +28,7 @@ from gui.procedure_run import Ended, ProcedureRun, Situation, script
 from gui.session import BenchSession
 from gui.widgets.run_bar import RunBar
 from instrument.bench.bench import Bench
-from instrument.files.errors import BenchError, SettingsError
-from instrument.files.formatting import count, duration, size
+from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
 """Rest after a key before what was typed is checked."""

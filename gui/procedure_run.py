@@ -11,16 +11,15 @@ from pathlib import Path
 from PySide6.QtCore import QObject, QTimer, Signal
 
 from calibration_routines.display.display_io import SpotLook
-from calibration_routines.errors import RunEndedError
-from calibration_routines.procedure import Listener, Outcome, Procedure, place_of
-from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
+from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
 from gui.jobs import Job, JobContext
 from gui.session import BenchSession
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Plan
-from instrument.plan.file import plan_toml
+from instrument.plan.model import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
 from recon.base.declare import Imports, expression

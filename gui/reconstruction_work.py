@@ -15,10 +15,9 @@ from gui.jobs import JobCancelledError, JobContext
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
 from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share
-from instrument.reconstruction.result_file import Outputs, write_reconstruction
-from instrument.reconstruction.volume_file import write_volume
+from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
 from recon.base.declare import Imports, expression
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 _INTERVAL_S = 0.5
 """What there is so far is shown this often, at most."""

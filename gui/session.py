@@ -23,8 +23,8 @@ from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
+from instrument.bench.photograph import LightState, switch_light
 from instrument.live.live_camera import LiveCamera
-from instrument.runs.snapshot import LightState, switch_light
 
 Level = Literal["debug", "info", "warning", "error"]
 

@@ -5,10 +5,10 @@ from recon.errors import InputError
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import Options, ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reconstruct import reconstruct
+from recon.reconstruction.reconstruct import judged, reconstruct
 from recon.reconstruction.result import Grid, Reconstruction
 from recon.reconstruction.selection import choose
-from recon.reconstruction.solve import judged, solve
+from recon.reconstruction.solve import solve
 from recon.types import Calibration, Geometry
 
 __all__ = [

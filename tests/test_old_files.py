@@ -69,6 +69,12 @@ def test_a_run_that_was_cut_off_is_resumed(here: Path, command: Command) -> None
     assert "3 of 3" in command("verify", "run")
 
 
+def test_a_sweep_becomes_its_calibration_by_its_old_record(here: Path, command: Command) -> None:
+    shutil.move(here / "sweep/calibration", here / "before")
+    assert "PSFs good" in command("resume", "sweep")
+    assert "RECALIBRATE" not in command("compare", "before", "sweep/calibration")
+
+
 def test_bench_and_plan_are_read(command: Command) -> None:
     assert "SIMULATED" in command("check", "--bench", "bench.toml")
     assert "2 parts, 3 frames" in command("plan", "show", "plan.toml", "--bench", "bench.toml")

@@ -77,19 +77,22 @@ def test_the_terminal_offers_and_runs_them_and_says_that_they_are_not_judged(pac
 def test_charts_and_maps_offer_them(package: Path) -> None:
     said = run(package, "-c", PROGRAM, "stability", "--list")
     assert "landweber tv" in said
-    assert "colour-groups" in said
+    assert "colour-groups of volumes" in said
+    assert "admm vignetting tv" in said
+    made = run(package, "-c", PROGRAM, "stability", "light-points", "--method", "admm vignetting tv")
+    assert "of 12 cells fail" in made
     lines = (
-        "from recon.evaluation.chart_reconstruction import ChartProblem, run_setting, settings_for",
+        "from recon.evaluation.chart_reconstruction import ChartProblem",
         "from recon.evaluation.scene import make_scene",
         "for family in ('sparse-picture', 'beads'):",
         "    scene = make_scene(family, size=32)",
         "    problem = ChartProblem(scene.measurement, scene.calibration, not scene.spec.is_picture)",
-        "    setting = next(s for s in settings_for(problem)",
+        "    setting = next(s for s in problem.settings()",
         "                   if (s.solver, s.prior, s.binning) == ('landweber', 'colour-groups', 1))",
-        "    points = run_setting(problem, setting, counts=(3, 40)).points",
+        "    points = problem.run(setting, counts=(3, 40)).points",
         "    assert points[1].held_out < points[0].held_out, points",
         "    print(setting.name)",
-        "    assert any(s.model == 'vignetting' for s in settings_for(problem))",
+        "    assert any(s.model == 'vignetting' for s in problem.settings())",
     )
     assert run(package, "-c", "\n".join(lines)).count("landweber convolution colour-groups") == 2
 

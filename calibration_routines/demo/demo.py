@@ -18,17 +18,19 @@ import numpy as np
 
 from calibration_routines.demo.demo_picture import Comparison, Viewer, compare, write_pictures
 from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.optics.photograph import Photograph, expose_scene, photograph
-from calibration_routines.psf.exposure import SweepExposures, expose_sweep
+from calibration_routines.optics.photograph import Photograph, photograph
+from calibration_routines.procedure import Listener
+from calibration_routines.psf.exposure import expose_scene
 from calibration_routines.psf.field_response import FieldResponse, measure_field_response
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
+from calibration_routines.psf.sweep_plan import SweepExposures, expose_sweep
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.runs.finish import CtrlC
-from instrument.runs.runner import RunProgress
+from instrument.runs.runner import RunStatus
 from recon import Reconstruction, reconstruct
 
 FILE = "demo.json"
@@ -222,16 +224,16 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
     """Do everything that needs the bench."""
     if bench.stage is None:
         raise ValueError("The demo's bench has a stage.")
-    sweep = settings.sweep
+    sweep = settings.sweep.points()
     with stage("home the stage"):
         bench.stage.home()
     with stage("place the point source"):
-        bench.place_source(0.0, 0.0, sweep.z_um[0])
+        bench.place_source(*sweep.points_um[0])
     with stage("expose without saturating"):
         exposures = expose_sweep(bench, sweep)
     audience.on_exposures(bench, settings, exposures)
     with stage("dark frames and axial sweep") as advance:
-        done = calibrate_sweep(bench, sweep, place, exposures=exposures, on_progress=_reporting(advance))
+        done = calibrate_sweep(bench, sweep, place, exposures=exposures, listener=_Frames(advance))
     audience.on_sweep(done)
     with stage("response over the field") as advance:
         height, width = settings.scene_size_um
@@ -241,7 +243,7 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             settings.scene_z_um,
             exposures.exposures_ms[settings.scene_plane],
             place,
-            on_progress=_reporting(advance),
+            listener=_Frames(advance),
         )
     with stage("photograph the scene") as advance:
         _world(bench).set_scene(settings.scene())
@@ -253,7 +255,7 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             average=settings.average,
             dark_frames=settings.average,
             binning=settings.binning,
-            on_progress=_reporting(advance),
+            listener=_Frames(advance),
         )
     return Measured(done, response, photo, bench.label)
 
@@ -265,8 +267,12 @@ def _warm_up() -> None:
     reconstruct(psf + 1.0, psf, iterations=2)
 
 
-def _reporting(advance: Advance) -> RunProgress:
-    return lambda status: advance(status.done, status.total)
+class _Frames(Listener):
+    def __init__(self, advance: Advance) -> None:
+        self._advance = advance
+
+    def frame(self, status: RunStatus) -> None:
+        self._advance(status.done, status.total)
 
 
 def _world(bench: Bench) -> SimulatedWorld:

@@ -19,7 +19,7 @@ from instrument.files.figures import Convergence, Panel, Summary, save_figure, s
 from instrument.files.images import write_image
 from recon import Reconstruction
 from recon.base.metrics import psnr, scale_to, ssim
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 if TYPE_CHECKING:
     from calibration_routines.demo.demo import Measured

@@ -22,7 +22,7 @@ from instrument.files.atomic import check_writable
 from instrument.files.errors import BenchError, FileError
 from instrument.files.slm_image import SlmCorrection, phase_levels
 from instrument.reconstruction.preparation import darkest_block
-from instrument.runs.folder import dated_name, free_name
+from instrument.runs.writer import dated_name, free_name
 from recon.holography import Display
 from recon.holography.camera_map import CameraMap, register_camera
 from recon.holography.pose import Pose

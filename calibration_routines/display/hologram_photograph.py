@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import Alignment
+from instrument.display.hologram import Alignment, bench_display
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
 from recon.base.declare import option

@@ -45,10 +45,9 @@ from calibration_routines.display.mask_search import (
     search_pose,
 )
 from calibration_routines.display.mask_stage import MaskStage, PlacementCost
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, home_if_needed, under_control
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
 from instrument.bench.bench import Bench
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import Alignment, save_alignment
+from instrument.display.hologram import Alignment, bench_display, save_alignment
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
@@ -251,7 +250,7 @@ def _place(
 
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class AlignmentProcedure:
+class AlignmentProcedure(Procedure):
     """Find the scattering mask by spots, move it to its place, keep what is left."""
 
     settings: AlignmentSettings = field(default_factory=AlignmentSettings)
@@ -259,7 +258,8 @@ class AlignmentProcedure:
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
         slm = require_slm(bench)
-        self._refuse_existing()
+        for file in (self.settings.out, self.settings.out and self.settings.out.with_suffix(".png")):
+            refuse_existing(file, overwrite=self.settings.overwrite)
         if self.settings.slm_calibration is not None:
             load_slm_correction(self.settings.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
@@ -273,39 +273,28 @@ class AlignmentProcedure:
             )
         )
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Align, and save the alignment with its picture."""
-        heard, slm, settings = listener or Listener(), require_slm(bench), self.settings
-        self._refuse_existing()
-        out = writable(bench, folder, self.settings.out, "alignment")
-        correction = (
-            load_slm_correction(self.settings.slm_calibration) if self.settings.slm_calibration else None
-        )
+        slm, settings = require_slm(bench), self.settings
+        out = writable(bench, folder, settings.out, "alignment")
+        correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
         io = DisplayBench(bench, bench.config.display.slm_binning, correction)
-        with under_control(bench, control) as control:
-            if settings.moves:
-                home_if_needed(bench, heard)
-            heard.step("aligning the mask")
+        if settings.moves:
+            home_if_needed(bench, listener)
+        listener.step("aligning the mask")
 
-            def tell(words: str, frames: int) -> None:
-                control.check()
-                heard.said(words)
-                heard.share(frames, settings.max_frames, at_most=True)
+        def on_progress(words: str, frames: int) -> None:
+            control.check()
+            listener.said(words)
+            listener.share(frames, settings.max_frames, at_most=True)
 
-            report = MaskAlignment(io, display, settings, progress=tell, on_look=heard.look).run()
-            alignment = _alignment(report, bench, display.mask.shape)
-            bench.safe_state()
+        report = MaskAlignment(io, display, settings, progress=on_progress, on_look=listener.look).run()
+        alignment = _alignment(report, bench, display.mask.shape)
+        bench.safe_state()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
-        from instrument.display.figures import (
+        from instrument.display.hologram_files import (
             write_alignment_figure,  # matplotlib, only where it is drawn
         )
 
@@ -325,11 +314,6 @@ class AlignmentProcedure:
             files=(figure,),
             result=report,
         )
-
-    def _refuse_existing(self) -> None:
-        if self.settings.out is not None:
-            refuse_existing(self.settings.out, overwrite=self.settings.overwrite)
-            refuse_existing(self.settings.out.with_suffix(".png"), overwrite=self.settings.overwrite)
 
 
 def alignment_lines(report: AlignmentReport, *, simulated: bool) -> list[str]:

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, SpotCamera, SpotLook
-from calibration_routines.options import Size, problems_of
-from instrument.files.errors import BenchError, SettingsError
+from calibration_routines.procedure import Checked, Size
+from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option
 from recon.holography import Display
 from recon.holography.pose import NAMES, Pose
@@ -36,7 +36,7 @@ class AlignmentFailedError(BenchError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignmentSettings:
+class AlignmentSettings(Checked):
     """How far and how carefully to search."""
 
     reach: float = option(72.0, unit="mask px", above=0, help="Largest shift to look for, mask pixels.")
@@ -90,10 +90,6 @@ class AlignmentSettings:
         default_words=f"{ALIGNMENT_FILE}; in the window dated, beside the runs",
     )
     overwrite: bool = option(False, flags=("--force",), help="Overwrite files that exist.")
-
-    def __post_init__(self) -> None:
-        if problems := problems_of(self):
-            raise SettingsError(problems)
 
     @property
     def last_frames(self) -> int:

@@ -18,12 +18,10 @@ from calibration_routines.display.display_io import (
     require_slm,
     writable,
 )
-from calibration_routines.options import problems_of
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
+from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
 from instrument.bench.bench import Bench
-from instrument.bench.display_setup import bench_display
-from instrument.files.alignment_file import load_alignment
-from instrument.files.errors import BenchError, SettingsError
+from instrument.display.hologram import bench_display, load_alignment
+from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
 from recon.base.declare import option
@@ -169,7 +167,7 @@ def _exposure_ms(io: DisplayBench) -> float:
 
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class SlmProcedure:
+class SlmProcedure(Checked, Procedure):
     """Measure the SLM's phase against its grey levels and, with an alignment, its flatness."""
 
     levels: int = option(33, least=8, most=256, label="Grey levels", help="Grey levels to measure.")
@@ -189,10 +187,6 @@ class SlmProcedure:
     )
     overwrite: bool = option(False, flags=("--force",), help="Overwrite a file that exists.")
 
-    def __post_init__(self) -> None:
-        if problems := problems_of(self):
-            raise SettingsError(problems)
-
     @property
     def frames(self) -> int:
         """Frames it takes at most."""
@@ -206,34 +200,24 @@ class SlmProcedure:
             load_alignment(self.alignment)
         return Outlook((f"{self.levels} grey levels, {self.frames} frames at most",))
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Measure, and save what ``align mask`` and ``show`` take."""
-        heard, slm = listener or Listener(), require_slm(bench)
-        refuse_existing(self.out, overwrite=self.overwrite)
-        out = writable(bench, folder, self.out, "slm calibration")
+        slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
         io = DisplayBench(bench, bench.config.display.slm_binning)
-        with under_control(bench, control) as control:
-            heard.step("measuring the look-up table")
 
-            def tell(_words: str, _n: int) -> None:
-                control.check()
-                heard.share(io.frames, self.frames)
+        def on_frame(_words: str, _n: int) -> None:
+            control.check()
+            listener.share(io.frames, self.frames)
 
-            found = measure_look_up_table(io, n_levels=self.levels, progress=tell)
-            if place is not None:
-                heard.step("measuring flatness")
-                bring_mask(bench, place.stage_position)
-                display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-                found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=tell)
-            bench.safe_state()
+        listener.step("measuring the look-up table")
+        found = measure_look_up_table(io, n_levels=self.levels, progress=on_frame)
+        if place is not None:
+            listener.step("measuring flatness")
+            bring_mask(bench, place.stage_position)
+            display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
+            found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=on_frame)
+        bench.safe_state()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)
         return Outcome(

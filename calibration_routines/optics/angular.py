@@ -8,61 +8,56 @@ solid angle seen from the side and the source's own directivity. What remains is
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, completed
 from calibration_routines.optics.angular_response import (
     EMISSIONS,
-    AngularResponse,
     Emission,
     analyse_angular,
     response_figure,
     response_lines,
     save_response,
 )
-from calibration_routines.options import MM, problems_of
 from calibration_routines.procedure import (
+    MM,
+    Checked,
     Listener,
     Outcome,
     Outlook,
+    Procedure,
+    Purpose,
     Routine,
+    completed,
     home_if_needed,
     outlook_of,
-    under_control,
 )
 from calibration_routines.psf.analysis import DarkModel, dark_model, drift_of, light_of
-from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift
 from calibration_routines.psf.sweep_options import PointSweep
-from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, sweep_plan
+from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, expose_sweep, sweep_plan
 from instrument.bench.bench import Bench
-from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, SettingsError
 from instrument.files.figures import save_figure
+from instrument.files.record import RecordFormat
 from instrument.plan import Plan
-from instrument.runs.acquire import prepare
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import RunProgress
 from recon.base.declare import RARE, option
+from recon.types import Geometry
 
 MOST_STEPS = 300
 """More angles to one side of an axis are a mistake."""
-RESPONSE_FILE = "angular_response.json"
-ANGULAR_FILE = "angular.json"
-"""In the run's folder: what its frames are for."""
 _REACH_MARGIN = 0.98  # of the stage's travel
 
 
 @dataclass(frozen=True)
-class AngularSweep:
+class AngularSweep(Checked):
     """What is measured."""
 
     z_um: float | None = option(
@@ -93,19 +88,17 @@ class AngularSweep:
     average: int = option(4, least=1, label="Frames a place", help="Frames a place, averaged.")
     dark_frames: int = option(4, least=1, help="Dark frames, at two exposures each.", group=RARE)
 
-    def __post_init__(self) -> None:
-        problems = problems_of(self)
-        if not problems and self.step_deg > self.largest_deg:
-            words = f"0 < step <= largest angle, not {self.step_deg:g} and {self.largest_deg:g}"
-            problems.append(("step_deg", words))
-        elif not problems and self.largest_deg / self.step_deg > MOST_STEPS:
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """As :meth:`Checked.disagreements`."""
+        if wrong or self.step_deg <= self.largest_deg <= MOST_STEPS * self.step_deg:
+            return []
+        words = f"0 < step <= largest angle, not {self.step_deg:g} and {self.largest_deg:g}"
+        if self.step_deg <= self.largest_deg:
             words = (
                 f"steps of {self.step_deg:g} degrees up to {self.largest_deg:g} are more than {MOST_STEPS}: "
                 "choose larger steps"
             )
-            problems.append(("step_deg", words))
-        if problems:
-            raise SettingsError(problems)
+        return [("step_deg", words)]
 
     def planned(self, bench: Bench) -> AngularSweep:
         """Return the sweep with its distance filled in."""
@@ -202,109 +195,72 @@ def _reach(bench: Bench) -> tuple[float, tuple[float, float]]:
     return min(reach), (low, high)
 
 
-def measure_angular_response(
-    bench: Bench,
-    sweep: AngularSweep,
-    folder: Path | str | None = None,
-    *,
-    on_progress: RunProgress | None = None,
-    on_exposures: Callable[[SweepExposures], None] | None = None,
-    control: RunControl | None = None,
-) -> tuple[AngularResponse, Path]:
-    """Move the source, measure the response, save it in the run's folder as ``angular_response.json``.
+@dataclass(frozen=True, slots=True)
+class AngularRecord:
+    """What the response is computed with besides the frames."""
 
-    Parameters
-    ----------
-    bench : Bench
-        Open, its stage homed.
-    sweep : AngularSweep
-    folder : path, optional
-        Where the run's folder is made; the bench's data folder by default.
-    on_progress, on_exposures : callable, optional
-    control : RunControl, optional
-        To pause, abort or stop the run from another thread.
+    sweep: AngularSweep
+    geometry: Geometry
+    bench: str
+    simulated: bool
 
-    Returns
-    -------
-    response : AngularResponse
-    file : Path
+
+ANGULAR = Purpose(
+    AngularRecord,
+    "angular.json",
+    "angular_response.json",
+    RecordFormat(
+        "diffuserbench angular sweep",
+        "run of calibrate angular",
+        restore="The frames beside it are not touched.",
+        unnamed_before=True,
+    ),
+)
+
+
+def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
+    """Compute the response from a complete run, and save it with its picture in its folder.
 
     Raises
     ------
-    PlanError
-        When a place is out of reach; nothing moved.
     CalibrationError
-        When no exposure is usable, the run ended early, or too little can be seen.
+        When too little can be seen.
     """
-    where = Path(folder) if folder is not None else None
-    sweep = sweep.planned(bench)
-    points = sweep.points()
-    geometry = bench.geometry
+    listener.step("analysing")
+    record = ANGULAR.read(run.path)
+    points, dark = record.sweep.points(), dark_model(run)
+    pitch_um, distance_mm = _needed(record.geometry)
+    drift = drift_of(run, points, dark)
+    response = analyse_angular(
+        _images(run, points, dark, drift),
+        points.points_um,
+        pitch_um=pitch_um,
+        distance_um=1e3 * distance_mm,
+        emission=record.sweep.emission,
+        findings=() if drift is None else drift.findings,
+        bench=record.bench,
+        simulated=record.simulated,
+    )
+    file = save_response(response, run.path / ANGULAR.result)
+    picture = file.with_suffix(".png")
+    save_figure(response_figure(response), picture)
+    return Outcome(
+        verdict=tuple(response_lines(response)),
+        good=not response.findings,
+        runs=(run.path,),
+        files=(file, picture),
+        result=response,
+    )
+
+
+def _needed(geometry: Geometry) -> tuple[float, float]:
+    """Return pixel pitch and the diffuser's distance; BenchError where they are not known."""
     if geometry.diffuser_distance_mm is None or geometry.pixel_pitch_um is None:
         raise BenchError(
             "The angles on the sensor follow from diffuser_distance_mm and pixel_pitch_um: give them in "
             "[geometry] of bench.toml."
         )
-    check_angular(bench, sweep, where)
-    exposures = expose_sweep(bench, points, control=control)
-    if on_exposures is not None:
-        on_exposures(exposures)
-    plan = sweep_plan(points, exposures.exposures_ms)
-    runner = prepare(bench, plan, where, on_progress=on_progress, control=control)
-    record = {
-        "sweep": asdict(sweep),
-        "geometry": asdict(geometry),
-        "bench": bench.label,
-        "simulated": bool(bench.simulated_kinds),
-    }
-    write_text(runner.path / ANGULAR_FILE, json.dumps(record, indent=1) + "\n")
-    return finish_angular(runner.execute())
-
-
-def finish_angular(run: Run) -> tuple[AngularResponse, Path]:
-    """Compute the response from a complete run, e.g. one that was resumed, and save it in its folder.
-
-    Raises
-    ------
-    CalibrationError
-        When the run is none of the angular response's, is not complete, or too little can be seen.
-    """
-    sweep, geometry, bench, simulated = _read_record(run.path)
-    completed(run)
-    points = sweep.points()
-    dark = dark_model(run)
-    drift = drift_of(run, points, dark)
-    images = _images(run, points, dark, drift)
-    response = analyse_angular(
-        images,
-        points.points_um,
-        pitch_um=geometry["pixel_pitch_um"],
-        distance_um=1e3 * geometry["diffuser_distance_mm"],
-        emission=sweep.emission,
-        findings=() if drift is None else drift.findings,
-        bench=bench,
-        simulated=simulated,
-    )
-    return response, save_response(response, run.path / RESPONSE_FILE)
-
-
-def is_angular(run: Path) -> bool:
-    """Whether a run's frames are those of an angular response."""
-    return (run / ANGULAR_FILE).is_file()
-
-
-def _read_record(run: Path) -> tuple[AngularSweep, dict[str, float], str, bool]:
-    path = run / ANGULAR_FILE
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        names = ("pixel_pitch_um", "diffuser_distance_mm")
-        geometry = {name: float(data["geometry"][name]) for name in names}
-        return AngularSweep(**data["sweep"]), geometry, str(data["bench"]), bool(data["simulated"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{path} cannot be read ({error}): the run is none of calibrate angular, or the file was "
-            "changed. The frames beside it are not touched."
-        ) from error
+    return geometry.pixel_pitch_um, geometry.diffuser_distance_mm
 
 
 # Frames to light ---------------------------------------------------------------------------------------
@@ -330,7 +286,7 @@ def _images(
 
 # Procedure ---------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class AngularProcedure:
+class AngularProcedure(Procedure):
     """Measure the sensor's angular response."""
 
     sweep: AngularSweep
@@ -339,6 +295,7 @@ class AngularProcedure:
         """Hold every place against the stage's limits."""
         sweep = self.sweep.planned(bench)
         points = sweep.points()
+        _needed(bench.geometry)
         plan = check_angular(bench, sweep, folder or bench.config.data_folder)
         reason = (
             f"{len(points.points_um)} places at z = {sweep.distance_um / 1e3:.4g} mm, up to "
@@ -348,42 +305,18 @@ class AngularProcedure:
         farthest = "" if given else ", the farthest from which the stage spans the angles"
         return outlook_of(bench, plan, folder, [reason + farthest])
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Home, move the source, and save the response with its picture in the run's folder."""
-        heard, sweep = listener or Listener(), self.sweep.planned(bench)
-        check_angular(bench, sweep, folder)
-        with under_control(bench, control) as control:
-            home_if_needed(bench, heard)
-            heard.step("moving the source")
-            response, file = measure_angular_response(
-                bench,
-                sweep,
-                folder,
-                on_progress=heard.frame,
-                on_exposures=heard.exposures,
-                control=control,
-            )
-        return response_outcome(response, file)
-
-
-def response_outcome(response: AngularResponse, file: Path) -> Outcome:
-    """Draw a response beside its file, and say what it is."""
-    picture = file.with_suffix(".png")
-    save_figure(response_figure(response), picture)
-    return Outcome(
-        verdict=tuple(response_lines(response)),
-        good=not response.findings,
-        runs=(file.parent,),
-        files=(file, picture),
-        result=response,
-    )
+        sweep = self.sweep.planned(bench)
+        points = sweep.points()
+        home_if_needed(bench, listener)
+        listener.step("moving the source")
+        exposures = expose_sweep(bench, points, control=control)
+        listener.exposures(exposures)
+        record = AngularRecord(sweep, bench.geometry, bench.label, bool(bench.simulated_kinds))
+        plan = sweep_plan(points, exposures.exposures_ms)
+        runner = ANGULAR.prepare(bench, plan, folder, record, control, listener)
+        return _finish(completed(runner.execute()), bench, control, listener)
 
 
 ROUTINES = (
@@ -397,8 +330,8 @@ ROUTINES = (
         options=AngularSweep,
         procedure=AngularProcedure,
         needs=("stage",),
-        lacks_result=lambda run: is_angular(run) and not (run / RESPONSE_FILE).exists(),
-        finish=lambda run: response_outcome(*finish_angular(run)),
+        purpose=ANGULAR,
+        finish=_finish,
         examples=(
             "diffuserbench calibrate angular --dry-run",
             "diffuserbench calibrate angular",

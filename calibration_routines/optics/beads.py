@@ -12,23 +12,30 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError
-from calibration_routines.optics.photograph import expose_scene, photograph
-from calibration_routines.options import MM, Size, problems_of
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, under_control
+from calibration_routines.optics.photograph import photograph
+from calibration_routines.procedure import (
+    MM,
+    CalibrationError,
+    Checked,
+    Listener,
+    Outcome,
+    Outlook,
+    Procedure,
+    Routine,
+    Size,
+)
 from calibration_routines.psf.analysis import binned
+from calibration_routines.psf.exposure import expose_scene
 from instrument.bench.bench import Bench
 from instrument.files.calibration_file import save_calibration
-from instrument.files.errors import BenchError, FileError, OperatorNeededError, SettingsError
-from instrument.runs.folder import dated_name, free_name
+from instrument.files.errors import BenchError, FileError, OperatorNeededError
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import RunProgress
+from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import RARE, option
 from recon.blind import BlindResult, BlindSettings, calibrate_from_beads
 from recon.types import Calibration, Geometry
 
 Floats = npt.NDArray[np.float32]
-Ask = Callable[[str], None]
 Progress = Callable[[str, float], object]
 
 BEADS_FOLDER = "calibration-beads"
@@ -53,7 +60,7 @@ _SOLVER = BlindSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeadSlides:
+class BeadSlides(Checked):
     """What to photograph, and how to solve it."""
 
     z_um: float = option(
@@ -116,10 +123,6 @@ class BeadSlides:
     )
     overwrite: bool = option(False, flags=("--force",), help="Replace a calibration that exists.")
 
-    def __post_init__(self) -> None:
-        if problems := problems_of(self):
-            raise SettingsError(problems)
-
     @property
     def solver(self) -> BlindSettings:
         """How the images are solved."""
@@ -169,19 +172,9 @@ class BeadCalibration:
 
 
 def photograph_slides(
-    bench: Bench,
-    slides: BeadSlides,
-    folder: Path | str | None = None,
-    *,
-    ask: Ask | None = None,
-    progress: Progress | None = None,
-    on_progress: RunProgress | None = None,
-    control: RunControl | None = None,
+    bench: Bench, slides: BeadSlides, folder: Path | None, control: RunControl, listener: Listener
 ) -> Floats:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
-
-    ``progress`` is called with words and the share done before each photograph, ``on_progress`` with the
-    run's status after each of its frames; ``control`` pauses, aborts or stops from another thread.
 
     Returns
     -------
@@ -196,6 +189,7 @@ def photograph_slides(
         When an image saturates.
     """
     changer = next((part for part in bench.shared.values() if isinstance(part, SlideChanger)), None)
+    ask = bench.ask
     if changer is None and ask is None:
         raise OperatorNeededError(
             "The bead slide must be moved by hand between photographs, and there is no terminal to ask at. "
@@ -204,10 +198,7 @@ def photograph_slides(
     exposure_ms: float | None = None
     images = []
     for number in range(slides.images):
-        if control is not None:
-            control.check()
-        if progress is not None:
-            progress(f"photograph {number + 1}", number / slides.images)
+        control.check()
         if changer is not None:
             changer.change_slide(number)
         elif ask is not None:
@@ -222,8 +213,8 @@ def photograph_slides(
             average=slides.average,
             dark_frames=4,
             binning=slides.binning,
-            on_progress=on_progress,
             control=control,
+            listener=listener,
         )
         if taken.saturated_pixels > 0:
             raise CalibrationError(
@@ -366,7 +357,7 @@ def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:
 
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class BeadProcedure:
+class BeadProcedure(Procedure):
     """Photograph bead slides and recover PSFs from them, without a stage.
 
     The slide is moved in between by the simulated bench, or by the operator, who is asked.
@@ -389,31 +380,19 @@ class BeadProcedure:
             )
         )
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, solve, and save the calibration."""
-        heard = listener or Listener()
-        self.slides.refuse_existing()
         geometry = bench_geometry(bench, self.slides)
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
-        with under_control(bench, control) as control:
-            heard.step("photographing bead slides")
-            taken = photograph_slides(
-                bench, self.slides, folder, ask=bench.ask, on_progress=heard.frame, control=control
-            )
-            heard.step("blind deconvolution")
+        listener.step("photographing bead slides")
+        taken = photograph_slides(bench, self.slides, folder, control, listener)
+        listener.step("blind deconvolution")
 
-            def solving(_words: str, done: float) -> None:
-                control.check()
-                heard.share(done, 1.0)
+        def solving(_words: str, done: float) -> None:
+            control.check()
+            listener.share(done, 1.0)
 
-            solved = calibrate_beads(taken, self.slides, geometry, provenance=facts, progress=solving)
+        solved = calibrate_beads(taken, self.slides, geometry, provenance=facts, progress=solving)
         out = self.slides.out or free_name(folder or bench.config.data_folder, dated_name("bead calibration"))
         return save_beads(solved, self.slides, out)
 

@@ -7,31 +7,39 @@ slope and deflection that tell a diffuser's quality.
 
 from __future__ import annotations
 
-import json
-from dataclasses import MISSING, asdict, dataclass
+from dataclasses import MISSING, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, completed
-from calibration_routines.options import problems_of
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
+from calibration_routines.procedure import (
+    CalibrationError,
+    Checked,
+    Listener,
+    Outcome,
+    Outlook,
+    Procedure,
+    Purpose,
+    Routine,
+    completed,
+    outlook_of,
+)
 from calibration_routines.psf.analysis import dark_model, full_scale, light_of
-from calibration_routines.psf.exposure import AutoExposure, auto_expose, hot_pixels
+from calibration_routines.psf.exposure import expose_light
 from drivers.led_array import LedArray
 from instrument.bench.bench import Bench
-from instrument.files.atomic import whole_file, write_text
-from instrument.files.errors import BenchError, SettingsError
+from instrument.files.atomic import whole_file
+from instrument.files.errors import BenchError
 from instrument.files.figures import save_figure
+from instrument.files.record import RecordFormat, plain
 from instrument.plan import OFF, Light, Part, Plan, check
 from instrument.plan.led_shapes import HalfCircle
-from instrument.runs.acquire import abilities_of, prepare
+from instrument.runs.acquire import abilities_of
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import RunProgress
 from recon.analysis.dpc import SIDES, DpcOptics, deflections_deg, phase_from_halves, slopes_deg
 from recon.base.declare import RARE, option
 
@@ -44,9 +52,7 @@ side as it leaves on the other (docs/decisions/0016-dpc.md)."""
 LEAST_LEDS = 24
 """Inside the objective's aperture: fewer, and slopes show in steps, as single LEDs cross the pupil's edge."""
 BANDS = ("red", "green", "blue")
-RESULT_FILE, HEIGHT_FILE = "dpc.json", "height_um.npy"
-SETUP_FILE = "dpc_setup.json"
-"""In the run's folder: what its frames are for."""
+HEIGHT_FILE = "height_um.npy"
 _TARGET = 0.6  # of full scale: halves differ in brightness where the sample deflects
 _COLOURS = ("#00798c", "#d1495b")
 _EDGE_QUANTILE = 0.999  # the largest deflection, less the outliers that noise makes
@@ -55,7 +61,7 @@ Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class DpcSetup:
+class DpcSetup(Checked):
     """The microscope and the sample."""
 
     objective_na: float = option(
@@ -77,10 +83,6 @@ class DpcSetup:
     band: str = option("green", choices=BANDS, label="LEDs", help="Which LEDs to light.")
     average: int = option(8, least=1, label="Frames a half", help="Frames a half circle, averaged.")
     dark_frames: int = option(8, least=1, help="Dark frames, averaged.", group=RARE)
-
-    def __post_init__(self) -> None:
-        if problems := problems_of(self):
-            raise SettingsError(problems)
 
 
 @dataclass(frozen=True)
@@ -151,84 +153,68 @@ def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
     )
 
 
-def measure_diffuser(
-    bench: Bench,
-    setup: DpcSetup,
-    folder: Path | str | None = None,
-    *,
-    on_progress: RunProgress | None = None,
-    control: RunControl | None = None,
-) -> tuple[DiffuserSurface, Path]:
-    """Photograph the four halves and compute the surface; saved in the run's folder.
+@dataclass(frozen=True, slots=True)
+class DpcRecord:
+    """What the surface is computed with besides the frames."""
 
-    Returns
-    -------
-    surface : DiffuserSurface
-    file : Path
-        ``dpc.json``; ``height_um.npy`` lies beside it.
-
-    Raises
-    ------
-    BenchError
-        When there is no LED array, or it does not suit the objective.
-    CalibrationError
-        When no exposure is usable or the run ended early.
-    """
-    array = _array(bench)
-    where = Path(folder) if folder is not None else None
-    optics = dpc_optics(bench, setup)
-    check(dpc_plan(array, setup, bench.camera.exposure_ms), abilities_of(bench, where))
-    exposure = _expose(bench, array, setup)
-    plan = dpc_plan(array, setup, exposure.exposure_ms)
-    runner = prepare(bench, plan, where, on_progress=on_progress, control=control)
-    record = {
-        "setup": asdict(setup),
-        "optics": asdict(optics),
-        "exposure_ms": exposure.exposure_ms,
-        "bench": bench.label,
-        "simulated": bool(bench.simulated_kinds),
-    }
-    write_text(runner.path / SETUP_FILE, json.dumps(record, indent=1) + "\n")
-    return finish_diffuser(runner.execute())
+    setup: DpcSetup
+    optics: DpcOptics
+    exposure_ms: float
+    bench: str
+    simulated: bool
 
 
-def is_dpc(run: Path) -> bool:
-    """Whether a run's frames are those of a diffuser's surface."""
-    return (run / SETUP_FILE).is_file()
+DPC = Purpose(
+    DpcRecord,
+    "dpc_setup.json",
+    "dpc.json",
+    RecordFormat(
+        "diffuserbench dpc setup",
+        "run of calibrate dpc",
+        restore="The frames beside it are not touched.",
+        unnamed_before=True,
+    ),
+)
+_RESULT = RecordFormat("diffuserbench dpc", "diffuser's surface")
 
 
-def finish_diffuser(run: Run) -> tuple[DiffuserSurface, Path]:
-    """Compute the surface from a complete run, e.g. one that was resumed, and save it in its folder.
+def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
+    """Compute the surface from a complete run, and save it with its picture in its folder.
 
     Raises
     ------
     CalibrationError
-        When the run is none of a diffuser's surface, is not complete, or saturates.
+        When a half saturates.
     """
-    path = run.path / SETUP_FILE
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        setup, optics = DpcSetup(**record["setup"]), DpcOptics(**record["optics"])
-        exposure_ms, bench = float(record["exposure_ms"]), str(record["bench"])
-        simulated = bool(record["simulated"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(
-            f"{path} cannot be read ({error}): the run is none of calibrate dpc, or the file was changed. "
-            "The frames beside it are not touched."
-        ) from error
-    phase = phase_from_halves(_halves(completed(run)), optics)
-    height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (setup.index - 1)))).astype(np.float32)
+    listener.step("analysing")
+    record = DPC.read(run.path)
+    optics, index = record.optics, record.setup.index
+    phase = phase_from_halves(_halves(run), optics)
+    height = (phase * (1e-3 * optics.wavelength_nm / (2 * np.pi * (index - 1)))).astype(np.float32)
     slope = slopes_deg(height, optics.pitch_um)
+    deflection = deflections_deg(slope, index)
     surface = DiffuserSurface(
-        height,
-        phase,
-        optics.pitch_um,
-        slope,
-        deflections_deg(slope, setup.index),
-        bench,
-        simulated,
+        height, phase, optics.pitch_um, slope, deflection, record.bench, record.simulated
     )
-    return surface, _save(surface, setup, optics, exposure_ms, run)
+    with whole_file(run.path / HEIGHT_FILE) as heights:
+        np.save(heights, surface.height_um)
+    file, picture = run.path / DPC.result, (run.path / DPC.result).with_suffix(".png")
+    facts = {
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        **plain(record),
+        "height_file": HEIGHT_FILE,
+        "pitch_um": surface.pitch_um,
+        "figures": surface.figures,
+    }
+    _RESULT.write(file, facts)
+    save_figure(surface_figure(surface), picture)
+    return Outcome(
+        verdict=(surface_line(surface),),
+        good=True,
+        runs=(run.path,),
+        files=(file, picture),
+        result=surface,
+    )
 
 
 def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
@@ -279,22 +265,6 @@ def _rgb(setup: DpcSetup) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _expose(bench: Bench, array: LedArray, setup: DpcSetup) -> AutoExposure:
-    """Find an exposure that suits all halves: for the first, with room for the others."""
-    try:
-        bench.scene_off()
-        array.off()
-        dark = bench.camera.snap()
-        first = HalfCircle(SIDES[0], _illumination_na(array, setup))
-        array.set_pattern(first.on(array, _rgb(setup)))
-        found = auto_expose(bench.camera, target=_TARGET, hot=hot_pixels(dark.image, dark.full_scale))
-    finally:
-        array.off()
-    if not found.usable:
-        raise CalibrationError(found.message)
-    return found
-
-
 def _halves(run: Run) -> dict[str, Image]:
     dark = dark_model(run)
     halves = {}
@@ -305,39 +275,18 @@ def _halves(run: Run) -> dict[str, Image]:
     return halves
 
 
-def _save(surface: DiffuserSurface, setup: DpcSetup, optics: DpcOptics, exposure_ms: float, run: Run) -> Path:
-    with whole_file(run.path / HEIGHT_FILE) as file:
-        np.save(file, surface.height_um)
-    data: dict[str, Any] = {
-        "format": "diffuserbench dpc",
-        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "bench": surface.bench,
-        "simulated": surface.simulated,
-        "setup": asdict(setup),
-        "optics": asdict(optics),
-        "exposure_ms": exposure_ms,
-        "height_file": HEIGHT_FILE,
-        "pitch_um": surface.pitch_um,
-        "figures": surface.figures,
-    }
-    write_text(run.path / RESULT_FILE, json.dumps(data, indent=1) + "\n")
-    return run.path / RESULT_FILE
-
-
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class DpcProcedure:
+class DpcProcedure(Procedure):
     """Measure the diffuser's surface by differential phase contrast."""
 
     setup: DpcSetup
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Hold the half circles against the LED array and the objective."""
-        if bench.led_array is None:
-            raise BenchError(f"{bench.label} has no [led_array].")
         folder = folder or bench.config.data_folder
         optics = dpc_optics(bench, self.setup)
-        plan = dpc_plan(bench.led_array, self.setup, bench.camera.exposure_ms)
+        plan = dpc_plan(_array(bench), self.setup, bench.camera.exposure_ms)
         check(plan, abilities_of(bench, folder))
         lit = len(plan.parts[1].light[0].leds)
         reason = (
@@ -347,35 +296,20 @@ class DpcProcedure:
         )
         return outlook_of(bench, plan, folder, [reason])
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph the halves and save the surface with its picture in the run's folder."""
-        heard = listener or Listener()
-        with under_control(bench, control) as control:
-            heard.step("half circles")
-            surface, file = measure_diffuser(
-                bench, self.setup, folder, on_progress=heard.frame, control=control
-            )
-        return surface_outcome(surface, file)
-
-
-def surface_outcome(surface: DiffuserSurface, file: Path) -> Outcome:
-    """Draw a surface beside its file, and say what it is."""
-    picture = file.with_suffix(".png")
-    save_figure(surface_figure(surface), picture)
-    return Outcome(
-        verdict=(surface_line(surface),),
-        good=True,
-        runs=(file.parent,),
-        files=(file, picture),
-        result=surface,
-    )
+        listener.step("half circles")
+        array, setup = _array(bench), self.setup
+        first = HalfCircle(SIDES[0], _illumination_na(array, setup)).on(array, _rgb(setup))
+        try:
+            found = expose_light(bench, lambda: array.set_pattern(first), target=_TARGET, dimmest=_TARGET)
+        finally:
+            array.off()
+        optics, exposure_ms = dpc_optics(bench, setup), found.exposure_ms
+        record = DpcRecord(setup, optics, exposure_ms, bench.label, bool(bench.simulated_kinds))
+        plan = dpc_plan(array, setup, exposure_ms)
+        runner = DPC.prepare(bench, plan, folder, record, control, listener)
+        return _finish(completed(runner.execute()), bench, control, listener)
 
 
 def surface_line(surface: DiffuserSurface) -> str:
@@ -439,8 +373,8 @@ ROUTINES = (
         options=DpcSetup,
         procedure=DpcProcedure,
         needs=("led_array",),
-        lacks_result=lambda run: is_dpc(run) and not (run / RESULT_FILE).exists(),
-        finish=lambda run: surface_outcome(*finish_diffuser(run)),
+        purpose=DPC,
+        finish=_finish,
         examples=(
             "diffuserbench new microscope.toml --led-microscope",
             "diffuserbench calibrate dpc --bench microscope.toml --na 0.1 --magnification 4",

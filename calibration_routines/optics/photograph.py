@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, completed
-from calibration_routines.options import problems_of
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
+from calibration_routines.procedure import (
+    Checked,
+    Listener,
+    Outcome,
+    Outlook,
+    Procedure,
+    Routine,
+    completed,
+    outlook_of,
+)
 from calibration_routines.psf.analysis import channels_first, dark_model, full_scale, replace_hot
-from calibration_routines.psf.exposure import AutoExposure, ExposureOutcome, auto_expose, hot_pixels
+from calibration_routines.psf.exposure import expose_scene
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.files.images import write_image
@@ -20,7 +27,6 @@ from instrument.plan import OFF, Part, Plan, check
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run
 from instrument.runs.run_control import RunControl
-from instrument.runs.runner import RunProgress
 from recon.base.blocks import block_mean
 from recon.base.declare import RARE, option
 
@@ -51,28 +57,6 @@ class Photograph:
     run: Run
 
 
-def expose_scene(bench: Bench, *, target: float = 0.7) -> AutoExposure:
-    """Auto-expose the lit scene as a PSF is: 99.9th percentile to ``target``, nothing saturated; ends dark.
-
-    Raises
-    ------
-    CalibrationError
-        When the scene saturates at the shortest exposure or flickers. A scene too dark for ``target`` is
-        photographed at the longest exposure.
-    """
-    bench.source_off()
-    bench.scene_off()
-    dark = bench.camera.snap()
-    bench.scene_on()
-    try:
-        found = auto_expose(bench.camera, target=target, hot=hot_pixels(dark.image, dark.full_scale))
-    finally:
-        bench.scene_off()
-    if found.outcome in (ExposureOutcome.TOO_BRIGHT, ExposureOutcome.UNSTEADY):
-        raise CalibrationError(found.message)
-    return found
-
-
 def photograph_plan(exposure_ms: float, average: int, dark_frames: int) -> Plan:
     """Return the plan of a photograph: the lit scene, then dark frames."""
     return Plan(
@@ -92,8 +76,8 @@ def photograph(
     average: int = 1,
     dark_frames: int = 4,
     binning: int = 1,
-    on_progress: RunProgress | None = None,
     control: RunControl | None = None,
+    listener: Listener | None = None,
 ) -> Photograph:
     """Photograph the scene into a run; ends with everything dark.
 
@@ -102,16 +86,16 @@ def photograph(
     bench : Bench
         Open.
     exposure_ms : float, optional
-        By default what :func:`expose_scene` finds.
+        By default what :func:`~calibration_routines.expose_scene` finds.
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     average, dark_frames : int
         Frames with and without light; all are stored.
     binning : int
         Software binning, on top of the camera's; the same as the calibration's.
-    on_progress : callable, optional
     control : RunControl, optional
         To pause, abort or stop the run from another thread.
+    listener : Listener, optional
 
     Raises
     ------
@@ -120,10 +104,14 @@ def photograph(
     CalibrationError
         When the run was ended before its last frame.
     """
+    control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:
+        listener.step("finding the exposure")
         exposure_ms = expose_scene(bench).exposure_ms
+        control.check()
+    listener.step("photographing")
     plan = photograph_plan(exposure_ms, average, dark_frames)
-    run = completed(acquire(bench, plan, folder, on_progress=on_progress, control=control))
+    run = completed(acquire(bench, plan, folder, on_progress=listener.frame, control=control))
     frames = run.images("scene")
     dark = dark_model(run)
     light = frames.mean(axis=0, dtype=np.float32) - dark.at(run.metadata(0).exposure_ms)
@@ -140,7 +128,7 @@ def photograph(
 
 # Procedure -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class PhotographProcedure:
+class PhotographProcedure(Checked, Procedure):
     """Photograph the lit scene for a reconstruction: exposure, frames, dark frames taken off."""
 
     exposure_ms: float | None = option(
@@ -151,10 +139,6 @@ class PhotographProcedure:
     binning: int = option(
         1, least=1, help="In software, on top of the camera's; the same as the calibration's.", group=RARE
     )
-
-    def __post_init__(self) -> None:
-        if problems := problems_of(self):
-            raise SettingsError(problems)
 
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Hold exposure, frames and disk against the bench."""
@@ -169,33 +153,18 @@ class PhotographProcedure:
         found = "as given" if self.exposure_ms is not None else "found at the start"
         return outlook_of(bench, plan, folder, [f"The exposure is {found}."])
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, and write the picture that ``reconstruct`` takes into the run's folder."""
-        heard = listener or Listener()
-        with under_control(bench, control) as control:
-            exposure_ms = self.exposure_ms
-            if exposure_ms is None:
-                heard.step("finding the exposure")
-                exposure_ms = expose_scene(bench).exposure_ms
-                control.check()
-            heard.step("photographing")
-            taken = photograph(
-                bench,
-                exposure_ms,
-                folder,
-                average=self.average,
-                dark_frames=self.dark_frames,
-                binning=self.binning,
-                on_progress=heard.frame,
-                control=control,
-            )
+        taken = photograph(
+            bench,
+            self.exposure_ms,
+            folder,
+            average=self.average,
+            dark_frames=self.dark_frames,
+            binning=self.binning,
+            control=control,
+            listener=listener,
+        )
         file = taken.run.path / PHOTOGRAPH_FILE
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "binning": self.binning}
         write_image(file, taken.measurement, facts | {"exposure_ms": taken.exposure_ms, "dark": "taken off"})

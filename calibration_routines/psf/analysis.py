@@ -18,7 +18,7 @@ from calibration_routines.psf.psf_quality import (
     temporal_noise,
 )
 from calibration_routines.psf.stage_fit import Drift, StageFit, judge_drift, judge_points
-from calibration_routines.psf.sweep_options import Sweep
+from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, REFERENCE
 from instrument.runs.run import Run
 from recon.base.blocks import block_mean
@@ -302,7 +302,7 @@ def light_of(run: Run, indices: Sequence[int], dark: DarkModel) -> Float:
     return np.asarray(light.mean(axis=-1) if light.ndim == 3 else light, np.float32)
 
 
-def drift_of(run: Run, sweep: Sweep, dark: DarkModel) -> Drift | None:
+def drift_of(run: Run, sweep: PointSweep, dark: DarkModel) -> Drift | None:
     """Return how the source changed between its visits to the reference; None for a sweep without any."""
     visits: dict[int, list[int]] = {}
     for step in run.steps(REFERENCE):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.errors import CalibrationError, completed
+from calibration_routines.procedure import CalibrationError, Listener, completed
 from calibration_routines.psf.analysis import dark_model, light_of
 from calibration_routines.psf.psf_quality import MAX_CLIPPED, measure_psf
 from calibration_routines.psf.sweep_plan import DARK, PSF
@@ -22,7 +22,6 @@ from instrument.bench.bench import Bench
 from instrument.plan import OFF, SOURCE, Part, Plan, SourcePoints
 from instrument.runs.acquire import acquire
 from instrument.runs.run import Run
-from instrument.runs.runner import RunProgress
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +116,7 @@ def measure_field_response(
     folder: Path | str | None = None,
     *,
     average: int = 2,
-    on_progress: RunProgress | None = None,
+    listener: Listener | None = None,
 ) -> FieldResponse:
     """Move the source to the middle of the field's four edges and to its centre, and fit the light received.
 
@@ -134,7 +133,7 @@ def measure_field_response(
         Where the run's folder is made; the bench's data folder by default.
     average : int
         Frames a place.
-    on_progress : callable, optional
+    listener : Listener, optional
 
     Raises
     ------
@@ -165,7 +164,7 @@ def measure_field_response(
             ),
         ),
     )
-    run = completed(acquire(bench, plan, folder, on_progress=on_progress))
+    run = completed(acquire(bench, plan, folder, on_progress=None if listener is None else listener.frame))
     return fit_field_response(places, [_light(run, place) for place in places])
 
 

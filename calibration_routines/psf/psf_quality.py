@@ -12,8 +12,7 @@ Findings are sentences: what was found, what was expected, what to do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -109,13 +108,6 @@ class PsfQuality:
     def source_um(self) -> tuple[float, float, float]:
         """Where the stage said the source was."""
         return self.x_um, self.y_um, self.z_um
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures as JSON-compatible values."""
-        figures = asdict(self)
-        figures["centroid_px"] = list(self.centroid_px)
-        figures["findings"] = list(self.findings)
-        return figures
 
 
 def measure_psf(

@@ -14,8 +14,7 @@ place is only reported, as it may be the source's, the camera's or the stage's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -79,12 +78,6 @@ class Drift:
         After the last visit it stays what it was then; 1 where the drift is not correctable.
         """
         return float(np.interp(seconds, self.seconds, self.brightness)) if self.is_correctable else 1.0
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures as JSON-compatible values."""
-        return {name: list(values) for name, values in asdict(self).items()} | {
-            "corrected": self.is_correctable
-        }
 
 
 def judge_drift(
@@ -199,10 +192,6 @@ class StageFit:
     residual_median_px: float
     residual_95_px: float
     findings: tuple[str, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures as JSON-compatible values."""
-        return asdict(self) | {"findings": list(self.findings)}
 
 
 def judge_points(

@@ -7,8 +7,9 @@ or without the bench.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -17,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration_routines.errors import completed
+from calibration_routines.procedure import CalibrationError, Listener, completed
 from calibration_routines.psf.analysis import (
-    DarkModel,
     PlaneFrames,
     SweepAnalysis,
     analyse_sweep,
@@ -27,53 +27,41 @@ from calibration_routines.psf.analysis import (
     dark_model,
     drift_of,
     full_scale,
+    light_of,
     optical_binning,
-    replace_hot,
 )
-from calibration_routines.psf.exposure import SweepExposures, expose_sweep
 from calibration_routines.psf.psf_quality import PsfQuality, place_of
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import Drift, StageFit
-from calibration_routines.psf.sweep_options import Sweep
+from calibration_routines.psf.sweep_options import AskedSweep
 from calibration_routines.psf.sweep_plan import (
     PSF,
     REFERENCE,
-    axis_point,
+    SWEEP,
+    SweepExposures,
+    SweepRecord,
     check_image_settings,
     check_sweep,
-    depths_um,
+    expose_sweep,
+    plan_lines,
     retake_plan,
     sweep_plan,
 )
-from calibration_routines.psf.sweep_record import (
-    SWEEP_FILE,
-    SweepRecord,
-    add_retakes,
-    read_record,
-    read_retakes,
-    rebinned,
-    sweep_json,
-    to_json,
-)
-from calibration_routines.psf.sweep_watch import OnEvent, SweepWatch, TakeAgain, retake_dimming
+from calibration_routines.psf.sweep_watch import SweepWatch, TakeAgain, retake_dimming
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.files.atomic import write_text
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError
+from instrument.files.record import plain, value_of
 from instrument.plan import Step
 from instrument.runs.acquire import acquire, prepare
 from instrument.runs.run import Run
-from instrument.runs.run_control import EndedEarlyError
-from instrument.runs.runner import Runner, RunProgress
-from recon.types import Calibration, Geometry
+from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.runner import Runner
+from recon.types import Calibration
 
-OnRunner = Callable[[Runner], None]
-"""Takes each runner of a sweep before it begins: who wants to pause, abort or stop it keeps it."""
-Analysed = Callable[[int, int], None]
-"""Takes how many PSFs have been analysed, and how many there are."""
-FOLDER = "calibration"
-"""Name of the calibration's folder inside the run's folder."""
+_INTERRUPTIONS = (KeyboardInterrupt, SystemExit, EndedEarlyError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +102,12 @@ class SweepCalibration:
 
 def calibrate_sweep(
     bench: Bench,
-    sweep: Sweep,
+    sweep: AskedSweep,
     folder: Path | str | None = None,
     *,
     exposures: SweepExposures | None = None,
-    on_progress: RunProgress | None = None,
-    on_analysis: Analysed | None = None,
-    on_event: OnEvent | None = None,
-    on_runner: OnRunner | None = None,
+    control: RunControl | None = None,
+    listener: Listener | None = None,
 ) -> SweepCalibration:
     """Take a sweep and save its calibration inside the run's folder.
 
@@ -129,22 +115,18 @@ def calibrate_sweep(
     ----------
     bench : Bench
         Open, its stage homed.
-    sweep : AxialSweep or PointSweep
+    sweep : AxialSweep, LateralSweep, VolumeSweep or PointSweep
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     exposures : SweepExposures, optional
         From :func:`~calibration_routines.expose_sweep`, which is called when None.
-    on_progress : callable, optional
-        Called with a :class:`~instrument.runs.runner.RunStatus` after every frame.
-    on_analysis : callable, optional
-        Called with how many PSFs have been analysed, and how many there are.
-    on_event : callable, optional
-        Called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been taken and judged,
-        and with a :class:`~calibration_routines.SourceVisit` after each visit to the reference point. All
-        callables are called in the thread that sweeps.
-    on_runner : callable, optional
-        Called with the sweep's :class:`~instrument.runs.runner.Runner` before it begins, and with that of
-        each round of retakes after it.
+    control : RunControl, optional
+        To pause, abort or stop it from another thread; it follows the sweep's run, and that of each round of
+        retakes after it.
+    listener : Listener, optional
+        Its ``event`` is called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been
+        taken and judged, and with a :class:`~calibration_routines.SourceVisit` after each visit to the
+        reference point, in the thread that sweeps.
 
     Returns
     -------
@@ -153,24 +135,35 @@ def calibrate_sweep(
 
     Raises
     ------
-    PlanError
+    PlanError, SettingsError
         When the sweep leaves the limits of the bench or the disk; nothing moved.
     CalibrationError
         When no exposure is usable, or the run was ended before its last frame.
     """
+    control, listener = control or RunControl(), listener or Listener()
     where = Path(folder) if folder is not None else None
-    check_sweep(bench, sweep, where)
-    exposures = exposures or expose_sweep(bench, sweep)
-    runner = prepare(bench, sweep_plan(sweep, exposures.exposures_ms), where, on_progress=on_progress)
-    record = SweepRecord(sweep, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
-    write_text(runner.path / SWEEP_FILE, to_json(record))
-    runner.on_frame = _watch(bench, record, runner.path, on_event).see
-    if on_runner is not None:
-        on_runner(runner)
-    return _finished(_complete(runner.execute()), record, bench, on_progress, on_analysis, on_runner)
+    points = sweep.planned(bench).sweep
+    check_sweep(bench, points, where)
+    if exposures is None:
+        listener.step("finding exposures")
+        try:
+            exposures = expose_sweep(bench, points, control=control)
+        except _INTERRUPTIONS as interruption:
+            interruption.add_note("The sweep had not begun: no frame was kept, start it again.")
+            raise
+    plan = sweep_plan(points, exposures.exposures_ms)
+    listener.exposures(exposures)
+    listener.planned(plan_lines(bench, points, plan, where))
+    listener.step("sweeping")
+    record = SweepRecord(points, exposures, bench.geometry, bench.label, bool(bench.simulated_kinds))
+    runner = SWEEP.prepare(bench, plan, where, record, control, listener)
+    watch = SweepWatch(points, bench.geometry)
+    watch.on_event, watch.take_again = listener.event, _retaker(bench, record, runner.path)
+    runner.on_frame = watch.see
+    return _finished(runner.execute(), record, bench, control, listener)
 
 
-def watch_resumed(bench: Bench, runner: Runner, on_event: OnEvent | None = None) -> None:
+def watch_resumed(bench: Bench, runner: Runner, listener: Listener) -> None:
     """Let a sweep's run that goes on be watched as from its beginning: what it has is looked at first.
 
     Parameters
@@ -178,22 +171,22 @@ def watch_resumed(bench: Bench, runner: Runner, on_event: OnEvent | None = None)
     bench : Bench
         Open.
     runner : Runner
-        From :func:`~instrument.runs.resume.prepare_resume`, not yet begun.
-    on_event : callable, optional
-        As :func:`calibrate_sweep`; not called for what was taken before.
+        From :func:`~instrument.runs.acquire.prepare_resume`, not yet begun.
+    listener : Listener
+        Its ``event`` is not called for what was taken before.
 
     Raises
     ------
     CalibrationError
         When the run is no sweep.
     """
-    record = read_record(runner.path)
+    record = SWEEP.read(runner.path)
     watch = SweepWatch(record.sweep, record.geometry)
     run = Run.open(runner.path)
     for step in run.plan.whole_steps(run.start) if run.plan is not None else ():
         if step.index in run.records and run.verify(step.index) is None:
             watch.see(step, _stored(run, step.index))
-    watch.on_event, watch.take_again = on_event, _retaker(bench, record.sweep, runner.path)
+    watch.on_event, watch.take_again = listener.event, _retaker(bench, record, runner.path)
     runner.on_frame = watch.see
 
 
@@ -201,9 +194,8 @@ def finish_sweep(
     run: Path | str,
     bench: Bench | None = None,
     *,
-    on_progress: RunProgress | None = None,
-    on_analysis: Analysed | None = None,
-    on_runner: OnRunner | None = None,
+    control: RunControl | None = None,
+    listener: Listener | None = None,
 ) -> SweepCalibration:
     """Make the calibration of a sweep's complete run, e.g. of one that was resumed.
 
@@ -213,7 +205,7 @@ def finish_sweep(
         The run's folder.
     bench : Bench, optional
         For retakes; without one, PSFs that need them are only flagged.
-    on_progress, on_analysis, on_runner : callable, optional
+    control, listener : optional
         As :func:`calibrate_sweep`.
 
     Raises
@@ -223,204 +215,203 @@ def finish_sweep(
     CalibrationFileError
         When it has its calibration already.
     """
-    path = Path(run)
-    record = read_record(path)
-    return _finished(_complete(Run.open(path)), record, bench, on_progress, on_analysis, on_runner)
+    record = SWEEP.read(Path(run))
+    return _finished(Run.open(Path(run)), record, bench, control or RunControl(), listener or Listener())
 
 
 def _finished(
-    run: Run,
-    record: SweepRecord,
-    bench: Bench | None,
-    on_progress: RunProgress | None,
-    on_analysis: Analysed | None,
-    on_runner: OnRunner | None,
+    run: Run, record: SweepRecord, bench: Bench | None, control: RunControl, listener: Listener
 ) -> SweepCalibration:
-    """Make the calibration of a complete run; an interruption says that all frames of it are kept."""
+    """Analyse, take again what needs it, save; an interruption says that all frames are kept."""
     try:
-        return _judged(run, record, bench, on_progress, on_analysis, on_runner)
-    except (KeyboardInterrupt, SystemExit, EndedEarlyError) as interruption:
+        taken = _TakenSweep(_complete(run), record, control, listener)
+        analysis = taken.analysed()
+        while bench is not None and (again := taken.to_take_again(analysis)):
+            taken.take_again(bench, again)
+            analysis = taken.analysed()
+        return taken.saved(analysis)
+    except _INTERRUPTIONS as interruption:
         interruption.add_note(
             f"All frames of the sweep are kept. For its calibration: diffuserbench resume {run.path}"
         )
         raise
 
 
-def _judged(
-    run: Run,
-    record: SweepRecord,
-    bench: Bench | None,
-    on_progress: RunProgress | None,
-    on_analysis: Analysed | None,
-    on_runner: OnRunner | None,
-) -> SweepCalibration:
-    """Analyse, take again what needs it, judge the source, save."""
-    sweep, exposures = record.sweep, record.exposures
-    where = run.path.parent
-    dark = dark_model(run)
-    if sweep.binning == 0:
-        sweep = _binned_to_resolution(run, sweep, dark)
-    try:
-        check_image_settings(sweep, dark.hot.shape)
-    except BenchError as error:
-        raise BenchError(
-            f"{run.path / SWEEP_FILE}: {error} All frames are kept: change binning or dct_order there, then: "
-            f"diffuserbench resume {run.path}"
-        ) from None
-    runs, takes, rounds = [run], dict.fromkeys(sweep.points_um, run), Counter[Position]()
-    for point, name in read_retakes(run.path):
-        retake = next((known for known in runs if known.path.name == name), None) or Run.open(where / name)
-        runs += [] if retake in runs else [retake]
-        takes[point] = retake
-        rounds[point] += 1
-    drift = drift_of(run, sweep, dark)
-    analysis = _analysed(takes, run, sweep, dark, record.geometry, drift, on_analysis)
-    while bench is not None:
-        again = [q for q in analysis.quality if q.retake and rounds[q.source_um] < sweep.retakes]
-        if not again:
-            break
-        points = [
-            (q.source_um, _exposure_ms(takes[q.source_um], q.source_um) * retake_dimming(q)) for q in again
+class _TakenSweep:
+    """The complete run of a sweep and its retakes: which of them has which point's frames."""
+
+    def __init__(self, run: Run, record: SweepRecord, control: RunControl, listener: Listener) -> None:
+        self.run, self.record = run, record
+        self.control, self.listener = control, listener
+        self.dark = dark_model(run)
+        self.runs = [run]
+        self.takes = dict.fromkeys(record.sweep.points_um, run)
+        self.rounds = Counter[Position]()
+        self.sweep = record.sweep
+        if self.sweep.binning == 0:
+            self.sweep = replace(self.sweep, binning=self._optical_binning())
+        try:
+            check_image_settings(self.sweep, self.dark.hot.shape)
+        except BenchError as error:
+            raise BenchError(
+                f"{run.path / SWEEP.file}: {error} All frames are kept: change binning or dct_order there, "
+                f"then: diffuserbench resume {run.path}"
+            ) from None
+        for retake in read_retakes(run.path):
+            known = next((one for one in self.runs if one.path.name == retake.run), None)
+            self._took(retake.point_um, known or Run.open(run.path.parent / retake.run))
+        self.drift = drift_of(run, self.sweep, self.dark)
+
+    def _took(self, point: Position, run: Run) -> None:
+        self.runs += [] if run in self.runs else [run]
+        self.takes[point] = run
+        self.rounds[point] += 1
+
+    def to_take_again(self, analysis: SweepAnalysis) -> list[tuple[Position, float]]:
+        """Return the points that it may help, each with its exposure."""
+        return [
+            (q.source_um, self._exposure_ms(q.source_um) * retake_dimming(q))
+            for q in analysis.quality
+            if q.retake and self.rounds[q.source_um] < self.sweep.retakes
         ]
-        runner = prepare(bench, retake_plan(sweep, points), where, on_progress=on_progress)
-        if on_runner is not None:
-            on_runner(runner)
+
+    def take_again(self, bench: Bench, points: list[tuple[Position, float]]) -> None:
+        """Take points again in a run beside the sweep's."""
+        plan, folder = retake_plan(self.sweep, points), self.run.path.parent
+        runner = prepare(bench, plan, folder, on_progress=self.listener.frame, control=self.control)
         retake = _complete(runner.execute())
-        add_retakes(run.path, [point for point, _ in points], retake.path.name)
-        runs.append(retake)
+        add_retakes(self.run.path, [point for point, _ in points], retake.path.name)
         for point, _ in points:
-            takes[point] = retake
-            rounds[point] += 1
-        analysis = _analysed(takes, run, sweep, dark, record.geometry, drift, on_analysis)
-    exposures = replace(
-        exposures, exposures_ms=tuple(_exposure_ms(takes[point], point) for point in sweep.points_um)
-    )
-    good = not any(q.findings for q in analysis.quality) and not any(s.findings for s in analysis.stages)
-    calibration = Calibration(
-        psfs=analysis.psfs,
-        source_positions_um=np.array(sweep.points_um),
-        background=analysis.background,
-        geometry=binned(record.geometry, sweep.binning),
-        quality={
-            "psfs": [q.as_json() for q in analysis.quality],
-            "stages": [stage.as_json() for stage in analysis.stages],
-            "drift": None if drift is None else drift.as_json(),
-            "good": good and (drift is None or not drift.findings),
-        },
-        provenance=_provenance(record, sweep, exposures, runs, analysis.reference_exposure_ms),
-    )
-    path = save_calibration(calibration, run.path / FOLDER)
-    return SweepCalibration(
-        calibration, path, analysis.quality, tuple(runs), exposures, analysis.stages, drift
-    )
+            self._took(point, retake)
 
+    def analysed(self) -> SweepAnalysis:
+        """Turn the frames into PSFs and judge them."""
+        sweep = self.sweep
+        return analyse_sweep(
+            self._planes(), self.dark, self.record.geometry, dct_order=sweep.dct_order, binning=sweep.binning
+        )
 
-def _watch(bench: Bench, record: SweepRecord, path: Path, on_event: OnEvent | None) -> SweepWatch:
-    return SweepWatch(
-        record.sweep,
-        record.geometry,
-        on_event=on_event,
-        take_again=_retaker(bench, record.sweep, path),
-    )
+    def _planes(self) -> Iterator[PlaneFrames]:
+        visits = self.run.steps(REFERENCE)
+        began = self.run.metadata(visits[0]).utc if visits else None
+        central = self.sweep.central
+        self.listener.step("analysing")
+        for done, point in enumerate(self.sweep.points_um):
+            self.control.check()
+            self.listener.share(done, len(self.sweep.points_um))
+            run, steps = self.takes[point], self._steps(point)
+            first = run.metadata(steps[0])
+            seconds = 0.0 if began is None else (first.utc - began).total_seconds()
+            yield PlaneFrames(
+                source_um=point,
+                exposure_ms=first.exposure_ms,
+                frames=np.stack([run.frame(step) for step in steps]),
+                full_scale=full_scale(run),
+                off_axis=point not in central,
+                brightness=1.0 if self.drift is None else self.drift.brightness_at(seconds),
+            )
 
+    def _steps(self, point: Position) -> list[Step]:
+        return [step for step in self.takes[point].steps(PSF) if step.source_um in (None, point)]
 
-def _retaker(bench: Bench, sweep: Sweep, path: Path) -> TakeAgain:
-    """Return what takes a point again between two points of the sweep in ``path``, as a run beside it."""
+    def _exposure_ms(self, point: Position) -> float:
+        return self.takes[point].metadata(self._steps(point)[0]).exposure_ms
 
-    def take_again(point: Position, exposure_ms: float) -> list[Snapshot]:
-        retake = _complete(acquire(bench, retake_plan(sweep, [(point, exposure_ms)]), path.parent))
-        add_retakes(path, [point], retake.path.name)
-        return [_stored(retake, step.index) for step in retake.steps(PSF)]
+    def _optical_binning(self) -> int:
+        """Return the binning by the finest structure, which is that of the farthest central PSF."""
+        steps = self._steps(self.sweep.axis_point(self.sweep.depths_um[-1]))[:2]
+        frames = [light_of(self.run, [step.index], self.dark) for step in steps]
+        return optical_binning(frames[0], frames[-1])
 
-    return take_again
+    def saved(self, analysis: SweepAnalysis) -> SweepCalibration:
+        """Save the calibration."""
+        sweep, drift, record = self.sweep, self.drift, self.record
+        exposures_ms = tuple(self._exposure_ms(point) for point in sweep.points_um)
+        exposures = replace(record.exposures, exposures_ms=exposures_ms)
+        findings = [q.findings for q in analysis.quality] + [stage.findings for stage in analysis.stages]
+        calibration = Calibration(
+            psfs=analysis.psfs,
+            source_positions_um=np.array(sweep.points_um),
+            background=analysis.background,
+            geometry=binned(record.geometry, sweep.binning),
+            quality={
+                "psfs": [plain(q) for q in analysis.quality],
+                "stages": [plain(stage) for stage in analysis.stages],
+                "drift": None if drift is None else plain(drift) | {"corrected": drift.is_correctable},
+                "good": not any(findings) and not (drift and drift.findings),
+            },
+            provenance=self._provenance(exposures, analysis.reference_exposure_ms),
+        )
+        path = save_calibration(calibration, self.run.path / SWEEP.result)
+        return SweepCalibration(
+            calibration, path, analysis.quality, tuple(self.runs), exposures, analysis.stages, drift
+        )
 
-
-def _stored(run: Run, index: int) -> Snapshot:
-    return Snapshot(run.frame(index), run.metadata(index), run.records[index].average)
+    def _provenance(self, exposures: SweepExposures, reference_ms: float) -> dict[str, Any]:
+        return {
+            "made_by": f"diffuserbench {version('diffuserbench')}",
+            "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+            "bench": self.record.bench,
+            "simulated": self.record.simulated,
+            "runs": [run.path.name for run in self.runs],
+            "sweep": plain(self.sweep),
+            "reference_exposure_ms": reference_ms,
+            "exposures_ms": list(exposures.exposures_ms),
+            "auto_exposure": [
+                {"z_um": z_um, "outcome": found.outcome.value, "trace": [asdict(t) for t in found.trace]}
+                for z_um, found in exposures.found
+            ],
+        }
 
 
 def _complete(run: Run) -> Run:
     return completed(run, "The sweep", f"Go on with: diffuserbench resume {run.path}")
 
 
-# Frames to PSFs ----------------------------------------------------------------------------------------
-def _analysed(
-    takes: Mapping[Position, Run],
-    first: Run,
-    sweep: Sweep,
-    dark: DarkModel,
-    geometry: Geometry,
-    drift: Drift | None,
-    on_analysis: Analysed | None,
-) -> SweepAnalysis:
-    planes = _planes(takes, first, sweep, drift, on_analysis)
-    return analyse_sweep(planes, dark, geometry, dct_order=sweep.dct_order, binning=sweep.binning)
+def _stored(run: Run, index: int) -> Snapshot:
+    return Snapshot(run.frame(index), run.metadata(index), run.records[index].average)
 
 
-def _planes(
-    takes: Mapping[Position, Run],
-    first: Run,
-    sweep: Sweep,
-    drift: Drift | None,
-    on_analysis: Analysed | None,
-) -> Iterator[PlaneFrames]:
-    central = {axis_point(sweep, z_um) for z_um in depths_um(sweep)}
-    visits = first.steps(REFERENCE)
-    began = first.metadata(visits[0]).utc if visits else None
-    for done, point in enumerate(sweep.points_um):
-        if on_analysis is not None:
-            on_analysis(done, len(sweep.points_um))
-        run = takes[point]
-        steps = _steps_of(run, point)
-        seconds = 0.0 if began is None else (run.metadata(steps[0]).utc - began).total_seconds()
-        yield PlaneFrames(
-            source_um=point,
-            exposure_ms=run.metadata(steps[0]).exposure_ms,
-            frames=np.stack([run.frame(step) for step in steps]),
-            full_scale=full_scale(run),
-            off_axis=point not in central,
-            brightness=1.0 if drift is None else drift.brightness_at(seconds),
-        )
+# Retakes -----------------------------------------------------------------------------------------------
+RETAKES_FILE = "retakes.json"
+"""Beside ``sweep.json``, once a point was taken again: which, and in which run."""
 
 
-def _steps_of(run: Run, point: Position) -> list[Step]:
-    return [step for step in run.steps(PSF) if step.source_um is None or step.source_um == point]
+@dataclass(frozen=True, slots=True)
+class Retake:
+    """A point that was taken again, and the name of the run beside the sweep's that has it."""
+
+    point_um: Position
+    run: str
 
 
-def _exposure_ms(run: Run, point: Position) -> float:
-    return run.metadata(_steps_of(run, point)[0]).exposure_ms
+def add_retakes(run: Path, points_um: Iterable[Position], retake: str) -> None:
+    """Keep that points of the sweep in folder ``run`` were taken again in the run named ``retake``."""
+    entries = [*read_retakes(run), *(Retake(point, retake) for point in points_um)]
+    write_text(run / RETAKES_FILE, json.dumps(plain(entries), indent=1) + "\n")
 
 
-def _binned_to_resolution(run: Run, sweep: Sweep, dark: DarkModel) -> Sweep:
-    """Choose the binning by the finest structure, which is that of the farthest central PSF."""
-    point = axis_point(sweep, depths_um(sweep)[-1])
-    steps = _steps_of(run, point)
-    exposure_ms = run.metadata(steps[0]).exposure_ms
-    frames = [
-        replace_hot(run.frame(step).astype(np.float32) - dark.at(exposure_ms), dark.hot) for step in steps[:2]
-    ]
-    grey = [frame.mean(axis=-1) if frame.ndim == 3 else frame for frame in frames]
-    return rebinned(sweep, optical_binning(grey[0], grey[-1]))
+def read_retakes(run: Path) -> list[Retake]:
+    """Return which points were taken again, in the order of time; CalibrationError from a damaged file."""
+    path = run / RETAKES_FILE
+    if not path.exists():
+        return []
+    try:
+        return value_of(list[Retake], json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}): it was changed or damaged. Without it the sweep's first takes "
+            "count: remove the file, or restore it from a copy."
+        ) from error
 
 
-def _provenance(
-    record: SweepRecord,
-    sweep: Sweep,
-    exposures: SweepExposures,
-    runs: Sequence[Run],
-    reference_ms: float,
-) -> dict[str, Any]:
-    return {
-        "made_by": f"diffuserbench {version('diffuserbench')}",
-        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "bench": record.bench,
-        "simulated": record.simulated,
-        "runs": [run.path.name for run in runs],
-        "sweep": sweep_json(sweep),
-        "reference_exposure_ms": reference_ms,
-        "exposures_ms": list(exposures.exposures_ms),
-        "auto_exposure": [
-            {"z_um": z_um, "outcome": found.outcome.value, "trace": [asdict(trial) for trial in found.trace]}
-            for z_um, found in exposures.found
-        ],
-    }
+def _retaker(bench: Bench, record: SweepRecord, path: Path) -> TakeAgain:
+    """Return what takes a point again between two points of the sweep in ``path``, as a run beside it."""
+
+    def take_again(point: Position, exposure_ms: float) -> list[Snapshot]:
+        plan = retake_plan(record.sweep, [(point, exposure_ms)])
+        retake = _complete(acquire(bench, plan, path.parent))
+        add_retakes(path, [point], retake.path.name)
+        return [_stored(retake, step.index) for step in retake.steps(PSF)]
+
+    return take_again

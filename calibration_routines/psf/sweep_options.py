@@ -1,82 +1,37 @@
 """A sweep of the point source as data: what a person asks for, and what is measured then.
 
 :class:`AxialSweep`, :class:`LateralSweep` and :class:`VolumeSweep` are what is asked; what was left out of
-them (planes, field, spacing) the bench fills in (``planned``). What is measured is an axial sweep with its
-number of planes, or a :class:`PointSweep`.
+them (planes, field, spacing) the bench fills in (``planned``). What is measured is always a
+:class:`PointSweep`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from calibration_routines.optics.angular_response import load_response
-from calibration_routines.options import MM, problems_of
-from calibration_routines.psf.sampling import (
-    Position,
-    grid_sweep,
-    planes_for,
-    require_reach,
-)
+from calibration_routines.procedure import MM, Checked
+from calibration_routines.psf.sampling import Position, grid_sweep, planes_for, require_reach
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.plan import Span
 from recon.base.declare import RARE, option
 from recon.optics.fall_off import FallOff, gaussian_fall_off
 
-
-class Sweep(Protocol):
-    """What the sweeping, and the analysis after it, need to know of a sweep."""
-
-    @property
-    def kind(self) -> str:
-        """``"axial"``, ``"lateral"`` or ``"volume"``."""
-
-    @property
-    def points_um(self) -> tuple[Position, ...]:
-        """Where the source stands for each PSF, in the order of the visits."""
-
-    @property
-    def average(self) -> int:
-        """Frames a point."""
-
-    @property
-    def dark_frames(self) -> int:
-        """Frames without light, at the shortest and at the longest exposure each."""
-
-    @property
-    def target(self) -> float:
-        """Fraction of full scale for the 99.9th percentile of the PSF on the axis."""
-
-    @property
-    def dct_order(self) -> int:
-        """Lowest DCT coefficients removed along each axis; 0 removes none."""
-
-    @property
-    def binning(self) -> int:
-        """Software binning; 0: to the optical resolution."""
-
-    @property
-    def retakes(self) -> int:
-        """How often PSFs that saturate or slipped are taken again."""
-
-    @property
-    def by_hand(self) -> bool:
-        """Whether the source stands where it was put by hand; nothing moves then."""
-
-    @property
-    def reference_every(self) -> int:
-        """Points between two visits to the reference point; 0: none."""
+LEAST_POINTS_WITH_REFERENCE = 4
+"""A shorter sweep is over before a source drifts: no reference visits."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedSweep:
     """A sweep with what its numbers come from, in words."""
 
-    sweep: Sweep
+    sweep: PointSweep
     reasons: tuple[str, ...] = ()
 
 
@@ -102,7 +57,7 @@ def _binning(text: str) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Taking:
+class Taking(Checked):
     """How each PSF is taken, whatever the sweep."""
 
     average: int = option(
@@ -146,6 +101,9 @@ class Taking:
         group=RARE,
     )
 
+    def _taking(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(Taking)}
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointSweep(Taking):
@@ -155,18 +113,40 @@ class PointSweep(Taking):
     kind: str = "volume"
     by_hand: bool = False
 
-    def __post_init__(self) -> None:
-        problems = problems_of(self)
-        if not self.points_um:
-            problems.append(("points_um", "a sweep needs at least one point"))
-        if len(set(self.points_um)) != len(self.points_um):
-            problems.append(("points_um", "a point is listed twice"))
-        if not np.isfinite(self.points_um).all():
-            problems.append(("points_um", "every coordinate of a point must be a finite number"))
-        if any(z <= 0 for _, _, z in self.points_um):
-            problems.append(("points_um", "every point must lie in front of the diffuser, z > 0"))
-        if problems:
-            raise SettingsError(problems)
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """As :meth:`Checked.disagreements`."""
+        words = {
+            "a sweep needs at least one point": not self.points_um,
+            "a point is listed twice": len(set(self.points_um)) != len(self.points_um),
+            "every coordinate of a point must be a finite number": not np.isfinite(self.points_um).all(),
+            "every point must lie in front of the diffuser, z > 0": any(z <= 0 for *_, z in self.points_um),
+        }
+        return [("points_um", said) for said, is_wrong in words.items() if is_wrong]
+
+    @property
+    def depths_um(self) -> tuple[float, ...]:
+        """Depths of the points, nearest first."""
+        return tuple(sorted({z for _, _, z in self.points_um}))
+
+    def axis_point(self, z_um: float) -> Position:
+        """Return the point of a depth that is nearest to the axis; its PSF is the depth's central one."""
+        return min((p for p in self.points_um if p[2] == z_um), key=lambda p: float(np.hypot(p[0], p[1])))
+
+    @property
+    def central(self) -> frozenset[Position]:
+        """The point of each depth that is nearest to the axis."""
+        return frozenset(self.axis_point(z_um) for z_um in self.depths_um)
+
+    @property
+    def reference_point(self) -> Position | None:
+        """The point that is revisited: on the axis, at the middle depth; None for a short sweep."""
+        if self.by_hand or not self.reference_every or len(self.points_um) < LEAST_POINTS_WITH_REFERENCE:
+            return None
+        return self.axis_point(self.depths_um[len(self.depths_um) // 2])
+
+    def planned(self, bench: Bench) -> PlannedSweep:
+        """Return itself: nothing was left to the bench."""
+        return PlannedSweep(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +196,6 @@ class _Depths:
         help="Diameter of a microlens diffuser's lenslets, for the number of planes (Kuo 2020, Eq. 5.10).",
         default_words="no lenslets",
         group=RARE,
-        recorded=False,
     )
     wavelength_nm: float | None = option(
         None,
@@ -226,7 +205,6 @@ class _Depths:
         help="For the lenslets' depth of field.",
         default_words="the bench's",
         group=RARE,
-        recorded=False,
     )
 
     @property
@@ -267,30 +245,26 @@ class AxialSweep(Taking, _Lateral, _Depths):
         group=RARE,
     )
 
-    kind: ClassVar[str] = "axial"
-
-    def __post_init__(self) -> None:
-        problems = problems_of(self)
-        depths_are_wrong = any(name in ("z_min_um", "z_max_um", "planes") for name, _ in problems)
-        if depths_are_wrong:
-            pass
-        elif self.z_min_um > self.far_um:
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """As :meth:`Checked.disagreements`."""
+        if not {"z_min_um", "z_max_um", "planes"}.isdisjoint(wrong):
+            return []
+        if self.z_min_um > self.far_um:
             words = (
                 f"planes must lie in front of the diffuser, nearest first: 0 < z min <= z max, "
                 f"not {self.z_min_um / 1e3:g} and {self.far_um / 1e3:g} mm"
             )
-            problems.append(("z_max_um", words))
-        elif self.planes is not None and (self.planes == 1) != (self.z_min_um == self.far_um):
+            return [("z_max_um", words)]
+        if self.planes is not None and (self.planes == 1) != (self.z_min_um == self.far_um):
             words = (
                 f"the number of planes is {self.planes}: one plane needs z min = z max, "
                 "more need z min < z max"
             )
-            problems.append(("planes", words))
-        elif self.by_hand and self.far_um > self.z_min_um:
+            return [("planes", words)]
+        if self.by_hand and self.far_um > self.z_min_um:
             words = f"{self.planes or 'several'} planes need a stage; by hand one PSF is taken at a time"
-            problems.append(("by_hand", words))
-        if problems:
-            raise SettingsError(problems)
+            return [("by_hand", words)]
+        return []
 
     @property
     def z_um(self) -> tuple[float, ...]:
@@ -309,10 +283,10 @@ class AxialSweep(Taking, _Lateral, _Depths):
             raise SettingsError([("planes", words)])
         return Span(start=self.z_min_um, stop=self.far_um, number=planes, spacing="dioptric").values()
 
-    @property
-    def points_um(self) -> tuple[Position, ...]:
-        """Where the source stands, nearest plane first; errors as :attr:`z_um`."""
-        return tuple((self.x_um, self.y_um, z_um) for z_um in self.z_um)
+    def points(self) -> PointSweep:
+        """Return what is measured, nearest plane first; errors as :attr:`z_um`."""
+        points = tuple((self.x_um, self.y_um, z_um) for z_um in self.z_um)
+        return PointSweep(points_um=points, kind="axial", by_hand=self.by_hand, **self._taking())
 
     def planned(self, bench: Bench) -> PlannedSweep:
         """As :meth:`AskedSweep.planned`."""
@@ -320,7 +294,7 @@ class AxialSweep(Taking, _Lateral, _Depths):
         if not self.by_hand:
             far = {} if self.z_max_um is None else {"z_max_um": self.z_max_um}
             self._require_reach(bench, z_min_um=self.z_min_um, **far)
-        return PlannedSweep(replace(self, z_max_um=self.far_um, planes=planes), reasons)
+        return PlannedSweep(replace(self, z_max_um=self.far_um, planes=planes).points(), reasons)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -376,16 +350,16 @@ class _Points:
 class _Grid(Taking, _Lateral, _Points):
     """A grid of points at each depth; ``(x_um, y_um)`` is its centre."""
 
-    def __post_init__(self) -> None:
-        problems = problems_of(self)
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """As :meth:`Checked.disagreements`."""
+        problems = []
         if self.response is not None and self.fall_off_deg is not None:
             words = "give a file with the angular response or a Gaussian's width in degrees, not both"
             problems.append(("fall_off_deg", words))
         if (self.half_field_x_um is None) != (self.half_field_y_um is None):
             missing = "half_field_x_um" if self.half_field_x_um is None else "half_field_y_um"
             problems.append((missing, "give half the field's width and its height, or neither"))
-        if problems:
-            raise SettingsError(problems)
+        return problems
 
     def _over(self, bench: Bench, kind: str, depths_um: tuple[float, ...]) -> PlannedSweep:
         """Return the sweep over the grid at each depth."""
@@ -401,10 +375,9 @@ class _Grid(Taking, _Lateral, _Points):
             x_um=self.x_um,
             y_um=self.y_um,
         )
-        taking = {field.name: getattr(self, field.name) for field in fields(Taking)}
         sizes = dict.fromkeys(f"{rows} x {columns}" for rows, columns in grid.shapes)
         return PlannedSweep(
-            PointSweep(points_um=grid.points_um, kind=kind, **taking),
+            PointSweep(points_um=grid.points_um, kind=kind, **self._taking()),
             (*grid.reasons, f"Grid: {' to '.join(sizes)} points (y x x) at each depth"),
         )
 
@@ -446,16 +419,18 @@ class VolumeSweep(_Grid, _Depths):
         help="Farthest plane, from the diffuser.",
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def disagreements(self, wrong: Collection[str]) -> list[tuple[str, str]]:
+        """As :meth:`Checked.disagreements`."""
+        problems = super().disagreements(wrong)
         in_order = self.z_min_um < self.z_max_um
-        if not in_order or (self.planes is not None and self.planes < 2):
+        if not (wrong or problems) and (not in_order or (self.planes is not None and self.planes < 2)):
             words = (
                 "a volume has two planes or more, 0 < z min < z max; not "
                 f"{'any number' if self.planes is None else self.planes} between {self.z_min_um / 1e3:g} and "
                 f"{self.z_max_um / 1e3:g} mm"
             )
-            raise SettingsError([("z_max_um" if not in_order else "planes", words)])
+            problems.append(("z_max_um" if not in_order else "planes", words))
+        return problems
 
     def planned(self, bench: Bench) -> PlannedSweep:
         """As :meth:`AskedSweep.planned`."""

@@ -1,29 +1,25 @@
-"""Sweeps from the request to the calibration: check, home, find exposures, take, judge, save."""
+"""Sweeps as procedures: what is asked, how it went in words, and what the registry offers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, outlook_of, under_control
-from calibration_routines.psf.exposure import SweepExposures, expose_sweep
+from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, outlook_of
 from calibration_routines.psf.psf_quality import place_of
 from calibration_routines.psf.sampling import reachable_depths_um
-from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
-from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, Sweep, VolumeSweep
-from calibration_routines.psf.sweep_plan import DARK, check_sweep, depths_um, reference_point, sweep_plan
+from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
+from calibration_routines.psf.sweep_options import AskedSweep, AxialSweep, LateralSweep, VolumeSweep
+from calibration_routines.psf.sweep_plan import SWEEP, SweepExposures, check_sweep, plan_lines
 from calibration_routines.psf.sweep_watch import SourceVisit, SweepEvent
 from instrument.bench.bench import Bench
-from instrument.files.formatting import count
-from instrument.plan import Plan, estimate
-from instrument.runs.acquire import abilities_of
-from instrument.runs.run_control import EndedEarlyError, RunControl
+from instrument.runs.run import Run
+from instrument.runs.run_control import RunControl
 
 
 @dataclass(frozen=True, slots=True)
-class SweepProcedure:
-    """Carries out what was asked of a sweep; the :class:`~calibration_routines.procedure.Procedure` of it."""
+class SweepProcedure(Procedure):
+    """Carries out what was asked of a sweep."""
 
     sweep: AskedSweep
 
@@ -41,68 +37,17 @@ class SweepProcedure:
         lines = plan_lines(bench, planned.sweep, plan, folder)
         return replace(outlook, plan_lines=(*lines, caveat))
 
-    def carry_out(
-        self,
-        bench: Bench,
-        folder: Path | None = None,
-        *,
-        control: RunControl | None = None,
-        listener: Listener | None = None,
-    ) -> Outcome:
-        """Take the sweep and save its calibration; everything is as in :func:`take_sweep`."""
+    def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
+        """Home the stage, find exposures, take the sweep and save its calibration."""
         sweep = self.sweep.planned(bench).sweep
-        return sweep_outcome(take_sweep(bench, sweep, folder, control=control, listener=listener))
-
-
-def take_sweep(
-    bench: Bench,
-    sweep: Sweep,
-    folder: Path | None = None,
-    *,
-    control: RunControl | None = None,
-    listener: Listener | None = None,
-) -> SweepCalibration:
-    """Check a sweep, home the stage, find exposures, take it and save its calibration.
-
-    Errors as :func:`~calibration_routines.calibrate_sweep`.
-    """
-    heard = listener or Listener()
-    check_sweep(bench, sweep, folder)
-    with under_control(bench, control) as control:
         if bench.stage is not None and not sweep.by_hand:
-            heard.step("homing the stage")
+            listener.step("homing the stage")
             bench.stage.home()
-        heard.step("finding exposures")
-        try:
-            exposures = expose_sweep(bench, sweep, control=control)
-        except (KeyboardInterrupt, SystemExit, EndedEarlyError) as interruption:
-            interruption.add_note("The sweep had not begun: no frame was kept, start it again.")
-            raise
-        heard.exposures(exposures)
-        heard.planned(plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), folder))
-        heard.step("sweeping")
-        return calibrate_sweep(
-            bench,
-            sweep,
-            folder,
-            exposures=exposures,
-            on_progress=heard.frame,
-            on_analysis=analysing(heard, control),
-            on_event=heard.event,
-            on_runner=control.follow,
-        )
+        return sweep_outcome(calibrate_sweep(bench, sweep, folder, control=control, listener=listener))
 
 
-def analysing(heard: Listener, control: RunControl) -> Callable[[int, int], None]:
-    """Return what hears how many PSFs have been analysed, and ends the analysis when it is asked to."""
-
-    def on_analysis(done: int, total: int) -> None:
-        control.check()
-        if done == 0:
-            heard.step("analysing")
-        heard.share(done, total)
-
-    return on_analysis
+def _finish(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome:
+    return sweep_outcome(finish_sweep(run.path, bench, control=control, listener=listener))
 
 
 def sweep_outcome(done: SweepCalibration) -> Outcome:
@@ -116,39 +61,7 @@ def sweep_outcome(done: SweepCalibration) -> Outcome:
     )
 
 
-_MUCH_BYTES = 10e9  # of a sweep, above which the plan says how to need less
 _MOST_LINES = 12  # findings in words; all of them are in calibration.json
-
-
-def plan_lines(bench: Bench, sweep: Sweep, plan: Plan, folder: Path | None) -> list[str]:
-    """Return what a sweep will do and cost, before it starts."""
-    cost = estimate(plan, abilities_of(bench, folder))
-    depths = depths_um(sweep)
-    listed = ", ".join(f"{z_um / 1e3:.4g}" for z_um in depths)
-    if sweep.kind == "axial":
-        lines = [f"Planes (mm): {listed}"]
-        what = count(len(depths), "plane")
-    else:
-        planes = f"at {len(depths)} depths (mm): {listed}" if len(depths) > 1 else "at one depth"
-        lines = [f"Points: {len(sweep.points_um)} {planes}"]
-        what = count(len(sweep.points_um), "point")
-    lit = len(sweep.points_um) * sweep.average
-    dark = sum(step.label == DARK for step in plan.steps())
-    revisits = ""
-    if reference_point(sweep) is not None:
-        visits = (cost.frames - lit - dark) // sweep.average
-        revisits = f" + {count(visits, 'visit')} to a reference x {sweep.average}"
-    lines.append(
-        f"Plan: {what} x {count(sweep.average, 'frame')}{revisits} + {count(dark, 'dark frame')} "
-        f"= {count(cost.frames, 'frame')}, {cost.total_bytes / 1e6:.0f} MB at most, "
-        f"{cost.seconds:.0f} s of exposure and motion."
-    )
-    if cost.total_bytes > _MUCH_BYTES:
-        lines.append(
-            f"Note: {cost.total_bytes / 1e9:.0f} GB are much. Fewer frames a PSF (--average), a larger "
-            "--spacing or fewer --planes make it less, and so does binning in [camera]."
-        )
-    return lines
 
 
 def exposure_lines(exposures: SweepExposures) -> list[str]:
@@ -245,6 +158,9 @@ ROUTINES = (
         "the calibration in the run's folder. Ends with the light off.",
         options=AxialSweep,
         procedure=SweepProcedure,
+        purpose=SWEEP,
+        finish=_finish,
+        watch=watch_resumed,
         examples=(
             "diffuserbench calibrate axial --z-min 100 --z-max 300 --planes 12",
             "diffuserbench calibrate axial --z-min 300          one PSF, 300 mm in front of the diffuser",
@@ -261,6 +177,9 @@ ROUTINES = (
         "reference point is visited again and again to tell whether the source drifts.",
         options=LateralSweep,
         procedure=SweepProcedure,
+        purpose=SWEEP,
+        finish=_finish,
+        watch=watch_resumed,
         needs=("stage",),
         examples=(
             "diffuserbench calibrate lateral --z 300 --dry-run          the grid, and why",
@@ -277,6 +196,9 @@ ROUTINES = (
         " unless given.",
         options=VolumeSweep,
         procedure=SweepProcedure,
+        purpose=SWEEP,
+        finish=_finish,
+        watch=watch_resumed,
         needs=("stage",),
         examples=(
             "diffuserbench calibrate volume --z-min 100 --z-max 300 --dry-run",

@@ -42,8 +42,8 @@ from calibration_routines.psf.stage_fit import (
     judge_visit,
     nominal_px_per_um,
 )
-from calibration_routines.psf.sweep_options import Sweep
-from calibration_routines.psf.sweep_plan import DARK, REFERENCE, axis_point, depths_um, reference_point
+from calibration_routines.psf.sweep_options import PointSweep
+from calibration_routines.psf.sweep_plan import DARK, REFERENCE
 from instrument.bench.photograph import Snapshot
 from instrument.plan import Step
 from recon.base.blocks import block_mean
@@ -119,28 +119,29 @@ class SweepWatch:
 
     Parameters
     ----------
-    sweep : Sweep
+    sweep : PointSweep
     geometry : Geometry
         Of the camera's pixels.
-    on_event : callable, optional
+
+    Attributes
+    ----------
+    on_event : callable or None
         Called with a :class:`PointTaken` or :class:`SourceVisit` in the thread that executes.
-    take_again : callable, optional
+    take_again : callable or None
         None: points that need it are only reported.
     """
 
     def __init__(
         self,
-        sweep: Sweep,
+        sweep: PointSweep,
         geometry: Geometry,
-        *,
-        on_event: OnEvent | None = None,
-        take_again: TakeAgain | None = None,
     ) -> None:
         self._sweep, self._geometry = sweep, geometry
-        self.on_event, self.take_again = on_event, take_again
+        self.on_event: OnEvent | None = None
+        self.take_again: TakeAgain | None = None
         self._numbers = {point: number for number, point in enumerate(sweep.points_um, start=1)}
-        self._central = {axis_point(sweep, z_um) for z_um in depths_um(sweep)}
-        self._reference = reference_point(sweep)
+        self._central = sweep.central
+        self._reference = sweep.reference_point
         self._parts: dict[int, list[Snapshot]] = {}
         self._dark_frames: dict[float, list[Counts]] = {}
         self._dark: DarkModel | None = None

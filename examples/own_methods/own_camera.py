@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.base import LinearOperator
-from recon.camera.camera_model import Depths
+from recon.camera.camera_model import Depths, OfferedCamera
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.offered import OfferedCamera
 
 Array = npt.NDArray[Any]
 

@@ -11,8 +11,7 @@ from recon.camera.base import LinearOperator
 from recon.priors import Prior
 from recon.reconstruction.part import Part
 from recon.reconstruction.solvers import OfferedSolver
-from recon.solvers.base import Solver
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Solver
 
 Array = npt.NDArray[Any]
 

@@ -13,11 +13,11 @@ from gui.session import BenchSession
 from gui.widgets.chart_view import ChartView
 from gui.widgets.dialogues import choose_path
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart_data import read_chart, subject_of
+from instrument.evaluation.chart import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
 from recon.base.declare import expression
-from recon.verdict.shipped import shipped_file
+from recon.verdict.cases import SHIPPED
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
 
@@ -29,7 +29,7 @@ class ChartsPanel(Panel):
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
-        self.maps_path = shipped_file()
+        self.maps_path = SHIPPED
         self.chart_path: Path | None = None
         self.stability = StabilityView()
         self.chart = ChartView()
@@ -38,7 +38,7 @@ class ChartsPanel(Panel):
         self.open_button.clicked.connect(self._choose)
         self.shipped_button = QPushButton("Shipped maps")
         self.shipped_button.setToolTip("The maps that come with the program, by which verdicts are made")
-        self.shipped_button.clicked.connect(lambda: self.open(shipped_file()))
+        self.shipped_button.clicked.connect(lambda: self.open(SHIPPED))
         self.heading = QLabel()
         self.heading.setMinimumWidth(10)
         self._headings = {self.stability: ("", ""), self.chart: (_NO_CHART, "")}
@@ -105,7 +105,7 @@ class ChartsPanel(Panel):
             lines = [
                 "from pathlib import Path",
                 "",
-                "from instrument.evaluation.chart_data import read_chart",
+                "from instrument.evaluation.chart import read_chart",
                 "",
                 f"points = read_chart({expression(self.chart_path)})['points']",
                 f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "
@@ -119,7 +119,7 @@ class ChartsPanel(Panel):
                 "from pathlib import Path",
                 "",
                 "from instrument.files.figures import save_figure",
-                "from instrument.evaluation.stability_figure import map_figure",
+                "from instrument.evaluation.figures import map_figure",
                 "from instrument.files.stability_file import read_stability",
                 "",
                 f"maps = read_stability({expression(self.maps_path)})['maps']",

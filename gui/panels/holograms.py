@@ -27,11 +27,10 @@ from gui.panel import Panel
 from gui.session import BenchSession
 from gui.widgets.hologram_views import HologramViews
 from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsMode
-from instrument.bench.display_setup import depth_limit_mm, expansion_side
-from instrument.display.hologram_job import field_picture
+from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.reconstruction.result_list import free_result
+from instrument.reconstruction.stored_result import free_result
 from recon.base.declare import expression, option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions

@@ -30,9 +30,7 @@ from gui.widgets.live_overlays import CrossHair, HistogramPlot, ProfileLine, Reg
 from gui.widgets.number_edit import NumberEdit
 from gui.widgets.plot import curve_pen, plot_widget
 from gui.widgets.record_bar import RecordBar
-from instrument.live.frame_view import histogram, line_profile, percentiles, sensor_roi
-from instrument.live.live_camera import LiveCameraStatus
-from instrument.runs.snapshot import (
+from instrument.bench.photograph import (
     LightState,
     check_photograph_file,
     led_pattern,
@@ -40,6 +38,8 @@ from instrument.runs.snapshot import (
     photograph_name,
     write_snapshot,
 )
+from instrument.live.frame_view import histogram, line_profile, percentiles, sensor_roi
+from instrument.live.live_camera import LiveCameraStatus
 
 _LOOK_MS = 8
 """Between two looks whether there is another frame: a look costs next to nothing."""
@@ -245,7 +245,8 @@ class LivePanel(Panel):
             "from drivers.camera import Roi",
             "from drivers.led_array import LedPattern",
             "from instrument.bench.bench import open_bench",
-            "from instrument.runs.snapshot import LightState, photograph_name, switch_light, write_snapshot",
+            "from instrument.bench.photograph import LightState, photograph_name",
+            "from instrument.bench.photograph import switch_light, write_snapshot",
             "",
             f"with open_bench({str(path) if path else None!r}) as bench:",
         ]

@@ -28,11 +28,11 @@ from gui.session import BenchSession
 from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
 from gui.widgets.number_edit import NumberEdit
+from instrument.bench.photograph import LightState, light_of
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.files.formatting import duration
+from instrument.files.errors import duration
 from instrument.live.live import LiveResult, full_picture
 from instrument.reconstruction.job import find_calibration
-from instrument.runs.snapshot import LightState, light_of
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.streams.live import LiveReconstructor

@@ -36,12 +36,16 @@ from gui.widgets.volume_view import VolumeView
 from instrument.files.calibration_file import calibrated_depths_um, newest_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import write_image
-from instrument.files.volume_zarr import uneven_steps
+from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.job import find_calibration
 from instrument.reconstruction.request import VolumeRequest
-from instrument.reconstruction.result_export import export_result
-from instrument.reconstruction.result_list import find_results, free_result
-from instrument.reconstruction.stored_result import StoredResult, open_result
+from instrument.reconstruction.stored_result import (
+    StoredResult,
+    export_result,
+    find_results,
+    free_result,
+    open_result,
+)
 from recon.base.declare import expression
 from recon.reconstruction.choice import Choice
 

@@ -29,8 +29,7 @@ from PySide6.QtWidgets import (
 
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
-from calibration_routines.psf.sweep import FOLDER
-from calibration_routines.psf.sweep_record import is_sweep
+from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background_reading import NewestOnly
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
@@ -39,7 +38,7 @@ from gui.session import BenchSession
 from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.run_bar import RunBar
-from instrument.runs.catalogue import RunSummary, run_paths, summary
+from instrument.runs.inspection import RunSummary, run_paths, summary
 from instrument.runs.run import Run, RunCondition
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
@@ -173,7 +172,7 @@ class RunsPanel(Panel):
         """Return lines that read the run, or go on with it where it did not end."""
         if self.opened is None:
             return (
-                "from pathlib import Path\n\nfrom instrument.runs.catalogue import run_paths, summary\n\n"
+                "from pathlib import Path\n\nfrom instrument.runs.inspection import run_paths, summary\n\n"
                 f"for path in run_paths(Path({str(self.session.runs_folder)!r})):\n    print(summary(path))\n"
             )
         if self._can_resume:
@@ -364,7 +363,7 @@ class RunsPanel(Panel):
 
     def _use(self) -> None:
         if self.opened is not None:
-            self.session.handed_on.emit("reconstructions", self.opened.path / FOLDER)
+            self.session.handed_on.emit("reconstructions", self.opened.path / SWEEP.result)
 
     def _open_folder(self) -> None:
         if self.opened is not None:
@@ -392,7 +391,7 @@ def _look_into(path: Path) -> _Found | str:
         run = Run.open(path)
         whole = run.condition is RunCondition.COMPLETED and not run.missing()
         can_resume = run.plan is not None and (not whole or lacks_result(run.path))
-        return _Found(run, sorted(run.records), _about(run), can_resume, (path / FOLDER).is_dir())
+        return _Found(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
     except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
         return str(error)
 
@@ -439,13 +438,13 @@ def _about(run: Run) -> list[str]:
     devices = run.provenance.get("devices")
     if isinstance(devices, Mapping):
         lines += [f"{kind}: {identity}" for kind, identity in devices.items()]
-    if is_sweep(run.path):
+    if SWEEP.is_of(run.path):
         lines += _calibration_lines(run.path)
     return lines
 
 
 def _calibration_lines(run: Path) -> list[str]:
-    file = run / FOLDER / "calibration.json"
+    file = run / SWEEP.result / "calibration.json"
     if not file.is_file():
         return ["A sweep without its calibration: Resume makes it."]
     try:

@@ -22,9 +22,8 @@ from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
-from instrument.files.errors import BenchError, FileError
-from instrument.files.formatting import count
-from instrument.plan.file import load_plan, plan_toml
+from instrument.files.errors import BenchError, FileError, count
+from instrument.plan.model import load_plan, plan_toml
 
 Image = npt.NDArray[Any]
 _LEVELS = (0.1, 99.9)

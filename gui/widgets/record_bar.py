@@ -14,13 +14,12 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QLineEdit, QProgressBar, QPus
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
 from gui.widgets.number_edit import NumberEdit
-from instrument.files.errors import FileError
-from instrument.files.formatting import size
+from instrument.bench.photograph import Lit
+from instrument.files.errors import FileError, size
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, there_now
 from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
-from instrument.runs.snapshot import Lit
 
 _DISK_MS = 5000
 _SILENT_S = 4.0

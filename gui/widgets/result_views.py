@@ -26,7 +26,7 @@ from gui.theme import colours
 from gui.widgets.image_view import ImageView
 from gui.widgets.levels_bar import LevelsBar
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 
 
 class FactsView(QTextBrowser):

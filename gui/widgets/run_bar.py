@@ -7,7 +7,7 @@ from PySide6.QtGui import QKeySequence
 from PySide6.QtWidgets import QGridLayout, QLabel, QProgressBar, QPushButton, QSizePolicy, QWidget
 
 from gui.procedure_run import Situation
-from instrument.files.formatting import duration
+from instrument.files.errors import duration
 
 _STEPS = 1000
 

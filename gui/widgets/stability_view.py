@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidg
 from gui.theme import colours
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from recon.verdict.failure import Failure
+from recon.verdict.map import Failure
 
 _SPAN = 1.0
 """The colours reach from a tenth of the severity at the boundary to ten times of it."""

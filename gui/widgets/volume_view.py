@@ -28,8 +28,8 @@ from gui.theme import colours
 from gui.widgets.image_view import StretchedImage
 from gui.widgets.levels_bar import LevelsBar
 from gui.widgets.plot import curve_pen, plot_widget, restyle
-from instrument.files.volume_source import Plane, VolumeSource
-from instrument.reconstruction.volume_views import Projections, grey, in_colour_of_depth, project
+from instrument.files.volumes import Plane, VolumeSource
+from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
 
 Mode = Literal["brightest", "slices"]
 Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]

@@ -22,10 +22,9 @@ from drivers.stage import Stage
 from instrument.bench.camera_settings import apply_table
 from instrument.bench.config import BenchConfig, CameraTable, Kind, SlmTable
 from instrument.bench.config_file import load_config
-from instrument.bench.lights import Ask, Lights, SceneSwitch
 from instrument.bench.photograph import Progress, Snapshot, photograph
 from instrument.bench.safety import ClosingAtExit, SafeStep, StepsFailedError, safe_steps, try_all
-from instrument.bench.source_mount import Position, SourceMount, known_geometry
+from instrument.bench.source_and_scene import Ask, Lights, Position, SceneSwitch, SourceMount, known_geometry
 from instrument.files.errors import BenchError
 from recon.types import Geometry
 

@@ -24,9 +24,8 @@ from instrument.bench.config import (
     SharedConfig,
     Table,
 )
-from instrument.bench.config_mistakes import Mistakes, nearest, nearest_name
+from instrument.bench.config_mistakes import Mistakes, key_lines, nearest, nearest_name
 from instrument.files.errors import ConfigError, ConfigProblem, FileError
-from instrument.files.toml_lines import key_lines
 
 DEFAULT_NAME = "bench.toml"
 BUILT_IN = "built-in bench.toml"

@@ -15,7 +15,7 @@ from drivers.errors import DeviceLostError, DeviceNotOpenError
 from drivers.led_array import LedArray
 from drivers.slm import Slm
 from drivers.stage import Stage
-from instrument.bench.lights import SceneSwitch
+from instrument.bench.source_and_scene import SceneSwitch
 from instrument.files.errors import BenchError
 
 _log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import typer
 from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.options import Only
 from instrument.files.errors import BenchError, FileError
-from instrument.files.volume_zarr import is_zarr_name
+from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.video_output import VideoPictures
@@ -118,7 +118,7 @@ def _video(
         return opened(path)
     if not (path / STATE).exists():
         raise FileError(path, "is neither a reconstructed video (.ome.zarr) nor a run.")
-    from instrument.cli.video import reconstruct_to_video
+    from instrument.cli.solving import reconstruct_to_video
     from instrument.reconstruction.video import VideoRequest
 
     files.out.mkdir(parents=True, exist_ok=True)

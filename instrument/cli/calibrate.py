@@ -26,7 +26,7 @@ from calibration_routines.optics.beads import (
     save_beads,
 )
 from calibration_routines.procedure import Listener, Outcome, Outlook, Routine, routines
-from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, event_note, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.cli.app import App, BenchOption, examples, open_and_say
@@ -114,8 +114,8 @@ def carry_out(
             return
         if not outlook.plan_lines:  # else said when the exposures are known
             print_lines(console, _plan_lines(outlook))
-        with Told(console) as told:
-            done = procedure.carry_out(opened, folder, listener=told)
+        with TerminalListener(console) as listener:
+            done = procedure.carry_out(opened, folder, listener=listener)
         print_outcome(console, done)
 
 
@@ -135,7 +135,7 @@ def print_outcome(console: Console, done: Outcome) -> None:
         console.print(f"{label:<13}{escape(str(path))}", soft_wrap=True)
 
 
-class Told(Listener):
+class TerminalListener(Listener):
     """Shows a bar for each step of a procedure, and prints what is found before frames are taken.
 
     A context, which takes away the last bar.
@@ -197,10 +197,12 @@ class Told(Listener):
 
     def event(self, event: SweepEvent) -> None:
         """Show the newest PSF's figures beside the bar, and print what is wrong above it."""
+        console = self._console
         if self._bar is not None:
             bar, task = self._bar
             bar.update(task, note=event_note(event))
-            print_lines(bar.console, event_lines(event))
+            console = bar.console
+        print_lines(console, event_lines(event))
 
 
 def print_lines(console: Console, lines: Sequence[str]) -> None:

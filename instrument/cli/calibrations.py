@@ -82,6 +82,7 @@ def analyze(
     from instrument.files.atomic import whole_file, write_text
     from instrument.files.calibration_file import load_calibration
     from instrument.files.figures import save_figure
+    from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
     from recon.analysis import analyse
 
@@ -113,7 +114,7 @@ def analyze(
             "calibration": str(folder.resolve()),
             "simulated": simulated,
             "provenance": measured.provenance,
-            "analysis": analysis.as_json(),
+            "analysis": plain(analysis.figures()),
         }
         write_text(record, json.dumps(described, indent=2, allow_nan=False) + "\n")
     if simulated:

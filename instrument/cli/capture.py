@@ -9,19 +9,19 @@ import numpy as np
 import typer
 
 from instrument.bench.bench import Bench
-from instrument.bench.photograph import Snapshot
-from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
-from instrument.cli.progress import keys, progress_bar
-from instrument.files.formatting import duration, size
-from instrument.runs.recorder import RecordingStatus, prepare_recording
-from instrument.runs.run import Run
-from instrument.runs.snapshot import (
+from instrument.bench.photograph import (
     LightState,
+    Snapshot,
     check_photograph_file,
     photograph_name,
     switch_light,
     write_snapshot,
 )
+from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
+from instrument.cli.progress import keys, progress_bar
+from instrument.files.errors import duration, size
+from instrument.runs.recorder import RecordingStatus, prepare_recording
+from instrument.runs.run import Run
 from recon.base.declare import option
 
 snap_app, record_app = App(), App()

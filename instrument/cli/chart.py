@@ -19,9 +19,10 @@ from recon.base.declare import option
 from recon.base.option_text import size as size_of
 
 if TYPE_CHECKING:
-    from instrument.evaluation.chart_data import ChartData
+    from instrument.evaluation.chart import ChartData
     from instrument.reconstruction.job import Job
-    from recon.evaluation.scored import Named, Point, Problem
+    from recon.evaluation.scored import Point
+    from recon.evaluation.trial import Named, Subject
 
 app = App()
 
@@ -176,7 +177,7 @@ def chart(
     given.refuse(subject.title, subject.word, *subject.of_photographs)
     if bench is not None and subject is not _HOLOGRAM:
         raise BenchError(f"--bench is for holograms; it does not apply with {subject.title}.")
-    from instrument.evaluation.chart_figure import write_charts
+    from instrument.evaluation.figures import write_charts
 
     out = options.out
     began = time.monotonic()
@@ -203,7 +204,7 @@ def _problem(
     source: SourceOptions,
     inputs: InputOptions,
     bench: Path | None,
-) -> tuple[Problem, dict[str, Any]]:
+) -> tuple[Subject[Any], dict[str, Any]]:
     """Return what is charted, and what to say of it."""
     from instrument.evaluation.chart_problems import (
         problem_of_calibrations,
@@ -280,7 +281,7 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     if psf is not None and volume:
         raise BenchError("--volume needs --calibration: one PSF image is of one depth.")
     from instrument.reconstruction.job import job_from_calibration, job_from_files
-    from instrument.reconstruction.volume_job import volume_job
+    from instrument.reconstruction.request import volume_job
 
     if psf is not None:
         return job_from_files(psf, image, inputs)
@@ -289,7 +290,7 @@ def _job(folder: Path | None, source: SourceOptions, inputs: InputOptions, *, vo
     return prepared(folder, image, inputs)
 
 
-def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[str, Any]]:
+def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Subject[Any], dict[str, Any]]:
     from instrument.evaluation.bench_photographs import OutOfTimeError, photographs
     from recon.evaluation.chart_calibration import CalibrationProblem
 
@@ -317,18 +318,18 @@ def _calibrations(size: int, out: Path, budget_s: float) -> tuple[Problem, dict[
     return CalibrationProblem(taken), {"bench": "simulated microscope", "simulated": True}
 
 
-def _made(problem: Problem, about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
-    from instrument.evaluation.chart_job import make_chart
+def _made(problem: Subject[Any], about: dict[str, Any], record: Path, budget_s: float) -> ChartData:
+    from instrument.evaluation.chart import make_chart
 
     with saying_what_is_left(record), progress_bar() as bar:
         task = bar.add_task("settings", total=None, note="")
 
-        def told(place: int, total: int, setting: Named, left_s: float) -> None:
+        def on_progress(place: int, total: int, setting: Named, left_s: float) -> None:
             bar.update(
                 task, total=total, completed=place, note=f"{setting.name}, {left_s:.0f} s of the budget left"
             )
 
-        return make_chart(problem, about, record, budget_s=budget_s, told=told)
+        return make_chart(problem, about, record, budget_s=budget_s, on_progress=on_progress)
 
 
 def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
@@ -350,7 +351,7 @@ def _tell_even(group: str, even: Sequence[Point], *, on_the_way: bool) -> None:
 
 
 def _told(point: Point) -> str:
-    from instrument.evaluation.chart_data import in_words
+    from instrument.evaluation.chart import in_words
 
     # Pixel by pixel, as settings were compared; points are drawn by blocks, which every binning has.
     error = (sum(point.held_out_parts) / len(point.held_out_parts)) ** 0.5

@@ -14,7 +14,8 @@ from rich.markup import escape
 from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
 from calibration_routines.demo.demo import Advance, DemoResult, run_demo
 from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.psf.sweep_procedure import exposure_lines, plan_lines, quality_lines
+from calibration_routines.psf.sweep_plan import plan_lines
+from calibration_routines.psf.sweep_procedure import exposure_lines, quality_lines
 from instrument.bench.bench import Bench
 from instrument.cli.app import App, examples
 from instrument.cli.calibrate import print_lines
@@ -58,8 +59,8 @@ class _Terminal:
 
     def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
         print_lines(self._console, exposure_lines(exposures))
-        plan = sweep_plan(settings.sweep, exposures.exposures_ms)
-        print_lines(self._console, plan_lines(bench, settings.sweep, plan, None))
+        sweep = settings.sweep.points()
+        print_lines(self._console, plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), None))
 
     def on_sweep(self, done: SweepCalibration) -> None:
         print_lines(self._console, quality_lines(done))

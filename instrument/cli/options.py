@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import typer
@@ -24,6 +24,7 @@ from recon.base.option_text import help_text, metavar, read
 from recon.errors import InputError
 
 _MAIN = "Options"
+_WORDS = "words that were typed"
 _WIDEST_FLAG = 30
 _MANY = 30
 """Options, above which help does without empty lines between the groups."""
@@ -71,6 +72,11 @@ class Given:
 
 class GroupedCommand(TyperCommand):
     """A command whose help shows the options under their groups' headings, what is rare last."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Remember the flags as they were typed: of several names of an option messages say that one."""
+        ctx.meta[_WORDS] = {word.partition("=")[0] for word in args}
+        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options, a definition list a group; close together where there are many."""
@@ -129,25 +135,38 @@ def flat(function: Callable[..., None]) -> Callable[..., None]:
         else:
             parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
 
-    def run(**values: Any) -> None:
+    def run(context: typer.Context, **values: Any) -> None:
         typed = {key: values.pop(key) for key in declared}
         given = {key: value for key, value in typed.items() if value is not None and value != []}
-        read_values = _read(declared, given)
+        named = {
+            key: _as_named(o, context.meta[_WORDS]) if key in given else o for key, o in declared.items()
+        }
+        read_values = _read(named, given)
         for name, (cls, keys) in objects.items():
             values[name] = cls(**{o.name: read_values[key] for key, o in keys.items() if key in read_values})
         if wants_given:
             values[wants_given] = Given(
-                {declared[key].name: declared[key] for key in given},
-                {declared[key].name: _as_typed(declared[key], value) for key, value in given.items()},
+                {named[key].name: named[key] for key in given},
+                {named[key].name: _as_typed(named[key], value) for key, value in given.items()},
             )
         function(**values)
 
     run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    parameters.insert(0, context)
     run.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.declared = declared  # type: ignore[attr-defined]
     run.options_classes = [cls for cls, _ in objects.values()]  # type: ignore[attr-defined]
     return run
+
+
+def _as_named(o: Option, words: Container[str]) -> Option:
+    """Return an option with that of its flags first that was typed."""
+    if (typed := next((f for f in o.flags if f.startswith("--") and f in words), o.flag)) == o.flag:
+        return o
+    flags = (typed, *(flag for flag in o.flags if flag != typed))
+    return replace(o, declaration=replace(o.declaration, flags=flags))
 
 
 def _as_typed(o: Option, value: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -13,13 +13,13 @@ import typer
 
 from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.files.atomic import write_text
-from instrument.files.errors import BenchError, FileError
-from instrument.files.formatting import duration, size
+from instrument.files.errors import BenchError, FileError, duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
-from instrument.plan.file import load_plan, save_plan
 from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
+from instrument.plan.model import load_plan, save_plan
 from instrument.plan.patterns import LED_PATTERNS, led_shape, pattern_help, shape_from_text
 from instrument.runs.acquire import abilities_of
+from recon.base.declare import option
 
 Point = tuple[float, float]
 WIDTH, HEIGHT = 56, 14
@@ -64,6 +64,30 @@ def _scaled(value: float, low: float, high: float, last: int) -> int:
 
 
 app = App("Look at a plan before anything moves, or write one to start from.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IlluminationOptions:
+    """Which LEDs light each frame, and how it is exposed."""
+
+    exposure_ms: float = option(help="Of every frame.", unit="ms", least=1e-3)
+    groups: list[list[int]] | None = option(
+        None, help="LEDs of each pattern: '0-3,8;4;5,6'.", metavar="LEDS", parse=groups_from_text
+    )
+    lattice: int | None = option(
+        None,
+        help="The array's LEDs in N x N groups by place; short for --pattern 'grid side=N'.",
+        metavar="N",
+        least=1,
+    )
+    pattern: str | None = option(
+        None,
+        help=f"A named pattern and all that belong to it: {', '.join(LED_PATTERNS)}. With options: "
+        "'half na=0.3'. diffuserbench plan patterns lists them.",
+        metavar="NAME",
+    )
+    level: int = option(255, help="Of every LED.", least=1, most=255)
+    average: int = option(1, help="Exposures averaged into a frame.", least=1)
 
 
 @app.command(
@@ -111,38 +135,10 @@ def new(
     )
 )
 def illumination(
-    exposure_ms: Annotated[float, typer.Option("--exposure-ms", min=1e-3, help="Of every frame.")],
+    options: IlluminationOptions,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write it.")] = Path(
         "illumination.toml"
     ),
-    groups: Annotated[
-        str | None,
-        typer.Option(
-            "--groups", metavar="LEDS", help="LEDs of each pattern: '0-3,8;4;5,6'.", show_default=False
-        ),
-    ] = None,
-    lattice: Annotated[
-        int | None,
-        typer.Option(
-            "--lattice",
-            metavar="N",
-            min=1,
-            help="The array's LEDs in N x N groups by place; short for --pattern 'grid side=N'.",
-            show_default=False,
-        ),
-    ] = None,
-    pattern: Annotated[
-        str | None,
-        typer.Option(
-            "--pattern",
-            metavar="NAME",
-            help=f"A named pattern and all that belong to it: {', '.join(LED_PATTERNS)}. With options: "
-            "'half na=0.3'. diffuserbench plan patterns lists them.",
-            show_default=False,
-        ),
-    ] = None,
-    level: Annotated[int, typer.Option("--level", min=1, max=255, help="Of every LED.")] = 255,
-    average: Annotated[int, typer.Option("--average", min=1, help="Exposures averaged into a frame.")] = 1,
     bench: BenchOption = None,
 ) -> None:
     """Write a plan of active illumination: the scene lit by one group of LEDs after the other.
@@ -150,16 +146,17 @@ def illumination(
     Run it twice, with the scene and with a plain white sheet in its place; then
     diffuserbench reconstruct SCENE --patterned SHEET solves all frames together.
     """
-    if sum(given is not None for given in (groups, lattice, pattern)) != 1:
+    groups, level = options.groups, options.level
+    if sum(given is not None for given in (groups, options.lattice, options.pattern)) != 1:
         raise BenchError("Give the patterns either as --groups, --lattice N or --pattern NAME (one of them).")
     if file.suffix.lower() not in (".toml", ".json"):
         raise FileError(file, "a plan's name ends in .toml or .json.")
     if file.exists():
         raise FileError(file, "exists already and was left as it is.")
     if groups is not None:
-        lights = group_lights(groups_from_text(groups), level)
+        lights = group_lights(groups, level)
     else:
-        shape = led_shape(*shape_from_text(pattern or f"grid side={lattice}"))
+        shape = led_shape(*shape_from_text(options.pattern or f"grid side={options.lattice}"))
         with open_and_say(bench) as opened:
             if opened.led_array is None:
                 raise BenchError(
@@ -167,7 +164,8 @@ def illumination(
                 )
             rgb = None if level == 255 else (level, level, level)
             lights = [Light.named(one, rgb) for one in shape.series(opened.led_array)]
-    save_plan(illumination_plan(lights, exposure_ms=exposure_ms, average=average), file)
+    plan = illumination_plan(lights, exposure_ms=options.exposure_ms, average=options.average)
+    save_plan(plan, file)
     typer.echo(f"Wrote {file}: {len(lights)} patterns. Look at it with: diffuserbench plan show {file}")
 
 

@@ -101,7 +101,7 @@ def _photograph(asked: _Asked) -> None:
 
 
 def _video(asked: _Asked, run: Path | None) -> None:
-    from instrument.cli.video import reconstruct_to_video
+    from instrument.cli.solving import reconstruct_to_video
     from instrument.reconstruction.video import VideoRequest
 
     source, output, video = asked.source, asked.output, asked.video

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import typer
 
+from instrument.cli import COMMANDS
 from instrument.cli.app import App
-from instrument.cli.commands import COMMANDS
 from recon.base.option_text import table
 
 _INTRODUCTION = """\

@@ -17,7 +17,7 @@ from recon.base.declare import option
 
 if TYPE_CHECKING:
     from calibration_routines.display.display_io import DisplayBench
-    from instrument.files.alignment_file import Alignment
+    from instrument.display.hologram import Alignment
     from instrument.runs.run import Run
 
 app = App()
@@ -134,7 +134,7 @@ def _show_hologram(what: list[Path], options: ShowOptions, bench: Path | None) -
     import numpy as np
 
     from calibration_routines.display.display_io import DisplayBench, bring_mask
-    from instrument.files.alignment_file import load_alignment
+    from instrument.display.hologram import load_alignment
     from instrument.files.slm_image import levels_phase, load_slm_correction, read_slm_image
 
     correction = load_slm_correction(options.slm_calibration) if options.slm_calibration else None
@@ -188,7 +188,7 @@ def _capture(
         write_capture,
         write_refined,
     )
-    from instrument.display.hologram_job import prepare_target
+    from instrument.display.hologram import prepare_target
     from instrument.files.images import read_image
     from recon.holography import HologramOptions
 
@@ -229,7 +229,7 @@ def _capture(
 
 def _show_run(run: Path, picture: Path | None) -> None:
     """Say how a run ended, what it holds, with which bench and software; draw a sheet of its frames."""
-    from instrument.runs.catalogue import contact_sheet
+    from instrument.runs.inspection import contact_sheet
     from instrument.runs.run import Run
 
     found = Run.open(run)
@@ -243,7 +243,7 @@ def _show_run(run: Path, picture: Path | None) -> None:
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:
-    from instrument.files.formatting import size
+    from instrument.files.errors import size
 
     origin = run.provenance
     facts = [

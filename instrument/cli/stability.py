@@ -112,7 +112,7 @@ def _make(folder: Path) -> None:
 
 
 def _draw(record: dict[str, object], picture: Path) -> None:
-    from instrument.evaluation.stability_figure import map_figure
+    from instrument.evaluation.figures import map_figure
     from instrument.files.atomic import whole_file
     from instrument.files.figures import save_figure
 
@@ -122,9 +122,9 @@ def _draw(record: dict[str, object], picture: Path) -> None:
 
 def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:
     from instrument.files.stability_file import RESULT, read_stability
-    from recon.verdict.shipped import shipped_file
+    from recon.verdict.cases import SHIPPED
 
-    maps = read_stability(shipped_file() if shipped else out / RESULT)["maps"]
+    maps = read_stability(SHIPPED if shipped else out / RESULT)["maps"]
     if missing := [n for n in names or () if n not in maps]:
         raise BenchError(f"Not made yet: {', '.join(missing)}. Leave --redraw out to make them.")
     _make(out)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from recon.analysis import Analysis
-from recon.analysis.condition import ConditionCurve
+from recon.analysis.gram import ConditionCurve
 from recon.analysis.points import PointTrial
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from instrument.bench.config import BenchConfig
-from instrument.bench.display_setup import bench_display, slm_size
-from instrument.display.hologram_job import prepare_target
+from instrument.display.hologram import bench_display, prepare_target, slm_size
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
 from instrument.files.sample_images import SAMPLES
@@ -20,7 +19,7 @@ from recon.base.noise import NoiseModel, averaged_noise
 from recon.camera.camera_model import one_depth
 from recon.errors import InputError
 from recon.evaluation.chart_hologram import HologramProblem
-from recon.evaluation.chart_reconstruction import ChartProblem, left_out
+from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.own_calibrations import OwnCalibration, OwnCalibrationsProblem
 from recon.evaluation.scene import make_scene
 
@@ -40,16 +39,9 @@ def problem_of_scene(family: str, size: int, seed: int) -> tuple[ChartProblem, d
         scene = make_scene(family, size=size, seed=seed, grid=3)  # type: ignore[arg-type]
     except InputError as error:
         raise BenchError(f"--scene {family}: {error}") from error
-    problem = ChartProblem(
-        scene.measurement,
-        scene.calibration,
-        not scene.spec.is_picture,
-        scene.erasures,
-        scene.noise,
-        scene.truth,
-    )
+    problem = ChartProblem.of_scene(scene)
     about = {"scene": family, "size": size, "seed": seed, "simulated": True}
-    return problem, {**about, "left_out": list(left_out(problem))}
+    return problem, {**about, "left_out": list(problem.left_out())}
 
 
 def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[ChartProblem, dict[str, Any]]:
@@ -69,7 +61,7 @@ def problem_of_job(job: Job, z_um: float | None, *, volume: bool) -> tuple[Chart
         _noise_of_mean(job),
     )
     about = {"inputs": dict(job.provenance), "simulated": job.simulated}
-    return problem, {**about, "left_out": list(left_out(problem))}
+    return problem, {**about, "left_out": list(problem.left_out())}
 
 
 def problem_of_calibrations(

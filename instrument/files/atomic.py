@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from instrument.files.errors import FileError
 
@@ -94,6 +96,17 @@ def write_bytes(path: Path | str, data: bytes) -> None:
     """Write bytes; errors as ``whole_file``."""
     with whole_file(path) as temporary:
         temporary.write_bytes(data)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that does not exist yet, and put its name on the disk."""
+    path.mkdir()
+    sync_folder(path.parent)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a mapping as a JSON file, atomically."""
+    write_bytes(path, (json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
 def check_writable(path: Path | str, n_bytes: int = 0) -> None:

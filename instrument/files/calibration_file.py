@@ -24,8 +24,8 @@ import numpy.typing as npt
 
 from instrument.files.atomic import whole_folder
 from instrument.files.errors import FileError
-from instrument.files.ome import ome_attributes
 from instrument.files.record import RecordFormat
+from instrument.files.volumes import ome_attributes
 from recon.types import Calibration, Geometry
 
 _JSON = "calibration.json"

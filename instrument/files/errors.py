@@ -1,4 +1,4 @@
-"""What can go wrong above the devices, in words a person can act on."""
+"""What can go wrong above the devices, and numbers, in words for people."""
 
 from __future__ import annotations
 
@@ -139,3 +139,25 @@ def _is_input_error(error: ValueError) -> bool:
     from recon.errors import InputError  # costs half a second, which only an error has to wait
 
     return isinstance(error, InputError)
+
+
+def size(n_bytes: float) -> str:
+    """Return a number of bytes for people."""
+    for unit in ("bytes", "kB", "MB", "GB", "TB"):
+        if n_bytes < 1000 or unit == "TB":
+            return f"{n_bytes:.0f} {unit}" if unit == "bytes" else f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    raise AssertionError
+
+
+def count(number: int, noun: str) -> str:
+    """Return how many of something there are: ``1 frame``, ``2 frames``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def duration(seconds: float) -> str:
+    """Return a time for people."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"

@@ -58,8 +58,8 @@ class RecordFormat:
         Every field that is known at the top; None where a record carries any further facts.
     error : type of FileError
         Raised for whatever is wrong with a file.
-    numbered_before : bool
-        Whether files of before named no format and had the version as ``"format"``.
+    numbered_before, unnamed_before : bool
+        Whether files of before named no format, and had the version as ``"format"`` or nothing there.
     """
 
     name: str
@@ -72,6 +72,7 @@ class RecordFormat:
     fields: Sequence[str] | None = None
     error: type[FileError] = FileError
     numbered_before: bool = False
+    unnamed_before: bool = False
 
     # Writing -------------------------------------------------------------------------------------
     def stamped(self, fields: Mapping[str, Any]) -> Fields:
@@ -120,7 +121,8 @@ class RecordFormat:
     def checked(self, record: Fields, path: Path) -> Fields:
         """Return the fields of a record that was read from ``path``; errors as :meth:`read`."""
         fields = dict(record)
-        name, version = fields.pop("format", None), fields.pop("version", 1)
+        name = fields.pop("format", self.name if self.unnamed_before else None)
+        version = fields.pop("version", 1)
         if self.numbered_before and isinstance(name, int):
             name, version = self.name, name
         if name != self.name:

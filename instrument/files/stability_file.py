@@ -14,12 +14,30 @@ import numpy as np
 
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.files.record import RecordFormat
+from instrument.files.record import Fields, RecordFormat
+from recon.verdict.cases import OF_VOLUMES
 from recon.verdict.map import Axis, Cell, Size, StressMap, boundary, severity_grid
+
+
+def _named(method: str) -> str:
+    """Name a method of volumes by its solver, as those of pictures: "volume tv" is "admm tv of volumes"."""
+    kind, _, prior = method.partition(" ")
+    return f"admm {prior}{OF_VOLUMES}" if kind == "volume" else method
+
+
+def _of_volumes(fields: Fields) -> Fields:
+    maps = {
+        name: {**found, "methods": {_named(m): result for m, result in found["methods"].items()}}
+        for name, found in fields["maps"].items()
+    }
+    return {**fields, "maps": maps}
+
 
 STABILITY = RecordFormat(
     "diffuserbench-stability",
     "stability maps",
+    major=2,
+    migrate={1: _of_volumes},
     make="Make it with diffuserbench stability.",
     fields=("program", "utc", "machine", "command", "maps"),
 )
@@ -61,7 +79,7 @@ class CellLog:
                 entry = json.loads(line)
                 # Lines of old have neither program nor scene: they are of another, whatever it was.
                 key = (*(str(entry[name]) for name in _KEY[:3]), *(str(entry.get(n)) for n in _KEY[3:]))
-                self._keep(key, Cell.from_json(entry))
+                self._keep(key, Cell.from_json({**entry, "method": _named(entry["method"])}))
             except (ValueError, KeyError, TypeError) as error:
                 if number == len(lines):  # cut off in mid-line: that cell is made again
                     self._cut_last(lines)

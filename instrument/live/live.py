@@ -23,7 +23,7 @@ from instrument.reconstruction.preparation import bin_image
 from recon import Measurement, reconstruct
 from recon.errors import InputError
 from recon.reconstruction.result import Reconstruction
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 from recon.streams.live import LivePicture, LiveReconstructor
 from recon.types import Calibration
 

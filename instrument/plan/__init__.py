@@ -1,8 +1,8 @@
 """Plans: what an acquisition will do, as data that counts, checks and iterates itself into steps."""
 
 from instrument.plan.abilities import BenchAbilities, PlanEstimate, check, estimate, stored_dtype
-from instrument.plan.errors import PlanError
-from instrument.plan.model import OFF, SOURCE, Light, Part, Plan, Step
+from instrument.plan.model import Part, Plan, PlanError, Step
+from instrument.plan.patterns import OFF, SOURCE, Light
 from instrument.plan.positions import SourceGrid, SourcePoints, SourcePosition, Span, StagePoints
 
 __all__ = [

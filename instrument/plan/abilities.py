@@ -12,9 +12,8 @@ import numpy as np
 from drivers.stage import StageAxis
 from instrument.files.errors import FileError
 from instrument.files.slm_image import read_slm_levels
-from instrument.plan.errors import PlanError
 from instrument.plan.led_shapes import LedPlaces
-from instrument.plan.model import Plan, Step
+from instrument.plan.model import Plan, PlanError, Step
 from instrument.plan.positions import SourcePosition
 
 SPARE_BYTES = 256 * 2**20

@@ -6,7 +6,8 @@ import re
 from collections.abc import Sequence
 
 from instrument.files.errors import BenchError
-from instrument.plan.model import OFF, Light, Part, Plan
+from instrument.plan.model import Part, Plan
+from instrument.plan.patterns import OFF, Light
 
 DARK, PATTERN = "dark", "pattern"
 """What the frames of such a plan are called."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -12,120 +13,20 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     Field,
     PositiveFloat,
-    SerializerFunctionWrapHandler,
     StringConstraints,
     ValidationError,
-    model_serializer,
     model_validator,
 )
 
-from drivers.led_array import LedPattern
-from instrument.plan.errors import PlanError, plan_problems
-from instrument.plan.led_shapes import WHITE, LedPlaces, LedShape
-from instrument.plan.patterns import LED_PATTERNS, led_shape, shape_from_text, shape_text
+from instrument.files.atomic import write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.plan.led_shapes import LedPlaces
+from instrument.plan.patterns import OFF, Light
 from instrument.plan.positions import PlanData, Positions, SourcePosition, StagePoints
-from recon.base.declare import changed
 
 Label = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=r"^[^/\x00-\x1f]+$")]
 Loop = Literal["repeat", "position", "light", "slm", "exposure"]
 LOOPS: tuple[Loop, ...] = ("repeat", "position", "slm", "light", "exposure")
-Level = Annotated[int, Field(ge=0, le=255)]
-_WITHOUT_SHAPE = ("off", "source", "pattern")
-"""Kinds of light that are no patterns by name."""
-
-
-class Light(PlanData):
-    """What the LED array shows during a step.
-
-    ``off``: dark. ``source``: the bench's point source, as ``bench.toml`` describes it. ``pattern``: the
-    listed LEDs, ``leds`` as ``[index, red, green, blue]`` with levels 0 to 255. Any other kind is a pattern
-    of :mod:`instrument.plan.patterns` by name, its options beside it, in the colour ``rgb`` (white); the LEDs
-    are found by :meth:`on` when the array is known.
-    """
-
-    kind: str
-    description: str = ""
-    leds: tuple[tuple[Annotated[int, Field(ge=0)], Level, Level, Level], ...] = ()
-    rgb: tuple[Level, Level, Level] | None = None
-    options: dict[str, Any] = Field(default_factory=dict)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _options_beside(cls, data: Any) -> Any:
-        """Take the options of a named pattern from beside its kind, or from a kind with options behind it."""
-        if not isinstance(data, Mapping):
-            return data
-        data = dict(data)
-        kind = data.get("kind")
-        if isinstance(kind, str) and len(kind.split()) > 1:
-            data["kind"], written = shape_from_text(kind)
-            data = {**written, **data}
-        if data.get("kind") not in _WITHOUT_SHAPE:
-            given = dict(data.get("options", {}))
-            given |= {name: data.pop(name) for name in list(data) if name not in cls.model_fields}
-            data["options"] = given
-        return data
-
-    @model_validator(mode="after")
-    def _kind_and_the_rest_agree(self) -> Light:
-        if (self.kind == "pattern") != bool(self.leds):
-            raise ValueError('leds belong to kind = "pattern", which needs at least one')
-        if self.kind in _WITHOUT_SHAPE and (self.options or self.rgb is not None):
-            raise ValueError(f'kind = "{self.kind}" has no options and no rgb')
-        if self.is_named and self.kind not in LED_PATTERNS:
-            known = ", ".join((*_WITHOUT_SHAPE, *LED_PATTERNS))
-            raise ValueError(f"light {self.kind!r} is not known; there are {known}")
-        if self.is_named:
-            led_shape(self.kind, self.options)
-        return self
-
-    @model_serializer(mode="wrap")
-    def _with_options_beside(self, dumped: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        data: dict[str, Any] = dumped(self)
-        options = data.pop("options", {})
-        if self.rgb is None:
-            data.pop("rgb", None)
-        return {**data, **options}
-
-    @classmethod
-    def of(cls, pattern: LedPattern) -> Light:
-        """Return the light of a pattern that was composed for an LED array."""
-        leds = tuple((index, *rgb) for index, rgb in pattern.levels)
-        if not leds:
-            return OFF
-        return cls(kind="pattern", description=pattern.description, leds=leds)
-
-    @classmethod
-    def named(cls, shape: LedShape, rgb: tuple[int, int, int] | None = None) -> Light:
-        """Return the light of a named pattern."""
-        options = {option.name: value for option, value in changed(shape)}
-        return cls(kind=shape.name, rgb=rgb, options=options)
-
-    @property
-    def is_named(self) -> bool:
-        """Whether it is a pattern by name, whose LEDs :meth:`on` finds."""
-        return self.kind not in _WITHOUT_SHAPE
-
-    def on(self, array: LedPlaces) -> Light:
-        """Return the light with its LEDs listed, for an array; itself where it is no pattern by name."""
-        if not self.is_named:
-            return self
-        return Light.of(led_shape(self.kind, self.options).on(array, self.rgb or WHITE))
-
-    def pattern(self) -> LedPattern:
-        """Return the LED pattern of a light of kind ``pattern``."""
-        name = self.description or f"LEDs {', '.join(str(led[0]) for led in self.leds)}"
-        return LedPattern(name, tuple((led[0], (led[1], led[2], led[3])) for led in self.leds))
-
-    def __str__(self) -> str:
-        if self.is_named:
-            colour = "" if self.rgb is None else f" rgb {self.rgb}"
-            return shape_text(led_shape(self.kind, self.options)) + colour
-        return self.kind if self.kind != "pattern" else self.pattern().description
-
-
-OFF = Light(kind="off")
-SOURCE = Light(kind="source")
 
 
 class Part(PlanData):
@@ -405,3 +306,101 @@ def _leave_out(data: Any, location: Sequence[int | str]) -> None:
         if isinstance(step, int) or step in data:
             data = data[step]
     data.pop(last, None)
+
+
+class PlanError(BenchError):
+    """A plan that cannot be carried out: every reason at once. Nothing has moved.
+
+    Parameters
+    ----------
+    name : path or str
+        The plan's file or label.
+    problems : sequence of str
+    """
+
+    def __init__(self, name: Path | str, problems: Sequence[str]) -> None:
+        self.name = name
+        self.problems = tuple(problems)
+        count = len(self.problems)
+        head = f"{name}: {count} problem{'s' if count != 1 else ''} in the plan. Nothing has moved."
+        super().__init__("\n  ".join((head, *self.problems)))
+
+
+def plan_problems(error: ValidationError) -> tuple[str, ...]:
+    """Return a validation's findings as sentences that name the place."""
+    mistakes = error.errors(include_url=False)
+    places = [found["loc"] for found in mistakes]
+    return tuple(
+        f"{_place(found['loc'])}: {found['msg'].removeprefix('Value error, ')}"
+        + (f" (found {found['input']!r:.80})" if not isinstance(found["input"], Mapping) else "")
+        for found in mistakes
+        # A list whose every item is wrong counts as empty too; its items' own mistakes say it better.
+        if found["type"] != "too_short"
+        or not any(place[: len(found["loc"])] == found["loc"] != place for place in places)
+    )
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    return (
+        "".join(f"[{item}]" if isinstance(item, int) else f".{item}" for item in location).lstrip(".")
+        or "plan"
+    )
+
+
+def load_plan(path: Path | str) -> Plan:
+    """Read a plan from a TOML or JSON file. Relative paths of SLM images are seen from the file's folder.
+
+    Raises
+    ------
+    FileError
+        When there is no such file, or its name ends neither in .toml nor in .json.
+    PlanError
+        Naming every mistake in it.
+    """
+    path = Path(path)
+    reader = _reader(path)
+    if not path.is_file():
+        raise FileError(path, "is a folder; a plan is a file." if path.is_dir() else "no such plan file.")
+    try:
+        data = reader(path.read_text())
+    except UnicodeDecodeError:
+        raise FileError(path, "is no text file.", "A plan is a TOML or JSON file.") from None
+    except ValueError as error:  # of tomllib and json alike; both name the line
+        raise PlanError(path, [str(error)]) from None
+    return Plan.checked(data, path).with_slm_images(lambda image: path.parent / image)
+
+
+def save_plan(plan: Plan, path: Path | str) -> None:
+    """Write a plan as TOML or JSON, by the file's suffix; :func:`load_plan` reads it back equal."""
+    path = Path(path)
+    is_toml = _reader(path) is tomllib.loads
+    write_text(path, plan_toml(plan) if is_toml else plan.to_json() + "\n")
+
+
+def plan_toml(plan: Plan) -> str:
+    """Return a plan as TOML, without what is as by default."""
+    data = plan.model_dump(mode="json", exclude_defaults=True)
+    for part, model in zip(data["parts"], plan.parts, strict=True):
+        if model.positions is not None:
+            part["positions"] = {"kind": model.positions.kind, **part["positions"]}
+    lines = [f"label = {_toml(data['label'])}"]
+    for part in data["parts"]:
+        lines += ["", "[[parts]]", *(f"{key} = {_toml(value)}" for key, value in part.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _reader(path: Path) -> Any:
+    readers: Mapping[str, Any] = {".toml": tomllib.loads, ".json": json.loads}
+    if path.suffix.lower() not in readers:
+        raise FileError(path, f"a plan's name ends in {' or '.join(readers)}.")
+    return readers[path.suffix.lower()]
+
+
+def _toml(value: Any) -> str:
+    """Return a JSON value in TOML's notation, inline."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    # Strings, numbers and booleans are written alike in both; a TOML basic string takes JSON's escapes.
+    return json.dumps(value, ensure_ascii=False)

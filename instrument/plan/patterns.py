@@ -9,9 +9,23 @@ They are written ``NAME OPTION=VALUE ...``: ``"half side=left na=0.3"``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from instrument.plan.led_shapes import Annulus, BrightField, DarkField, GridCell, HalfCircle, LedShape, Single
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from drivers.led_array import LedPattern
+from instrument.plan.led_shapes import (
+    WHITE,
+    Annulus,
+    BrightField,
+    DarkField,
+    GridCell,
+    HalfCircle,
+    LedPlaces,
+    LedShape,
+    Single,
+)
+from instrument.plan.positions import PlanData
 from recon.base.declare import changed, options_of, require, with_overrides
 from recon.base.registry import Registry
 from recon.errors import InputError
@@ -90,3 +104,102 @@ def _value(text: str) -> Any:
         except ValueError:
             continue
     return text
+
+
+Level = Annotated[int, Field(ge=0, le=255)]
+_WITHOUT_SHAPE = ("off", "source", "pattern")
+"""Kinds of light that are no patterns by name."""
+
+
+class Light(PlanData):
+    """What the LED array shows during a step.
+
+    ``off``: dark. ``source``: the bench's point source, as ``bench.toml`` describes it. ``pattern``: the
+    listed LEDs, ``leds`` as ``[index, red, green, blue]`` with levels 0 to 255. Any other kind is a pattern
+    of :mod:`instrument.plan.patterns` by name, its options beside it, in the colour ``rgb`` (white); the LEDs
+    are found by :meth:`on` when the array is known.
+    """
+
+    kind: str
+    description: str = ""
+    leds: tuple[tuple[Annotated[int, Field(ge=0)], Level, Level, Level], ...] = ()
+    rgb: tuple[Level, Level, Level] | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _options_beside(cls, data: Any) -> Any:
+        """Take the options of a named pattern from beside its kind, or from a kind with options behind it."""
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        kind = data.get("kind")
+        if isinstance(kind, str) and len(kind.split()) > 1:
+            data["kind"], written = shape_from_text(kind)
+            data = {**written, **data}
+        if data.get("kind") not in _WITHOUT_SHAPE:
+            given = dict(data.get("options", {}))
+            given |= {name: data.pop(name) for name in list(data) if name not in cls.model_fields}
+            data["options"] = given
+        return data
+
+    @model_validator(mode="after")
+    def _kind_and_the_rest_agree(self) -> Light:
+        if (self.kind == "pattern") != bool(self.leds):
+            raise ValueError('leds belong to kind = "pattern", which needs at least one')
+        if self.kind in _WITHOUT_SHAPE and (self.options or self.rgb is not None):
+            raise ValueError(f'kind = "{self.kind}" has no options and no rgb')
+        if self.is_named and self.kind not in LED_PATTERNS:
+            known = ", ".join((*_WITHOUT_SHAPE, *LED_PATTERNS))
+            raise ValueError(f"light {self.kind!r} is not known; there are {known}")
+        if self.is_named:
+            led_shape(self.kind, self.options)
+        return self
+
+    @model_serializer(mode="wrap")
+    def _with_options_beside(self, dumped: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data: dict[str, Any] = dumped(self)
+        options = data.pop("options", {})
+        if self.rgb is None:
+            data.pop("rgb", None)
+        return {**data, **options}
+
+    @classmethod
+    def of(cls, pattern: LedPattern) -> Light:
+        """Return the light of a pattern that was composed for an LED array."""
+        leds = tuple((index, *rgb) for index, rgb in pattern.levels)
+        if not leds:
+            return OFF
+        return cls(kind="pattern", description=pattern.description, leds=leds)
+
+    @classmethod
+    def named(cls, shape: LedShape, rgb: tuple[int, int, int] | None = None) -> Light:
+        """Return the light of a named pattern."""
+        options = {option.name: value for option, value in changed(shape)}
+        return cls(kind=shape.name, rgb=rgb, options=options)
+
+    @property
+    def is_named(self) -> bool:
+        """Whether it is a pattern by name, whose LEDs :meth:`on` finds."""
+        return self.kind not in _WITHOUT_SHAPE
+
+    def on(self, array: LedPlaces) -> Light:
+        """Return the light with its LEDs listed, for an array; itself where it is no pattern by name."""
+        if not self.is_named:
+            return self
+        return Light.of(led_shape(self.kind, self.options).on(array, self.rgb or WHITE))
+
+    def pattern(self) -> LedPattern:
+        """Return the LED pattern of a light of kind ``pattern``."""
+        name = self.description or f"LEDs {', '.join(str(led[0]) for led in self.leds)}"
+        return LedPattern(name, tuple((led[0], (led[1], led[2], led[3])) for led in self.leds))
+
+    def __str__(self) -> str:
+        if self.is_named:
+            colour = "" if self.rgb is None else f" rgb {self.rgb}"
+            return shape_text(led_shape(self.kind, self.options)) + colour
+        return self.kind if self.kind != "pattern" else self.pattern().description
+
+
+OFF = Light(kind="off")
+SOURCE = Light(kind="source")

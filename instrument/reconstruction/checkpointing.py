@@ -1,18 +1,33 @@
-"""A reconstruction that is kept while it runs, and gone on with: the folder that fits a request."""
+"""A reconstruction that is kept in a folder while it runs, and gone on with.
+
+``problem.json`` says what is being reconstructed, one ``.npz`` file a part holds a solver's state and
+history. Each is written whole or not at all; a kill costs what came after the last.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+import shutil
+import time
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, fields
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from instrument.files.checkpoint import CheckpointFolder, digest
-from instrument.files.errors import BenchError
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import check_writable, whole_file, write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.files.record import plain
 from instrument.reconstruction.job import Job
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.base.declare import identity
 from recon.reconstruction.solvers import SOLVERS
-from recon.solvers.stopping import StopReason
+from recon.solvers.base import IterationRecord, Solver, StopReason
 
 _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 
@@ -77,3 +92,169 @@ def settle_checkpoint(
     else:
         told["Checkpoint"] = f"{keeper.folder}: the same again, with more time, goes on from it"
     return told
+
+
+PROBLEM = "problem.json"
+_STATE = "state/"
+EVERY_S = 60.0
+"""Seconds between two writings: the most that a kill costs, and rare enough to cost little itself."""
+
+
+class CheckpointFolder:
+    """A :class:`recon.solvers.base.Keeper` in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when missing.
+    problem : mapping
+        What decides the result, JSON-compatible: a folder kept for something else is refused.
+    every_s : float
+        Least time between two writings of a part.
+
+    Raises
+    ------
+    FileError
+        When the folder holds something else, or cannot be written to.
+    """
+
+    def __init__(self, folder: Path, problem: Mapping[str, Any], *, every_s: float = EVERY_S) -> None:
+        self.folder = folder
+        self._every_s = every_s
+        self._written = time.monotonic()
+        self._resumed: dict[str, int] = {}
+        problem = plain(dict(problem))
+        if folder.exists() and not folder.is_dir():
+            raise FileError(
+                folder, "is a file; a checkpoint is a folder.", "Name another, or one to be made."
+            )
+        if (folder / PROBLEM).is_file():
+            self._compare(problem)
+        elif folder.is_dir() and any(folder.iterdir()):
+            raise FileError(folder, "holds something else and was left as it is.", "Name another folder.")
+        else:
+            check_writable(folder)
+            folder.mkdir(exist_ok=True)
+            write_text(folder / PROBLEM, json.dumps(problem, indent=1, sort_keys=True) + "\n")
+
+    @property
+    def resumed_from(self) -> int:
+        """Iterations that earlier runs have done, of the part that is furthest."""
+        return max(self._resumed.values(), default=0)
+
+    def resume(self, part: str, solver: Solver) -> tuple[IterationRecord, ...]:
+        """Restore what was kept of a part, if anything, and return its history so far."""
+        path = self._path(part)
+        if not path.is_file():
+            return ()
+        try:
+            with np.load(path, allow_pickle=False) as kept:
+                records = tuple(_record(row) for row in kept["history"])
+                solver.restore(_state(kept))
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise FileError(
+                path, f"cannot be read as a checkpoint ({error}).", "Delete it to start over."
+            ) from None
+        self._resumed[part] = len(records)
+        return records
+
+    def keep(self, part: str, solver: Solver, history: Sequence[IterationRecord], *, ended: bool) -> None:
+        """Write a solver's state when it is time to, or its run has ended."""
+        if not ended and time.monotonic() - self._written < self._every_s:
+            return
+        if not history:
+            return
+        state = {f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()}
+        with whole_file(self._path(part)) as temporary:
+            np.savez(temporary, history=np.array([astuple(r) for r in history]), **state)
+        self._written = time.monotonic()
+
+    def remove(self) -> None:
+        """Delete the folder: there is nothing left to go on with."""
+        shutil.rmtree(self.folder)
+
+    def _path(self, part: str) -> Path:
+        return self.folder / f"{part or 'picture'}.npz"
+
+    def _compare(self, problem: Mapping[str, Any]) -> None:
+        path = self.folder / PROBLEM
+        try:
+            kept = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise FileError(path, f"cannot be read ({error}).", "Name another folder.") from None
+        for name in sorted({*problem, *kept}):
+            if problem.get(name) != kept.get(name):
+                raise FileError(
+                    self.folder,
+                    f"keeps another reconstruction: its {name} is {kept.get(name)!r}, "
+                    f"here it is {problem.get(name)!r}.",
+                    "Name another folder, or delete this one to start over.",
+                )
+
+
+def digest(array: npt.NDArray[Any] | None) -> str | None:
+    """Return what tells an array from others: shape, and the beginning of its SHA-256."""
+    if array is None:
+        return None
+    text = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
+    return f"{' x '.join(map(str, array.shape))} {array.dtype}, {text}"
+
+
+def _record(row: npt.NDArray[np.float64]) -> IterationRecord:
+    values = dict(zip((f.name for f in fields(IterationRecord)), row.tolist(), strict=True))
+    return IterationRecord(**values | {"iteration": int(values["iteration"])})
+
+
+def _flat(state: Mapping[str, Any] | Sequence[Any], prefix: str = "") -> dict[str, Any]:
+    """Name every array and number of a nested state by its path; a list's entries by their index."""
+    items = state.items() if isinstance(state, Mapping) else ((f"#{i}", v) for i, v in enumerate(state))
+    flat: dict[str, Any] = {}
+    for name, value in items:
+        if isinstance(value, Mapping | list):
+            flat |= _flat(value, f"{prefix}{name}/")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
+
+
+class _Lazy(dict[str, Any]):
+    """A state whose arrays are read one at a time, as the solver takes them: volumes may be large."""
+
+    def __init__(self, kept: Any) -> None:
+        super().__init__()
+        self._kept = kept
+
+    def __missing__(self, name: str) -> Any:
+        return _value(self._kept[f"{_STATE}{name}"])
+
+
+def _state(kept: Any) -> dict[str, Any]:
+    names = [name.removeprefix(_STATE) for name in kept.files if name.startswith(_STATE)]
+    if not any("/" in name for name in names):
+        return _Lazy(kept)
+    nested: dict[str, Any] = _nested({name: kept[f"{_STATE}{name}"] for name in names})
+    return nested
+
+
+def _value(array: npt.NDArray[Any]) -> Any:
+    return array.item() if array.ndim == 0 else array
+
+
+def _nested(flat: Mapping[str, npt.NDArray[Any]]) -> Any:
+    """Undo :func:`_flat`; arrays of no dimension become numbers again."""
+    tree: dict[str, Any] = {}
+    for path, value in flat.items():
+        *branches, leaf = path.split("/")
+        place = tree
+        for branch in branches:
+            place = place.setdefault(branch, {})
+        place[leaf] = _value(value)
+    return _lists(tree)
+
+
+def _lists(tree: Any) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    if tree and all(name.startswith("#") for name in tree):
+        return [_lists(tree[f"#{i}"]) for i in range(len(tree))]
+    return {name: _lists(value) for name, value in tree.items()}

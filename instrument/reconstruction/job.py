@@ -1,7 +1,8 @@
-"""A reconstruction from files, before the work: what goes in, and what was chosen on the way, in words."""
+"""A reconstruction from files, before the work: what goes in, and what was chosen, in words and on record."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +14,6 @@ import numpy.typing as npt
 from instrument.files.calibration_file import is_calibration, load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, read_image
-from instrument.reconstruction.erasures import Erased, erasures_of, reduce_valid
 from instrument.reconstruction.mosaic import (
     in_colour,
     matched_mosaic,
@@ -22,35 +22,26 @@ from instrument.reconstruction.mosaic import (
     pattern_of,
     reduce_mosaic,
 )
-from instrument.reconstruction.options import DarkChoice, InputOptions, NoiseChoice
+from instrument.reconstruction.options import InputOptions, NoiseChoice
 from instrument.reconstruction.preparation import (
+    AUTO_PIXELS,
     Crop,
     Dark,
+    Erased,
     FloatImage,
     auto_binning,
     bin_image,
+    calibrated_dark,
     check_pair,
     check_psf,
-    dark_from_corners,
-    dark_from_counts,
-    dark_from_file,
-    darkest_block,
+    dark_level,
+    erasures_of,
     reduce,
+    reduce_valid,
     saturated_pixels,
 )
-from instrument.reconstruction.record import (
-    crop_record,
-    dark_record,
-    describe,
-    describe_window,
-    mosaic_note,
-    noise_note,
-    noise_of,
-    slices_record,
-    source_record,
-)
 from recon.base.noise import NoiseModel, averaged_noise
-from recon.camera.refocus import at_depth
+from recon.camera.factors import Pattern
 from recon.types import Calibration
 
 
@@ -147,7 +138,7 @@ def job_from_files(
     warnings = check_psf(psf, allow_saturated=inputs.allow_saturated)
     pattern = pattern_of(inputs.mosaic, image)
     check_pair(psf, image, allow_mixed_depth=inputs.allow_mixed_depth, mosaic=pattern is not None)
-    level = _dark(inputs.dark, psf, image)
+    level = dark_level(inputs.dark, psf, image)
     window = _window(crop, image)
     factor = auto_binning(window) if binning is None else binning
     if pattern is not None and binning is None and factor > 1:
@@ -226,7 +217,7 @@ def job_with(
     pattern = pattern_of(inputs.mosaic, image)
     if calibration.psfs.shape[1] > 1 and not (image.is_colour or pattern):
         raise FileError(image.path, f"is grey, but the calibration {folder} is colour.")
-    pixels, level = _calibrated_dark(inputs.dark, image, calibration, match)
+    pixels, level = calibrated_dark(inputs.dark, image, calibration, match)
     factor = inputs.binning or 1
     erased = erasures_of(inputs.erasures, image)
     matched = replace(erased, valid=None if erased.valid is None else reduce_valid(erased.valid, None, match))
@@ -271,61 +262,6 @@ def job_with(
     )
 
 
-def require_distance(z_um: float) -> None:
-    """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
-    if not 0 < z_um < np.inf:
-        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
-
-
-def refocused(job: Job, z_um: float) -> Job:
-    """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
-
-    Where the calibration has the depth the job is returned as it is. Where depths, or the distance from
-    diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
-    reconstruction takes the PSF as it is, or the nearest one.
-
-    Raises
-    ------
-    BenchError
-        When ``z_um`` is no distance.
-    """
-    require_distance(z_um)
-    calibration = job.calibration
-    z = calibration.source_positions_um[:, 2]
-    if not bool((z > 0).all()):
-        return _as_measured(job, z_um, "at what depth it was measured is not known")
-    if calibration.geometry.diffuser_distance_mm is None:
-        if np.isclose(z, z_um).any():
-            return job
-        return _as_measured(
-            job, z_um, "the diffuser's distance from the sensor is not known; the nearest is taken"
-        )
-    calibration, made = at_depth(calibration, z_um)
-    if made is None:
-        return job
-    return replace(
-        job,
-        calibration=calibration,
-        notes={**job.notes, "PSF": f"refocused to {z_um / 1e3:g} mm: {made}"},
-        provenance={
-            **job.provenance,
-            "refocused": {
-                "z_um": made.z_um,
-                "from_z_um": list(made.from_z_um),
-                "displacement_error_um": made.displacement_error_um,
-                "expected_similarity": made.expected_similarity,
-            },
-        },
-    )
-
-
-def _as_measured(job: Job, z_um: float, why: str) -> Job:
-    """Return the job with a note that its PSF was not refocused."""
-    said = f"not refocused to {z_um / 1e3:g} mm: {why}"
-    read = job.notes.get("PSF")
-    return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})
-
-
 def find_calibration(folder: Path) -> Path:
     """Return the calibration folder that ``folder`` is, or the one that it holds.
 
@@ -350,35 +286,6 @@ def find_calibration(folder: Path) -> Path:
         )
         raise FileError(folder, f"holds {found}; exactly one is expected.")
     return inside[0]
-
-
-def _dark(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
-    if choice == "auto":
-        return dark_from_corners(psf, image)
-    if isinstance(choice, Path):
-        return dark_from_file(read_image(choice), image)
-    return dark_from_counts(choice)
-
-
-def _calibrated_dark(
-    choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int
-) -> tuple[FloatImage, Dark]:
-    """Return the image on the calibration's pixels, and what to subtract there; the PSFs need nothing."""
-    pixels = bin_image(image.pixels, match)
-    if isinstance(choice, Path):
-        dark = dark_from_file(read_image(choice), image)
-        return pixels, replace(dark, image=bin_image(np.asarray(dark.image), match))
-    if choice != "auto":
-        return pixels, dark_from_counts(choice)
-    if calibration.background is not None:
-        background = np.moveaxis(calibration.background, 0, -1)
-        return pixels, Dark(
-            background[..., 0] if background.shape[-1] == 1 else background,
-            0.0,
-            f"the calibration's background (mean {float(background.mean()):.1f} counts)",
-        )
-    darkest = darkest_block(image.pixels)
-    return pixels, Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
 
 
 def _matching_binning(image: ImageFile, shape: tuple[int, ...], folder: Path) -> int:
@@ -447,3 +354,82 @@ def _saturation(image: ImageFile, erased: Erased) -> tuple[str, ...]:
         return ()
     share = f"{count / image.pixels.size:.2%}"
     return (f"{count} pixels of the image ({share}) are saturated and used: expect halos there.",)
+
+
+# As it is shown, and kept beside the result -------------------------------------------------------------
+def noise_of(image: ImageFile) -> NoiseModel | None:
+    """Return a pixel's noise as the metadata of a photograph tell it, the mean of its frames regarded."""
+    told: Any = image.metadata.get("noise")
+    try:
+        average = float(image.metadata.get("average", 1))
+        model = NoiseModel(
+            float(told["read_noise_counts"]) / average**0.5, float(told["counts_per_electron"]) / average
+        )
+    except (TypeError, KeyError, ValueError, ZeroDivisionError):
+        return None  # somebody else's metadata
+    known = np.isfinite([model.read_noise, model.counts_per_electron]).all()
+    return model if known and min(model.read_noise, model.counts_per_electron) >= 0 else None
+
+
+def noise_note(noise: NoiseModel | None) -> dict[str, str]:
+    """Tell of a known noise."""
+    if noise is None:
+        return {}
+    known = f"read noise {noise.read_noise:.3g} counts, {noise.counts_per_electron:.3g} counts an electron"
+    return {"Noise": f"{known}, as the photograph's metadata say, unless --noise is given"}
+
+
+def mosaic_note(pattern: Pattern | None) -> dict[str, str]:
+    """Tell of a raw frame's colour mosaic."""
+    if pattern is None:
+        return {}
+    return {"Mosaic": f"{pattern}: every pixel counts for its own colour, nothing is demosaiced"}
+
+
+def describe(file: ImageFile) -> str:
+    """Return an image's name, size and what was noted in reading it."""
+    return ", ".join((f"{file.path}: {file.describe()}", *file.notes))
+
+
+def describe_window(crop: Crop | None, asked: int | None, factor: int, result: FloatImage) -> str:
+    """Return what was cut out and how it was binned; ``asked`` is None where that was chosen."""
+    window = "whole image" if crop is None else f"window of {crop.height} x {crop.width}"
+    is_automatic = asked is None and factor > 1
+    binned = f"binned {factor} x {factor}" if factor > 1 else "not binned"
+    limit = f"at most {AUTO_PIXELS / 1e6:g} megapixel"
+    why = f" (automatic: {limit}; --bin 1 for all)" if is_automatic else ""
+    return f"{window}, {binned}{why}: {result.shape[0]} x {result.shape[1]}"
+
+
+def source_record(file: ImageFile) -> dict[str, Any]:
+    """Return what tells an image from others."""
+    digest = hashlib.sha256(np.ascontiguousarray(file.pixels).data).hexdigest()
+    return {"path": str(file.path.resolve()), "pixels": file.describe(), "pixels_sha256": digest}
+
+
+def dark_record(dark: Dark) -> dict[str, Any]:
+    """Return a dark level's means, counts, and where it comes from."""
+    values = {
+        name: float(np.mean(value))
+        for name, value in (("image_counts", dark.image), ("psf_counts", dark.psf))
+    }
+    return {**values, "from": dark.reason}
+
+
+def crop_record(crop: Crop | None, image: ImageFile) -> dict[str, int] | None:
+    """Return the window that was cut out of an image, pixels."""
+    if crop is None:
+        return None
+    height, width = image.pixels.shape[:2]
+    return slices_record(crop.slices((height, width)))
+
+
+def slices_record(slices: tuple[slice, slice]) -> dict[str, int]:
+    """Return a window of rows and columns, pixels."""
+    rows, columns = slices
+    return {
+        "top": rows.start,
+        "left": columns.start,
+        "height": rows.stop - rows.start,
+        "width": columns.stop - columns.start,
+    }

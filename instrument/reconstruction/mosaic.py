@@ -11,7 +11,7 @@ import numpy.typing as npt
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile
 from instrument.reconstruction.preparation import Crop, FloatImage, reduce
-from recon.camera.bayer import PATTERNS, Pattern, interpolate_bayer, split_bayer
+from recon.camera.factors import PATTERNS, Pattern, interpolate_bayer, split_bayer
 from recon.errors import InputError
 from recon.types import Calibration
 

@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from instrument.reconstruction.erasures import Choice as ErasuresChoice
 from instrument.reconstruction.mosaic import MosaicChoice, mosaic_named
-from instrument.reconstruction.preparation import Crop
+from instrument.reconstruction.preparation import Crop, DarkChoice, ErasuresChoice
 from recon.base.declare import RARE, option
 from recon.base.noise import NoiseModel
-from recon.camera.bayer import PATTERNS
+from recon.camera.factors import PATTERNS
 from recon.errors import InputError
 from recon.streams.joint import OverTimeName
 from recon.streams.video import WARM_ITERATIONS
 
-DarkChoice = Literal["auto"] | float | Path
 NoiseChoice = NoiseModel | float | Literal["estimate"] | None
 """A camera's noise; None for what the photograph's metadata say, and estimated where they say nothing."""
 

@@ -16,12 +16,13 @@ import numpy.typing as npt
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.plan.illumination import DARK, PATTERN
-from instrument.reconstruction.job import Job, find_calibration, refocused
+from instrument.reconstruction.job import Job, find_calibration
 from instrument.reconstruction.preparation import reduce
+from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
 from recon.reconstruction.result import Reconstruction
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord
 from recon.types import Calibration
 
 Floats = npt.NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""From image files to what a reconstruction needs: matched, dark-subtracted, cropped, binned.
+"""From image files to what a reconstruction needs: matched, dark-subtracted, erased, cropped, binned.
 
 Every choice that is made here for the user comes back in words, so that it can be shown and kept.
 """
@@ -6,18 +6,24 @@ Every choice that is made here for the user comes back in words, so that it can 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from instrument.files.errors import BenchError, FileError
-from instrument.files.images import ImageFile
+from instrument.files.images import ImageFile, read_image
 from recon.base.blocks import block_mean
 from recon.errors import InputError
+from recon.types import Calibration
 
 FloatImage = npt.NDArray[np.float32]
+
+ErasuresChoice = Literal["none", "saturated"] | float | Path
+"""Nothing; saturated pixels; a random share; a mask file, zero where a pixel is erased."""
+DarkChoice = Literal["auto"] | float | Path
 
 AUTO_PIXELS = 500_000
 """Automatic binning goes on until the image has at most this many pixels."""
@@ -25,6 +31,9 @@ LEAST_BINNED = 8
 """Pixels along each side that binning must leave: fewer hold no pattern to decode."""
 SATURATED_LIGHT_LIMIT = 0.01
 """A PSF with a larger share of its light in saturated pixels is refused: its true shape is unknown."""
+
+SEED = 0
+"""Of the pixels that are left out at random."""
 
 # Full scale of 8 to 16 bit sensors, right-aligned and left-aligned in 16 bit.
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535, 65472, 65520, 65532)
@@ -243,6 +252,36 @@ def darkest_block(pixels: npt.NDArray[Any]) -> float:
     return float(bin_image(grey, max(1, min(_PATCH, *grey.shape))).min())
 
 
+def dark_level(choice: DarkChoice, psf: ImageFile, image: ImageFile) -> Dark:
+    """Return what is subtracted from a PSF and an image: as given, or estimated."""
+    if choice == "auto":
+        return dark_from_corners(psf, image)
+    if isinstance(choice, Path):
+        return dark_from_file(read_image(choice), image)
+    return dark_from_counts(choice)
+
+
+def calibrated_dark(
+    choice: DarkChoice, image: ImageFile, calibration: Calibration, match: int
+) -> tuple[FloatImage, Dark]:
+    """Return the image on the calibration's pixels, and what to subtract there; the PSFs need nothing."""
+    pixels = bin_image(image.pixels, match)
+    if isinstance(choice, Path):
+        dark = dark_from_file(read_image(choice), image)
+        return pixels, replace(dark, image=bin_image(np.asarray(dark.image), match))
+    if choice != "auto":
+        return pixels, dark_from_counts(choice)
+    if calibration.background is not None:
+        background = np.moveaxis(calibration.background, 0, -1)
+        return pixels, Dark(
+            background[..., 0] if background.shape[-1] == 1 else background,
+            0.0,
+            f"the calibration's background (mean {float(background.mean()):.1f} counts)",
+        )
+    darkest = darkest_block(image.pixels)
+    return pixels, Dark(darkest, 0.0, f"{darkest:.4g} counts: the image's darkest 10 x 10 pixels (estimated)")
+
+
 # Size ------------------------------------------------------------------------------------------------
 def auto_binning(shape: tuple[int, int]) -> int:
     """Return the smallest binning that leaves at most ``AUTO_PIXELS`` pixels."""
@@ -292,3 +331,66 @@ def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None
             f"Take --bin {most}{' or less' if most > 1 else ''}."
         )
     return binned
+
+
+# Erasures: exact (Kuo 2020, Eq. 3.10), the reconstruction explains the other pixels and predicts the erased
+@dataclass(frozen=True, slots=True)
+class Erased:
+    """Which pixels are valid, ``(height, width)`` or ``(height, width, 3)``; None means all of them."""
+
+    valid: npt.NDArray[np.bool_] | None
+    reason: str
+
+
+def erasures_of(choice: ErasuresChoice, image: ImageFile) -> Erased:
+    """Return which pixels of an image take part.
+
+    Raises
+    ------
+    BenchError, FileError
+        When the share is not from 0 to below 1, or the mask does not fit or leaves nothing.
+    """
+    if choice == "none":
+        return Erased(None, "none")
+    if choice == "saturated":
+        return _saturated(image)
+    if isinstance(choice, Path):
+        return _from_mask(choice, image)
+    if not 0 <= choice < 1:
+        raise BenchError(f"--erasures {choice:g}: a share from 0 to below 1 is expected, e.g. 0.8.")
+    keep = np.random.default_rng(SEED).random(image.pixels.shape[:2]) >= choice
+    return Erased(keep, f"{1 - keep.mean():.1%} of the pixels, at random (seed {SEED})")
+
+
+def reduce_valid(valid: npt.NDArray[np.bool_], crop: Crop | None, binning: int) -> npt.NDArray[np.bool_]:
+    """Cut and bin a mask like its image: a binned pixel is valid where all of its pixels are."""
+    if crop is not None:
+        valid = valid[crop.slices((valid.shape[0], valid.shape[1]))]
+    height, width = valid.shape[0] // binning, valid.shape[1] // binning
+    blocks = valid[: height * binning, : width * binning].reshape(
+        height, binning, width, binning, *valid.shape[2:]
+    )
+    return np.asarray(blocks.all(axis=(1, 3)))
+
+
+def _saturated(image: ImageFile) -> Erased:
+    count = saturated_pixels(image.pixels)
+    if not count:
+        return Erased(None, "none (no pixel is saturated)")
+    full_scale = int(image.pixels.max())
+    share = f"{count / image.pixels.size:.2%}"
+    reason = f"{count} saturated pixels ({share}, at {full_scale}); --erasures none uses them"
+    return Erased(np.asarray(image.pixels) != full_scale, reason)
+
+
+def _from_mask(path: Path, image: ImageFile) -> Erased:
+    mask = read_image(path)
+    shape: tuple[Any, ...] = image.pixels.shape
+    if mask.pixels.shape not in (shape, shape[:2]):
+        raise FileError(
+            path, f"the mask is {mask.describe()}, but the image {image.path} is {image.describe()}."
+        )
+    valid = np.asarray(mask.pixels != 0)
+    if not valid.any():
+        raise FileError(path, "the mask is zero everywhere: no pixel is left.", "Zero marks erased pixels.")
+    return Erased(valid, f"{1 - valid.mean():.1%} of the pixels, where {path} is zero")

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from instrument.files.calibration_file import is_calibration
 from instrument.files.errors import BenchError
+from instrument.files.images import read_stack
 from instrument.reconstruction.job import (
     Job,
     job_from_calibration,
     job_from_files,
-    refocused,
+    job_with,
 )
 from instrument.reconstruction.options import InputOptions, NoiseChoice, SourceOptions
-from instrument.reconstruction.volume_job import volume_job
-from recon.base.checks import select_psf
-from recon.base.options import require_options
+from instrument.reconstruction.preparation import darkest_block
+from instrument.runs.run import STATE
+from recon.base.checks import require_options, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
+from recon.camera.refocus import at_depth
 from recon.priors import Prior
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
@@ -32,8 +35,7 @@ from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choice_for
 from recon.reconstruction.solve import ITERATIONS
 from recon.reconstruction.solvers import SOLVERS, volume_priors
-from recon.solvers.base import Keeper
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Keeper
 from recon.types import Calibration
 
 Watch = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -161,7 +163,7 @@ class VolumeRequest:
     image : Path
         The photograph.
     psfs : Path
-        As :func:`instrument.reconstruction.volume_job.volume_job`.
+        As :func:`volume_job`.
     inputs : InputOptions
     options : ReconstructionOptions
         Its prior must be one of :func:`recon.reconstruction.solvers.volume_priors`.
@@ -246,3 +248,91 @@ def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None
         raise BenchError("--positive-background and --no-background exclude each other.")
     if options.choose is not None:
         _require_choice("--choose", options.model)
+
+
+def volume_job(
+    psfs: Path,
+    image: Path,
+    inputs: InputOptions,
+) -> Job:
+    """Prepare a photograph and PSFs at several depths.
+
+    Parameters
+    ----------
+    psfs : Path
+        A calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one image
+        file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs lose
+        their darkest level; float ones are taken to be free of any offset.
+    image, inputs
+        As :func:`~instrument.reconstruction.job.job_from_calibration`.
+
+    Raises
+    ------
+    FileError, BenchError
+    """
+    if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
+        return job_from_calibration(psfs, image, inputs)
+    stack = read_stack(psfs, leave_out=image).pixels
+    pixels = stack.astype(np.float32)
+    if stack.dtype.kind == "u":
+        pixels = np.maximum(pixels - min(darkest_block(p) for p in pixels), 0)
+    channels = pixels[:, None] if pixels.ndim == 3 else np.moveaxis(pixels, -1, 1)
+    calibration = Calibration(
+        np.ascontiguousarray(channels), np.full((len(pixels), 3), np.nan), provenance={"psfs": str(psfs)}
+    )
+    return job_with(calibration, psfs, image, inputs)
+
+
+def require_distance(z_um: float) -> None:
+    """Check a scene's distance, micrometres; BenchError says it in millimetres, as it was given."""
+    if not 0 < z_um < np.inf:
+        raise BenchError(f"The scene's distance must be above 0 mm and finite, not {z_um / 1e3:g} mm.")
+
+
+def refocused(job: Job, z_um: float) -> Job:
+    """Return the job with a PSF for a depth that its calibration does not contain, and a note that says so.
+
+    Where the calibration has the depth the job is returned as it is. Where depths, or the distance from
+    diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
+    reconstruction takes the PSF as it is, or the nearest one.
+
+    Raises
+    ------
+    BenchError
+        When ``z_um`` is no distance.
+    """
+    require_distance(z_um)
+    calibration = job.calibration
+    z = calibration.source_positions_um[:, 2]
+    if not bool((z > 0).all()):
+        return _as_measured(job, z_um, "at what depth it was measured is not known")
+    if calibration.geometry.diffuser_distance_mm is None:
+        if np.isclose(z, z_um).any():
+            return job
+        return _as_measured(
+            job, z_um, "the diffuser's distance from the sensor is not known; the nearest is taken"
+        )
+    calibration, made = at_depth(calibration, z_um)
+    if made is None:
+        return job
+    return replace(
+        job,
+        calibration=calibration,
+        notes={**job.notes, "PSF": f"refocused to {z_um / 1e3:g} mm: {made}"},
+        provenance={
+            **job.provenance,
+            "refocused": {
+                "z_um": made.z_um,
+                "from_z_um": list(made.from_z_um),
+                "displacement_error_um": made.displacement_error_um,
+                "expected_similarity": made.expected_similarity,
+            },
+        },
+    )
+
+
+def _as_measured(job: Job, z_um: float, why: str) -> Job:
+    """Return the job with a note that its PSF was not refocused."""
+    said = f"not refocused to {z_um / 1e3:g} mm: {why}"
+    read = job.notes.get("PSF")
+    return replace(job, notes={**job.notes, "PSF": f"{read}, {said}" if read else said})

@@ -1,8 +1,9 @@
-"""Writing a reconstruction: the numbers, a picture to look at, and how it came about."""
+"""Writing a reconstruction: the numbers, a picture or a page of views to look at, and how it came about."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -12,11 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, write_text
+from instrument.files.atomic import check_writable, whole_file, write_text
 from instrument.files.errors import FileError
+from instrument.files.figures import save_figure
 from instrument.files.images import write_image
 from instrument.files.record import plain
-from instrument.files.volume_zarr import is_zarr_name
+from instrument.files.volumes import is_zarr_name, middle_step_um, uneven_steps, write_volume_zarr
 from instrument.reconstruction.job import Job
 from recon.reconstruction.result import Grid, Reconstruction
 
@@ -104,11 +106,11 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
     write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
     pixels, white = preview(image)
     write_image(outputs.preview, pixels)
-    record = reconstruction_record(result, job) | {
+    record = reconstruction_record(result, job, volume=False) | {
         "rotated_deg": rotate_deg,
         "preview": {"white": white, "white_percentile": WHITE_PERCENTILE, "black": 0.0},
     }
-    write_text(outputs.record, json.dumps(record, indent=1, allow_nan=False) + "\n")
+    _write_record(outputs.record, record)
 
 
 def picture_grid(grid: Grid) -> dict[str, Any]:
@@ -140,8 +142,8 @@ def white_level(image: npt.NDArray[np.floating]) -> float:
     return white
 
 
-def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
-    """Return all that is known of a reconstruction but its pixels, JSON-compatible."""
+def reconstruction_record(result: Reconstruction, job: Job, *, volume: bool) -> dict[str, Any]:
+    """Return all that is known of a picture or volume but its pixels, JSON-compatible."""
     record = {
         "program": f"diffuserbench {version('diffuserbench')}",
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -152,16 +154,90 @@ def reconstruction_record(result: Reconstruction, job: Job) -> dict[str, Any]:
         "method": result.solver,
         "prior": result.prior,
         "tau": result.tau,
+        "background_estimated": result.background is not None,
         "noise_norm": result.noise_norm,
-        "stop_reason": str(result.stop_reason),
-        "iterations": len(result.history),
         "seconds": result.seconds,
         "warnings": [*job.warnings, *result.warnings],
         "verdict": None if result.verdict is None else result.verdict.as_json(),
-        "background_estimated": result.background is not None,
-        "grid": picture_grid(result.grid),
         "provenance": result.provenance,
-        "history": [asdict(entry) for entry in result.history],
+        **(_of_volume(result) if volume else _of_picture(result)),
     }
     written: dict[str, Any] = plain(record)
     return written
+
+
+def _write_record(path: Path, record: Mapping[str, Any]) -> None:
+    write_text(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
+
+
+def _of_picture(result: Reconstruction) -> dict[str, Any]:
+    return {
+        "stop_reason": str(result.stop_reason),
+        "iterations": len(result.history),
+        "grid": picture_grid(result.grid),
+        "history": [asdict(entry) for entry in result.history],
+    }
+
+
+def _of_volume(result: Reconstruction) -> dict[str, Any]:
+    grid = result.grid
+    return {
+        "stop_reasons": [str(reason) for reason in result.stop_reasons],
+        "uneven_steps": uneven_steps(grid.z_um),
+        "grid": {
+            "shape": grid.shape,
+            "centre": grid.centre,
+            "z_um": _known(grid.z_um),
+            "pitch_um": _known(grid.pitch_um),
+        },
+        "histories": [[asdict(entry) for entry in history] for history in result.histories],
+    }
+
+
+def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
+    """Write volume, page of views and record, each whole or not at all.
+
+    A TIFF holds ``ZYX`` or ``ZCYX`` float32, an OME-Zarr ``zyx`` or ``czyx``; the name says which. OME knows
+    one voxel size for all: that of the middle plane is written there; every plane's own is in the record.
+
+    Raises
+    ------
+    FileError, OSError
+        When a file cannot be written, naming it.
+    """
+    from instrument.reconstruction.result_figures import volume_figure
+
+    if is_zarr_name(outputs.image):
+        about = {"simulated": job.simulated, "record": outputs.record.name}
+        write_volume_zarr(outputs.image, result.volume, result.grid, about)
+    else:
+        _write_tiff(outputs.image, result)
+    with whole_file(outputs.preview) as temporary:
+        save_figure(volume_figure(result, simulated=job.simulated), temporary)
+    _write_record(outputs.record, reconstruction_record(result, job, volume=True))
+
+
+def _write_tiff(path: Path, result: Reconstruction) -> None:
+    import tifffile
+
+    volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
+    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **_voxel_size(result.grid)}
+    with whole_file(path) as temporary:
+        tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
+
+
+def _known(values: np.ndarray[Any, Any]) -> list[float] | None:
+    return [float(v) for v in values] if np.isfinite(values).all() else None
+
+
+def _voxel_size(grid: Grid) -> dict[str, Any]:
+    if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
+        return {}
+    middle = len(grid.z_um) // 2
+    sizes = {
+        "X": float(grid.pitch_um[middle]),
+        "Y": float(grid.pitch_um[middle]),
+        "Z": middle_step_um(grid.z_um),
+    }
+    lengths = {f"PhysicalSize{axis}": value for axis, value in sizes.items()}
+    return lengths | {f"PhysicalSize{axis}Unit": "µm" for axis in sizes}

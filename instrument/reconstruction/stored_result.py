@@ -1,9 +1,10 @@
-"""A reconstruction read back: its pixels or voxels, and in words how it came about."""
+"""Reconstructions on disk: listed, read back with their story in words, written for other programs."""
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from instrument.files.atomic import whole_file
 from instrument.files.errors import FileError
-from instrument.files.images import read_image
-from instrument.files.volume_source import VolumeSource, open_volume
-from instrument.files.volume_zarr import is_zarr_name
-from recon.solvers.stopping import IterationRecord
-from recon.verdict.verdict import Region
+from instrument.files.images import read_image, write_image
+from instrument.files.volumes import (
+    VolumeSource,
+    is_zarr_name,
+    middle_step_um,
+    open_volume,
+    write_volume_zarr,
+)
+from instrument.reconstruction.result_file import preview
+from recon.reconstruction.result import Grid
+from recon.solvers.base import IterationRecord
+from recon.verdict.judge import Region
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,3 +263,163 @@ def _iteration(entry: Mapping[str, Any]) -> IterationRecord:
 
 def _length(um: float) -> str:
     return f"{um:.3g} um" if um < 1000 else f"{um / 1000:.4g} mm"
+
+
+_DEEP = 3
+"""Folders are searched so many levels down: runs lie in the data folder, calibrations and results in runs."""
+
+
+def find_results(folder: Path | str) -> list[Path]:
+    """Return the pictures and volumes with a record of ours in a folder and below, the newest first.
+
+    Only records are read. A folder that is not there holds none.
+    """
+    found: list[tuple[float, Path]] = []
+    for depth in range(_DEEP):
+        for record in Path(folder).glob("*/" * depth + "*.json"):
+            if _is_record(record):
+                found.append((record.stat().st_mtime, record))
+    return [path for _, path in sorted(found, reverse=True)]
+
+
+def _is_record(path: Path) -> bool:
+    """Whether a JSON file is the record of a reconstruction, and the reconstruction is there."""
+    try:
+        with path.open("rb") as file:
+            if b'"diffuserbench ' not in file.read(200):  # the program's name stands first
+                return False
+        record = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return False  # another program's file
+    if not isinstance(record, dict) or not {"grid", "prior", "inputs"} <= record.keys():
+        return False
+    stem = path.with_suffix("")
+    return any(
+        stem.with_name(stem.name + suffix).exists() for suffix in (".tif", ".tiff", ".ome.zarr", ".zarr")
+    )
+
+
+def free_result(folder: Path, stem: str, suffix: str) -> Path:
+    """Return a name in a folder under which nothing is written yet: ``stem``, else ``stem-2`` and so on."""
+    for number in itertools.count(1):
+        name = stem if number == 1 else f"{stem}-{number}"
+        if not any((folder / f"{name}{s}").exists() for s in {suffix, ".json", ".png"}):
+            return folder / f"{name}{suffix}"
+    raise AssertionError
+
+
+Advance = Callable[[int, int], object]
+PICTURE_SUFFIXES = (".tif", ".tiff", ".npy", ".png")
+VOLUME_SUFFIXES = (".tif", ".tiff", ".npy", ".ome.zarr", ".zarr")
+_BIG_TIFF_BYTES = 4_000_000_000
+
+
+def export_result(
+    result: StoredResult,
+    target: Path | str,
+    *,
+    rotate_deg: int = 0,
+    overwrite: bool = False,
+    advance: Advance | None = None,
+) -> None:
+    """Write a picture or volume in the format that the target's name asks for, whole or not at all.
+
+    Parameters
+    ----------
+    result : StoredResult
+    target : Path
+        A picture: ``.tif`` and ``.npy`` (float32) or ``.png`` (8 bit, as the preview). A volume: ``.tif``
+        (OME-TIFF), ``.npy``, both plane by plane, or ``.ome.zarr``, for which it must fit into memory.
+    rotate_deg : int
+        A multiple of 90 by which a picture is turned counter-clockwise.
+    overwrite : bool
+    advance : callable, optional
+        ``advance(planes done, planes)``; may raise to end the work.
+
+    Raises
+    ------
+    FileError
+        When the name asks for no format that there is, something is there already, or it cannot be written.
+    OSError
+        When the disk is full.
+    """
+    target = Path(target)
+    volume = result.volume is not None
+    known = VOLUME_SUFFIXES if volume else PICTURE_SUFFIXES
+    if not target.name.lower().endswith(known):
+        kind = "volume" if volume else "picture"
+        raise FileError(target, f"a {kind} is exported as {', '.join(known)}.")
+    if target.resolve() == result.path.resolve():
+        raise FileError(target, "is the result itself.", "Choose another name.")
+    if target.exists() and not overwrite:
+        raise FileError(target, "exists already and was left as it is.")
+    if result.volume is None:
+        assert result.image is not None
+        image = np.ascontiguousarray(np.rot90(result.image, rotate_deg // 90))
+        write_image(target, preview(image)[0] if target.suffix.lower() == ".png" else image)
+    elif is_zarr_name(target):
+        _to_zarr(result, result.volume, target, advance)
+    elif target.suffix.lower() == ".npy":
+        _to_npy(result.volume, target, advance)
+    else:
+        _to_tiff(result, result.volume, target, advance)
+
+
+def _planes(source: VolumeSource, advance: Advance | None) -> Iterator[npt.NDArray[np.float32]]:
+    n_z = source.shape[0]
+    for z in range(n_z):
+        yield source.plane(z)
+        if advance is not None:
+            advance(z + 1, n_z)
+
+
+def _full_shape(source: VolumeSource) -> tuple[int, ...]:
+    return source.shape if source.n_channels == 1 else (*source.shape, source.n_channels)
+
+
+def _to_npy(source: VolumeSource, target: Path, advance: Advance | None) -> None:
+    with whole_file(target) as temporary:
+        voxels = np.lib.format.open_memmap(
+            temporary, mode="w+", dtype=np.dtype(np.float32), shape=_full_shape(source)
+        )
+        for z, plane in enumerate(_planes(source, advance)):
+            voxels[z] = plane
+        voxels.flush()
+
+
+def _to_zarr(result: StoredResult, source: VolumeSource, target: Path, advance: Advance | None) -> None:
+    voxels = np.empty(_full_shape(source), np.float32)
+    for z, plane in enumerate(_planes(source, advance)):
+        voxels[z] = plane
+    unknown = np.full(source.shape[0], np.nan)
+    z_um, pitch_um = result.planes_um or (unknown, unknown)
+    centre = (source.shape[1] // 2, source.shape[2] // 2)
+    grid = Grid(source.shape, centre, z_um, pitch_um)
+    write_volume_zarr(target, voxels, grid, {"simulated": result.simulated})
+
+
+def _to_tiff(result: StoredResult, source: VolumeSource, target: Path, advance: Advance | None) -> None:
+    import tifffile
+
+    n_z, height, width = source.shape
+    colour = source.n_channels > 1
+    shape = (n_z, source.n_channels, height, width) if colour else source.shape
+    metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX"}
+    if (planes := result.planes_um) is not None and n_z > 1:
+        z_um, pitch_um = planes
+        spacing, pitch = middle_step_um(z_um), float(pitch_um[n_z // 2])
+        metadata |= {"PhysicalSizeX": pitch, "PhysicalSizeY": pitch, "PhysicalSizeZ": spacing}
+        metadata |= {f"PhysicalSize{axis}Unit": "µm" for axis in "XYZ"}
+
+    def pages() -> Iterator[npt.NDArray[np.float32]]:
+        for plane in _planes(source, advance):
+            if colour:
+                yield from np.moveaxis(plane, -1, 0)
+            else:
+                yield plane
+
+    with (
+        whole_file(target) as temporary,
+        tifffile.TiffWriter(temporary, ome=True, bigtiff=source.n_bytes > _BIG_TIFF_BYTES) as tiff,
+    ):
+        tiff.write(pages(), shape=shape, dtype=np.float32, photometric="minisblack", metadata=metadata)

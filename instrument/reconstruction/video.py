@@ -18,7 +18,7 @@ import numpy as np
 from instrument.files.atomic import write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
-from instrument.files.volume_zarr import is_zarr_name
+from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.ome import ome_attributes
+from instrument.files.volumes import ome_attributes
 
 if TYPE_CHECKING:
     import zarr

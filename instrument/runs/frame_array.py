@@ -11,7 +11,8 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import sync_folder
+from instrument.files.atomic import make_folder, sync_folder, write_json
 from instrument.files.errors import FileError
-from instrument.files.ome import ome_attributes, ome_axis
-from instrument.runs.durable import SyncPool, make_folder, write_json
+from instrument.files.volumes import ome_attributes, ome_axis
 
 Image = npt.NDArray[Any]
 _LEVEL = "0"
@@ -44,6 +44,41 @@ class _Draft(NamedTuple):
     handle: int
     path: Path
     chunk: StoredChunk
+
+
+class SyncPool:
+    """Puts many files and folders on the disk at the same time.
+
+    Each sync ends with the disk emptying its cache, and the kernel joins such requests that come together:
+    here, sixteen frames of 1.3 megapixels took a third of the time that they take one after the other.
+    """
+
+    def __init__(self, threads: int = 8) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="sync")
+
+    def files(self, handles: Iterable[int]) -> None:
+        """Sync open files; returns, or raises the first error, when all have been tried."""
+        self._all([self._pool.submit(_sync_file, handle) for handle in handles])
+
+    def folders(self, paths: Iterable[Path]) -> None:
+        """Sync folders; returns, or raises the first error, when all have been tried."""
+        self._all([self._pool.submit(sync_folder, path) for path in paths])
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def _all(self, tasks: list[Future[None]]) -> None:
+        try:
+            wait(tasks)
+        finally:
+            wait(tasks)  # after Ctrl-C too: the caller closes the handles next
+        for task in tasks:
+            task.result()
+
+
+def _sync_file(handle: int) -> None:
+    os.fsync(handle)
 
 
 class FrameArray:

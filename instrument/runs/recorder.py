@@ -19,7 +19,7 @@ from instrument.files.errors import BenchError
 from instrument.plan.abilities import SPARE_BYTES
 from instrument.runs.acquire import free_bytes, record_of
 from instrument.runs.finish import end_run
-from instrument.runs.frame_record import Gap
+from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run, RunError
 from instrument.runs.writer import FrameToStore, RunWriter
 

@@ -22,12 +22,13 @@ from drivers.frame import FrameMetadata
 from instrument.files.errors import FileError
 from instrument.files.record import RecordFormat
 from instrument.plan import Plan, Step
-from instrument.runs.durable import read_lines
 from instrument.runs.frame_array import FrameArray, StoredChunk
-from instrument.runs.frame_record import FrameRecord, Gap
+from instrument.runs.log import FrameRecord, Gap, read_lines
 
 if TYPE_CHECKING:
     import zarr
+
+    from instrument.bench.photograph import Progress
 
 
 PLAN, BENCH, PROVENANCE, STATE = "plan.json", "bench.json", "provenance.json", "state.json"
@@ -299,6 +300,18 @@ class Run:
                 f"written were {record.n_bytes} bytes and {record.crc32:08x}",
             )
         return None
+
+    def damaged(self, on_progress: Progress | None = None) -> tuple[DamagedFrame, ...]:
+        """Read every recorded frame; return those that are not as they were written.
+
+        ``on_progress`` is called with frames read and frames to read.
+        """
+        found = []
+        for count, index in enumerate(sorted(self.records), start=1):
+            found.append(self.verify(index))
+            if on_progress is not None:
+                on_progress(count, len(self.records))
+        return tuple(frame for frame in found if frame is not None)
 
     def is_locked(self) -> bool:
         """Whether some program has the run open for writing."""

@@ -15,19 +15,22 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
 from instrument.bench.safety import StepsFailedError
-from instrument.plan import Plan, Step
+from instrument.files.errors import BenchError
+from instrument.files.slm_image import read_slm_levels
+from instrument.plan import Light, Plan, Step
 from instrument.runs.finish import end_run
 from instrument.runs.run import FinishReason, Run
-from instrument.runs.step_settings import StepSettings
 from instrument.runs.writer import FrameToStore, RunWriter
 
 _STOP_REPEAT_S = 0.005
@@ -94,6 +97,67 @@ class _EndedEarlyError(Exception):
 
     def __init__(self, reason: FinishReason) -> None:
         self.reason = reason
+
+
+class StepSettings:
+    """Brings the bench to a step's settings, touching only what differs from the step before."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._now: dict[str, Any] = {}
+        """What is set, by the names of a step's fields; not there where it is not known."""
+
+    def actions(self, step: Step) -> list[Callable[[], None]]:
+        """Return what to do, in order: camera, motion, SLM, light."""
+        bench = self._bench
+        setters: dict[str, Callable[[Any], object]] = {
+            "exposure_ms": bench.camera.set_exposure_ms,
+            "gain": bench.camera.set_gain,
+            "source_um": lambda source_um: bench.place_source(*source_um),
+            "stage": self._move_stage,
+            "slm_image": self._display,
+            "scene_lit": lambda lit: bench.scene_on() if lit else bench.scene_off(),
+            "light": self._set_light,
+        }
+        wanted = {name: getattr(step, name) for name in setters}
+        return [
+            partial(self._set, name, value, setters[name])
+            for name, value in wanted.items()
+            if value not in (None, {}) and value != self._now.get(name)
+        ]
+
+    def darken(self) -> None:
+        """Turn off the light for a pause; the next step turns it on again."""
+        light: Light | None = self._now.get("light")
+        if light is not None and light.kind != "off":
+            self._bench.source_off()
+            del self._now["light"]
+
+    def _set(self, name: str, value: Any, setter: Callable[[Any], object]) -> None:
+        for unknown in ("source_um", "stage") if name in ("source_um", "stage") else (name,):
+            self._now.pop(unknown, None)
+        setter(value)
+        self._now[name] = value
+
+    def _move_stage(self, position: Mapping[str, float]) -> None:
+        if self._bench.stage is None:
+            raise BenchError(f"A stage position, {position}: this bench has no stage.")
+        self._bench.stage.move_to(position)
+
+    def _display(self, path: Path) -> None:
+        if self._bench.slm is None:
+            raise BenchError(f"SLM image {path}: this bench has no SLM.")
+        self._bench.slm.display(read_slm_levels(path))
+
+    def _set_light(self, light: Light) -> None:
+        if light.kind == "source":
+            self._bench.source_on()
+        elif light.kind == "off":
+            self._bench.source_off()
+        elif self._bench.led_array is None:
+            raise BenchError(f"light {light}: this bench has no LED array.")
+        else:
+            self._bench.led_array.set_pattern(light.pattern())
 
 
 class Runner:

@@ -1,31 +1,33 @@
-"""Writing a run: the one owner of a run folder."""
+"""Writing a run: the one owner of a run folder, which it makes, names and locks."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
+import hashlib
 import os
 import platform
+import re
 import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
-from instrument.files.atomic import sync_folder, write_bytes
+from instrument.files.atomic import make_folder, sync_folder, write_bytes, write_json
 from instrument.plan import Plan
-from instrument.runs.durable import AppendOnlyLog, write_json
-from instrument.runs.folder import dated_name, disk_remedy, free_name, lock_run, plan_with_copies
 from instrument.runs.frame_array import FrameArray
-from instrument.runs.frame_record import FrameRecord, Gap
+from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap
 from instrument.runs.run import (
     BENCH,
     BENCH_TOML,
@@ -35,6 +37,7 @@ from instrument.runs.run import (
     PLAN,
     PROVENANCE,
     RUN_STATE,
+    SLM_IMAGES,
     STATE,
     FinishReason,
     Run,
@@ -82,6 +85,21 @@ def _version(package: str) -> str | None:
         return None
 
 
+@contextlib.contextmanager
+def _disk(path: Path, what: str) -> Iterator[None]:
+    """Say what could not be done where the disk refuses it, and what to do about that."""
+    remedies = {
+        **dict.fromkeys(_FULL, "Free some disk space; diffuserbench resume continues the run."),
+        **dict.fromkeys(_FORBIDDEN, "Choose a folder that you may write to."),
+    }
+    try:
+        yield
+    except OSError as error:
+        remedy = remedies.get(error.errno or 0, "")
+        raise RunError(path, f"{what}: {error.strerror}.", remedy) from error
+
+
+_FULL, _FORBIDDEN = (errno.ENOSPC, errno.EDQUOT), (errno.EACCES, errno.EPERM, errno.EROFS)
 _FIRST_CAPACITY = 256
 """Frames that a recording's array is made for at first; it doubles as needed."""
 
@@ -156,8 +174,7 @@ class RunWriter:
             When the folder cannot be written to.
         """
         parent = Path(parent)
-        now = datetime.now(UTC)
-        try:
+        with _disk(parent, "no run can be kept there"):
             parent.mkdir(parents=True, exist_ok=True)
             path = free_name(parent, dated_name(label))
             draft = parent / f".{path.name}.draft"
@@ -181,7 +198,7 @@ class RunWriter:
                     "label": label,
                     "simulated": bench.simulated,
                     "state": "running",
-                    "started_utc": now.isoformat(),
+                    "started_utc": datetime.now(UTC).isoformat(),
                     "pid": os.getpid(),
                 }
                 write_json(draft / STATE, RUN_STATE.stamped(state))
@@ -193,10 +210,6 @@ class RunWriter:
                 shutil.rmtree(draft, ignore_errors=True)
                 raise
             sync_folder(parent)
-        except OSError as error:
-            raise RunError(
-                parent, f"no run can be kept there: {error.strerror}.", disk_remedy(error)
-            ) from error
         return cls(path, lock)
 
     @classmethod
@@ -209,13 +222,11 @@ class RunWriter:
             When it is no run, or some program writes to it now.
         """
         path = Run.open(path).path
-        try:
+        with _disk(path, "cannot be continued"):
             writer = cls(path, lock_run(path))
             for leftover in path.glob(".*"):  # of a write that a crash cut off
                 if leftover.is_file():
                     leftover.unlink()
-        except OSError as error:
-            raise RunError(path, f"cannot be continued: {error.strerror}.", disk_remedy(error)) from error
         return writer
 
     def start(self, **fields: Any) -> None:
@@ -236,20 +247,16 @@ class RunWriter:
         if not frames:
             return
         try:
-            array = self._array or self._make_array(frames)
-            if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
-                array.resize(max(last + 1, 2 * array.n_frames))
-            images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
-            stored = array.write(images)
-            self._log.append(
-                FrameRecord(frame.index, chunk.n_bytes, chunk.crc32, frame.average, frame.metadata).to_json()
-                for frame, chunk in zip(frames, stored, strict=True)
-            )
-        except OSError as error:
-            first = frames[0].index
-            raise RunError(
-                self.path, f"frame {first} could not be stored: {error.strerror}.", disk_remedy(error)
-            ) from error
+            with _disk(self.path, f"frame {frames[0].index} could not be stored"):
+                array = self._array or self._make_array(frames)
+                if self._is_recording and (last := max(f.index for f in frames)) >= array.n_frames:
+                    array.resize(max(last + 1, 2 * array.n_frames))
+                images = [(f.index, f.image.astype(np.float32) if self._float else f.image) for f in frames]
+                stored = array.write(images)
+                self._log.append(
+                    FrameRecord(f.index, chunk.n_bytes, chunk.crc32, f.average, f.metadata).to_json()
+                    for f, chunk in zip(frames, stored, strict=True)
+                )
         except ValueError as error:
             raise RunError(self.path, f"does not take a frame: {error}") from error
 
@@ -261,7 +268,7 @@ class RunWriter:
         """Append a gap of a recording to the log."""
         self._append(gap.to_json())
 
-    def trim(self) -> None:
+    def _trim(self) -> None:
         """Give a recording's array the length and the frame period that the log tells."""
         run = Run.open(self.path)
         if self._array is None or run.plan is not None:
@@ -270,19 +277,12 @@ class RunWriter:
 
     def finish(self, reason: FinishReason, error: str = "") -> Run:
         """Say how the run ended, close its files, and return it for reading."""
+        ended = {"reason": reason.value, "error": error}
         try:
-            self.trim()
-            self.note("finished", reason=reason.value, error=error)
-            self._set_state(
-                state="finished",
-                reason=reason.value,
-                error=error,
-                finished_utc=datetime.now(UTC).isoformat(),
-            )
-        except OSError as failure:
-            raise RunError(
-                self.path, f"its array could not be trimmed: {failure.strerror}.", disk_remedy(failure)
-            ) from failure
+            with _disk(self.path, "its array could not be trimmed"):
+                self._trim()
+            self.note("finished", **ended)
+            self._set_state(state="finished", **ended, finished_utc=datetime.now(UTC).isoformat())
         finally:
             self.close()
         return Run.open(self.path)
@@ -299,12 +299,7 @@ class RunWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # Inside --------------------------------------------------------------------------------------
@@ -322,18 +317,52 @@ class RunWriter:
         return self._array
 
     def _append(self, record: Mapping[str, Any]) -> None:
-        try:
+        with _disk(self.path, "its log could not be written"):
             self._log.append([record])
-        except OSError as error:
-            raise RunError(
-                self.path, f"its log could not be written: {error.strerror}.", disk_remedy(error)
-            ) from error
 
     def _set_state(self, **changes: Any) -> None:
-        try:
+        with _disk(self.path, "its state could not be written"):
             write_json(self.path / STATE, RUN_STATE.stamped(self._state | changes))
-        except OSError as error:
-            raise RunError(
-                self.path, f"its state could not be written: {error.strerror}.", disk_remedy(error)
-            ) from error
         self._state.update(changes)
+
+
+def plan_with_copies(plan: Plan, folder: Path) -> Plan:
+    """Copy a plan's SLM images into a folder, so that the run can be continued and understood later."""
+    if plan.slm_images:
+        make_folder(folder / SLM_IMAGES)
+    copies: dict[Path, Path] = {}
+    for path in plan.slm_images:
+        data = path.read_bytes()
+        copies[path] = Path(SLM_IMAGES) / f"{hashlib.sha256(data).hexdigest()[:16]}{path.suffix}"
+        write_bytes(folder / copies[path], data)
+    return plan.with_slm_images(copies.__getitem__)
+
+
+def lock_run(path: Path) -> int:
+    """Return a handle that holds the run's lock until it is closed or the process ends, however it ends."""
+    handle = os.open(path / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise RunError(path, "another program is writing to this run.", "Wait until it ends.") from None
+    return handle
+
+
+def dated_name(label: str) -> str:
+    """Return a name for something made now: local date, time and what it is."""
+    return f"{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}_{slug(label)}"
+
+
+def free_name(parent: Path, name: str, suffix: str = "") -> Path:
+    """Return a path for a new run or file, with a number before the suffix when its name is taken."""
+    path, number = parent / f"{name}{suffix}", 1
+    while path.exists() or (parent / f".{path.name}.draft").exists():
+        number += 1
+        path = parent / f"{name}-{number}{suffix}"
+    return path
+
+
+def slug(label: str) -> str:
+    """Return a label as part of a folder's name."""
+    return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.correlation import RESOLUTION_LEVEL, autocorrelate, correlate, cut_to_light, similarity
+from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, similarity
 from recon.camera.refocus import central_psfs, refocus
 from recon.camera.registration import register
 from recon.errors import InputError
@@ -145,7 +145,6 @@ def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: f
     factor, shift, recognised = _fit(new, old, complex(whole.rows, whole.columns))
     moved = _undone(new, factor, shift)
     correlation = correlate(old, new)
-    own = autocorrelate(new)
     return Change(
         z_um=z_um,
         rows=shift.real,
@@ -154,7 +153,7 @@ def compare_psfs(new: Array, old: Array, z_um: float = float("nan"), exposure: f
         rotation_deg=float(-np.rad2deg(np.angle(factor))) if recognised else None,
         as_is=correlation.maximum,
         aligned=similarity(moved, old),
-        spot=_spot(correlation) / _spot(own),
+        spot=correlation.spot_px / autocorrelate(new).spot_px,
         edge_px=abs(factor - 1) * extent,
         brightness=float(new.sum(dtype=np.float64) / old.sum(dtype=np.float64)) / exposure,
     )
@@ -207,12 +206,6 @@ def _undone(image: Array, factor: complex, shift: complex) -> npt.NDArray[np.flo
         np.asarray(image, np.float32), matrix, offset, order=3
     )
     return np.maximum(result, 0)
-
-
-def _spot(correlation: Any) -> float:
-    return float(
-        np.sqrt(correlation.half_width(0, RESOLUTION_LEVEL) * correlation.half_width(1, RESOLUTION_LEVEL))
-    )
 
 
 def _at(old: Calibration, z_um: float) -> Array:

@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.condition import ConditionCurve, Direction, condition_curve
-from recon.analysis.correlation import INNER_PRODUCT, RESOLUTION_LEVEL, autocorrelate
-from recon.analysis.field import (
+from recon.analysis.correlation import (
+    INNER_PRODUCT,
+    RESOLUTION_LEVEL,
     FieldOfView,
     FieldPoint,
     across_field,
+    autocorrelate,
     convolution_holds_deg,
     field_of_view,
 )
-from recon.analysis.point_tests import PLANES, PointTests, point_tests
-from recon.analysis.points import Noise
+from recon.analysis.gram import ConditionCurve, Direction, condition_curve
+from recon.analysis.points import PLANES, Noise, PointTests, point_tests
 from recon.analysis.resolution import (
     AxialResolution,
     DepthSimilarity,
@@ -183,20 +184,17 @@ class Analysis:
     settings: AnalysisSettings
     notes: tuple[str, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return every figure as JSON-compatible values; images are left out."""
-        record = asdict(self)
-        for name in ("psf", "autocorrelation"):
-            del record[name]
-        del record["settings"]["fall_off"]
-        result: dict[str, Any] = _plain(record)
-        result["resolution"] = {
+    def figures(self) -> dict[str, Any]:
+        """Return every figure by name; images are left out."""
+        figures = asdict(self)
+        del figures["psf"], figures["autocorrelation"], figures["settings"]["fall_off"]
+        figures["resolution"] = {
             "angle_deg": self.lateral.angle_deg(self.pitch_um, self.distance_um),
             "object_um": self.lateral.object_um(self.pitch_um, self.distance_um, self.z_um),
-            "depth_of_field_um": _plain(self.axial.depth_of_field_um(self.z_um)),
-            "hyperfocal_um": _plain(self.axial.hyperfocal_um),
+            "depth_of_field_um": self.axial.depth_of_field_um(self.z_um),
+            "hyperfocal_um": self.axial.hyperfocal_um,
         }
-        return result
+        return figures
 
 
 def analyse(
@@ -422,18 +420,3 @@ def _axial_spacing(settings: AnalysisSettings, calibration: Calibration, notes: 
         notes.append("Eq. 5.10 (axial calibration spacing) needs the lenslet's diameter and the wavelength.")
         return None
     return axial_spacing_per_um(settings.lenslet_um, 1e-3 * wavelength_nm)
-
-
-def _plain(value: Any) -> Any:
-    """Numbers, strings, lists and mappings only; what is not finite becomes None."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    return value

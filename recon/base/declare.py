@@ -15,7 +15,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from recon.errors import InputError
@@ -170,6 +170,8 @@ class Option:
 
         With ``typed`` in the words of the command line: its flag, and the unit that people type.
         """
+        if value is self.default:
+            return None
         name = self.flag if typed else self.name
         if value is None:
             may_be = self.default is None or type(None) in typing.get_args(self.type)
@@ -185,9 +187,10 @@ class Option:
             return f"{name} must be one of {', '.join(words)}, not {value!r}{meant}"
         if self.kinds == (bool,) and not isinstance(value, bool):
             return f"{name} must be True or False, not {value!r}."
-        others = tuple(k for k in self.kinds if isinstance(k, type) and k not in (int, float, bool))
-        if not {int, float} & set(self.kinds) or isinstance(value, (str, Path, *others)):
+        if any(_fits(kind, value) for kind in self.kinds):
             return None
+        if not {int, float} & set(self.kinds):
+            return f"{name} must be {self.expected(typed=typed)}, not {value!r}."
         said = self.declaration
         kind = Integral if self.is_whole else Real
         is_number = isinstance(value, kind) and not isinstance(value, bool)
@@ -219,13 +222,45 @@ class Option:
         said = self.declaration
         words = [*self.words, *((said.none_word,) if said.none_word and typed else ())]
         if not {int, float} & set(self.kinds):
-            return f"one of {', '.join(words)}" if words else "given"
+            others = [_in_words(kind) for kind in self.kinds if not (kind is str and words)]
+            others = [said for said in others if said]
+            return " or ".join(([f"one of {', '.join(words)}"] if words else []) + others) or "given"
         number = ", ".join(["a whole number" if self.is_whole else "a number", *self.limits(typed=typed)])
         unit = (said.shown_unit if typed else "") or said.unit
         number += f" ({unit})" if unit else ""
         if Path in self.kinds:
             words.append("the name of a file")
         return f"{', '.join(words)} or {number}" if words else number
+
+
+def _fits(kind: Any, value: object) -> bool:
+    """Whether a value is of a type, as far as that can be told; numbers are judged with their limits."""
+    if kind in (int, float):
+        return False
+    if typing.get_origin(kind) is typing.Literal:
+        return isinstance(value, str)  # which words is another question
+    if typing.get_origin(kind) is tuple:
+        several = hasattr(value, "__len__") and not isinstance(value, str)
+        items = typing.get_args(kind)
+        return several and (items[1:] == (...,) or len(value) == len(items))  # type: ignore[arg-type]
+    if not isinstance(kind, type):
+        return True
+    also = (str, PurePath) if kind is Path else tuple if issubclass(kind, tuple) else ()
+    return isinstance(value, (kind, also))
+
+
+def _in_words(kind: Any) -> str:
+    """Say what a value of a type is; empty where its words say it."""
+    if kind is Path:
+        return "the name of a file"
+    if inside := typing.get_args(kind):
+        many = typing.get_origin(kind) is tuple
+        return f"{'several' if inside[1:] == (...,) else len(inside)} values" if many else ""
+    if not isinstance(kind, type) or issubclass(kind, enum.Enum):
+        return ""
+    if kind is str:
+        return "a text"
+    return f"{'an' if kind.__name__[0] in 'AEIOU' else 'a'} {kind.__name__}"
 
 
 def option(default: Any = dataclasses.MISSING, **declaration: Any) -> Any:
@@ -273,6 +308,9 @@ def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f" Did you mean {near[0]!r}?" if near else f" There are {', '.join(known)}."
+            flag = f"--{name.replace('_', '-')}"  # an old name goes on working on the command line
+            if new := next((o.name for o in options_of(options) if flag in o.flags), ""):
+                hint = f" It is called {new!r}."
             raise InputError(f"{type(options).__name__} has no option {name!r}.{hint}")
     return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
 

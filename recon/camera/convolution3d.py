@@ -121,7 +121,7 @@ class Convolution3D(LinearOperator):
 
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return what the sensor sees of the volume ``x``."""
-        from recon.camera import _plane_kernels as kernels
+        from recon.camera import _kernels as kernels
 
         if out is None:
             out = np.empty(self.range_shape, self.dtype)
@@ -145,7 +145,7 @@ class Convolution3D(LinearOperator):
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Correlate sensor data with every depth's PSF."""
-        from recon.camera import _plane_kernels as kernels
+        from recon.camera import _kernels as kernels
 
         if out is None:
             out = np.empty(self.domain_shape, self.dtype)

@@ -10,8 +10,8 @@ found. A blind calibration has no zero: a shift of the whole picture is no error
 
 from __future__ import annotations
 
-import hashlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,9 +23,10 @@ from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.points import support_of
 from recon.camera.registration import displacement
 from recon.errors import InputError
-from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.evaluation.scored import Aside, Curve, Point
+from recon.evaluation.trial import Subject, Turn, in_turns
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import StopReason
+from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration, Geometry
 
 Array = npt.NDArray[Any]
@@ -133,12 +134,16 @@ class CalibrationSetting:
         return first + depths + (f", mean of {self.averaged}" if self.averaged > 1 else "")
 
 
-@dataclass(frozen=True)
-class CalibrationProblem:
-    """Photographs from which calibrations are made, and scenes to judge them on."""
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem(Subject[CalibrationSetting]):
+    """Photographs from which calibrations are made, and scenes to judge them on.
+
+    A blind calibration that finds no beads is an InputError of its run.
+    """
+
+    kind = "calibration"
 
     photographs: Photographs
-    kind: KindName = "calibration"
 
     @property
     def pixels(self) -> tuple[int, ...]:
@@ -160,99 +165,66 @@ class CalibrationProblem:
         blind = [CalibrationSetting(slides=n) for n in sorted({3, 5, slides}) if 2 <= n <= slides]
         return (*sorted(found, key=lambda s: s.images), *blind)
 
-    def run(
-        self, setting: CalibrationSetting, *, limit_s: float | None = None, aside: Aside = nothing_aside
-    ) -> Curve:
-        """Calibrate and reconstruct every scene.
-
-        Raises
-        ------
-        InputError
-            When the setting does not apply, or a blind calibration finds no beads.
-        """
-        if setting not in self.settings():
-            raise InputError(f"The setting '{setting.name}' does not apply to these photographs.")
+    def _curve(self, setting: CalibrationSetting, limit_s: float | None, aside: Aside) -> Curve:
+        """Calibrate and reconstruct every scene."""
         began = time.perf_counter()
         try:
             calibration = self._calibrated(setting, None if limit_s is None else began + limit_s)
         except _OutOfTime:
             return Curve((), finished=False)
         spent = time.perf_counter() - began
-        points: list[Point] = []
-        for scene in self.photographs.scenes:
-            left = None if limit_s is None else limit_s - (time.perf_counter() - began)
-            if left is not None and left <= 0:
-                return Curve(tuple(points), finished=False)
-            found = reconstruct(
-                scene.image,
-                calibration if scene.name != "flat picture" else self._flat(calibration),
-                model="local" if setting.grid > 1 or setting.slides else "convolution",
-                # Total variation for what is extended, l1 for what is sparse.
-                prior="tv" if scene.name == "flat picture" else "l1",
-                estimate_background=False,
-                iterations=ITERATIONS,
-                time_s=left,
-                judged=False,
+        turns = (self._turn(setting, calibration, scene, spent) for scene in self.photographs.scenes)
+        return in_turns(turns, None if limit_s is None else limit_s - spent, aside)
+
+    def _turn(
+        self, setting: CalibrationSetting, calibration: Calibration, scene: Photographed, spent_s: float
+    ) -> Turn:
+        flat = scene.name == "flat picture"
+
+        def reconstructed(left_s: float | None) -> Reconstruction:
+            # Total variation for what is extended, l1 for what is sparse.
+            given = self._flat(calibration) if flat else calibration
+            return _reconstructed(
+                scene.image, given, setting, "tv" if flat else "l1", iterations=ITERATIONS, time_s=left_s
             )
-            if StopReason.TIME in found.stop_reasons:
-                return Curve(tuple(points), finished=False)
-            with aside():
-                psnr_db, likeness, nrmse = self.judged(found.volume.sum(axis=0), scene)
-            points.append(
-                Point(
-                    setting.name,
-                    len(found.histories[0]),
-                    spent + found.seconds,
-                    psnr_db=psnr_db,
-                    ssim=likeness,
-                    nrmse=nrmse,
-                    images=setting.images,
-                    family=setting.family,
-                    group=scene.name,
-                )
+
+        def scored(result: Reconstruction) -> Point:
+            psnr_db, likeness, nrmse = self.judged(result.volume.sum(axis=0), scene)
+            return Point(
+                setting.name,
+                len(result.histories[0]),
+                spent_s + result.seconds,
+                psnr_db=psnr_db,
+                ssim=likeness,
+                nrmse=nrmse,
+                images=setting.images,
+                family=setting.family,
+                group=scene.name,
             )
-        return Curve(tuple(points), finished=True)
+
+        return reconstructed, scored
 
     def warm_up(self, setting: CalibrationSetting) -> None:
         """Reconstruct from noise, in small."""
-        photographs = self.photographs
         rng = np.random.default_rng(0)
-        few = CalibrationSetting(min(setting.grid, 3), min(setting.depths, 3))
-        size = 24
+        size, few = 24, CalibrationSetting(min(setting.grid, 3), min(setting.depths, 3))
         centre = np.zeros((size, size), np.float32)
         centre[size // 2 - 2 : size // 2 + 3, size // 2 - 2 : size // 2 + 3] = rng.random((5, 5))
-        square = _square(few.grid)
-        positions = [(float(x), float(y), 1e3 * (z + 1)) for z in range(few.depths) for x, y in square]
+        places = _square(3 if setting.slides else few.grid)
+        positions = [(1e2 * x, 1e2 * y, 1e3 * (z + 1)) for z in range(few.depths) for x, y in places]
         calibration = Calibration(
             np.repeat(centre[None, None], len(positions), axis=0),
-            1e2 * np.array(positions) * (1, 1, 1e-2),
-            geometry=replace(photographs.geometry, diffuser_distance_mm=1.0),
+            np.array(positions),
+            geometry=replace(self.photographs.geometry, diffuser_distance_mm=1.0),
         )
-        model = "local" if few.grid > 1 or setting.slides else "convolution"
-        if model == "local" and few.grid == 1:
-            calibration = replace(
-                calibration,
-                psfs=np.repeat(calibration.psfs, 9, axis=0),
-                source_positions_um=np.array([(1e2 * x, 1e2 * y, 1e3) for x, y in _square(3)]),
-            )
         for prior in ("tv", "l1"):
-            reconstruct(
-                rng.random((size, size)),
-                calibration,
-                model=model,
-                prior=prior,
-                estimate_background=False,
-                iterations=2,
-                judged=False,
-            )
+            _reconstructed(rng.random((size, size)), calibration, setting, prior, iterations=2)
 
-    def fingerprint(self) -> str:
-        """Digest all photographs."""
+    def _identity(self) -> Iterator[str | Array]:
         p = self.photographs
-        digest = hashlib.sha256(f"{p.z_um} {p.geometry} {p.window_px} {p.reach}".encode())
-        for array in (p.psfs, p.places, p.slides, *(a for s in p.scenes for a in (s.image, s.truth))):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()[:16]
+        yield f"{p.z_um} {p.geometry} {p.window_px} {p.reach}"
+        yield from (p.psfs, p.places, p.slides)
+        yield from (image for scene in p.scenes for image in (scene.image, scene.truth))
 
     def judged(self, found: Array, scene: Photographed) -> tuple[float, float, float]:
         """Return PSNR in dB, SSIM and NRMSE where the scene is, at the best gain and shift."""
@@ -355,6 +327,15 @@ class CalibrationProblem:
 
     def _grid(self) -> int:
         return len(np.unique(np.round(self.photographs.places[:, 0], 6)))
+
+
+def _reconstructed(
+    image: Array, calibration: Calibration, setting: CalibrationSetting, prior: str, **limits: Any
+) -> Reconstruction:
+    model = "local" if setting.grid > 1 or setting.slides else "convolution"
+    return reconstruct(
+        image, calibration, model=model, prior=prior, estimate_background=False, judged=False, **limits
+    )
 
 
 class _OutOfTime(Exception):  # noqa: N818 (no error: the time limit of a blind calibration)

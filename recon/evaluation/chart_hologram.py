@@ -7,9 +7,8 @@ whatever was optimised; expansions do not compete with each other, for each show
 
 from __future__ import annotations
 
-import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
-from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
+from recon.evaluation.scored import Aside, Curve, Point
+from recon.evaluation.trial import Subject
 from recon.holography.display import Display, random_mask
 from recon.holography.judge import compare
 from recon.holography.losses import LOSSES
@@ -75,7 +75,7 @@ class HologramSetting:
 
 
 @dataclass(frozen=True)
-class HologramProblem:
+class HologramProblem(Subject[HologramSetting]):
     """A picture and the displays that shall show it.
 
     Attributes
@@ -91,12 +91,13 @@ class HologramProblem:
         Of the random start.
     """
 
+    kind = "hologram"
+
     displays: tuple[Display, ...]
     targets: tuple[tuple[Target, ...], ...]
     frames: tuple[int, ...] = (1, 2, 3)
     weights: Array = field(default_factory=lambda: foveal_weights((256, 256)))
     seed: int = 0
-    kind: KindName = "hologram"
 
     def __post_init__(self) -> None:
         factors = [d.expansion for d in self.displays]
@@ -119,23 +120,10 @@ class HologramProblem:
             found += [HologramSetting(q, "nesterov", loss) for loss in LOSSES]
         return tuple(sorted(found, key=_cost))
 
-    def run(
-        self,
-        setting: HologramSetting,
-        *,
-        limit_s: float | None = None,
-        aside: Aside = nothing_aside,
-        counts: Sequence[int] = COUNTS,
+    def _curve(
+        self, setting: HologramSetting, limit_s: float | None, aside: Aside, *, counts: Sequence[int] = COUNTS
     ) -> Curve:
-        """Compute one hologram and score it on the way.
-
-        Raises
-        ------
-        InputError
-            When the setting does not apply to the problem.
-        """
-        if setting not in self.settings():
-            raise InputError(f"The setting '{setting.name}' does not apply to this problem.")
+        """Compute one hologram and score it on the way."""
         place = [d.expansion for d in self.displays].index(setting.expansion)
         display, targets = self.displays[place], self.targets[place]
         options = HologramOptions(
@@ -180,21 +168,17 @@ class HologramProblem:
         image = np.random.default_rng(0).random((64, 64))
         HologramProblem((display,), ((Target(image),),), self.frames).run(setting, counts=(2,))
 
-    def fingerprint(self) -> str:
-        """Digest displays, targets and the rest."""
-        digest = hashlib.sha256(f"{self.frames} {self.seed}".encode())
+    def _identity(self) -> Iterator[str | Array]:
+        yield f"{self.frames} {self.seed}"
         for display, targets in zip(self.displays, self.targets, strict=True):
             fixed = (display.slm_pitch_um, display.wavelength_nm, display.focal_mm, display.mask_fill)
-            digest.update(f"{display.slm_shape} {fixed} {display.dc}".encode())
-            digest.update(np.ascontiguousarray(display.mask.response(display.wavelength_nm)).tobytes())
-            digest.update(np.ascontiguousarray(display.mask.levels).tobytes())
+            yield f"{display.slm_shape} {fixed} {display.dc}"
+            yield from (display.mask.response(display.wavelength_nm), display.mask.levels)
             if display.displacement is not None:
-                digest.update(np.ascontiguousarray(display.displacement).tobytes())
+                yield display.displacement
             for target in targets:
-                digest.update(f"{target.z_mm} {target.white}".encode())
-                digest.update(np.ascontiguousarray(target.image).tobytes())
-        digest.update(np.ascontiguousarray(self.weights).tobytes())
-        return digest.hexdigest()[:16]
+                yield from (f"{target.z_mm} {target.white}", target.image)
+        yield self.weights
 
 
 def _cost(setting: HologramSetting) -> float:
@@ -205,27 +189,26 @@ def _cost(setting: HologramSetting) -> float:
 
 def _point(setting: HologramSetting, model: HologramModel, record: HologramRecord, slm: Array) -> Point:
     """Score what is seen, the mean of all planes."""
-    planes = range(len(model.targets))
     scores = [
         compare(
             np.asarray(model.seen(slm, p), float) / model.peaks[p],
             np.asarray(model.wanted(p), float) / model.peaks[p],
             1.0,
         )
-        for p in planes
+        for p in range(len(model.targets))
     ]
-
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(s, name) for s in scores]))
-
+    names = ("psnr_db", "ssim", "crop_psnr_db", "crop_ssim")
+    psnr_db, ssim, middle_psnr_db, middle_ssim = (
+        float(np.mean([getattr(s, name) for s in scores])) for name in names
+    )
     return Point(
         setting.name,
         record.iteration,
         record.seconds,
-        psnr_db=mean("psnr_db"),
-        ssim=mean("ssim"),
-        middle_psnr_db=mean("crop_psnr_db"),
-        middle_ssim=mean("crop_ssim"),
         family=setting.family,
         group=setting.group,
+        psnr_db=psnr_db,
+        ssim=ssim,
+        middle_psnr_db=middle_psnr_db,
+        middle_ssim=middle_ssim,
     )

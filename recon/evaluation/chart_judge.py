@@ -11,30 +11,37 @@ for it (docs/benchmarks/charts.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base import metrics
 from recon.base.blocks import block_mean, blocks_about_axis, enlarged
-from recon.camera.background import BackgroundRemoval
+from recon.camera.factors import BackgroundRemoval
+from recon.errors import InputError
 from recon.evaluation.scored import Point
-from recon.evaluation.trial import Setting, binnings_of
+from recon.evaluation.trial import Setting
 from recon.reconstruction.measurement import Measurement, channel_noise
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import BACKGROUND_FREQUENCIES, Part
-from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import reduced_calibration
+from recon.reconstruction.result import window_of
 from recon.types import Calibration
 
 if TYPE_CHECKING:
     from recon.evaluation.chart_reconstruction import ChartProblem
-from dataclasses import dataclass
 
-from recon.base import metrics
-from recon.errors import InputError
+Array = npt.NDArray[Any]
 
+HELD_SHARE = 0.05
+PARTS = 12
+"""Of the held-out pixels, scored apart: how much they differ tells how much the score scatters."""
+_PIXELS_A_WAVE = 4
+"""Blocks along an axis for each slow wave that is fitted, at least."""
 VOLUME_BLUR_PX = 1.0
 """Volumes are compared through a blur of this deviation in every direction: a bead at a voxel's border is not
 wrong by being in its neighbour."""
@@ -69,32 +76,13 @@ def score(found: npt.NDArray[Any], truth: npt.NDArray[Any], *, volume: bool | No
     if volume is None:
         volume = truth.ndim == 4 or (truth.ndim == 3 and truth.shape[2] > 4)
     a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    if not volume:
-        return Score(
-            metrics.psnr(a, b, fit_scale=True),
-            metrics.ssim(a, b, fit_scale=True),
-            metrics.nrmse(a, b, fit_scale=True),
-        )
-    from scipy.ndimage import gaussian_filter
+    if volume:
+        from scipy.ndimage import gaussian_filter
 
-    sigma = (VOLUME_BLUR_PX,) * 3 + (0.0,) * (b.ndim - 3)
-    a, b = (gaussian_filter(v, sigma, mode="constant") for v in (a, b))
-    # Planes side by side make one picture: one scale and one peak for all of the volume.
-    wide_a, wide_b = (v.reshape(-1, *v.shape[2:]) for v in (a, b))
-    return Score(
-        metrics.psnr(wide_a, wide_b, fit_scale=True),
-        metrics.ssim(wide_a, wide_b, fit_scale=True),
-        metrics.nrmse(wide_a, wide_b, fit_scale=True),
-    )
-
-
-Array = npt.NDArray[Any]
-
-HELD_SHARE = 0.05
-PARTS = 12
-"""Of the held-out pixels, scored apart: how much they differ tells how much the score scatters."""
-_PIXELS_A_WAVE = 4
-"""Blocks along an axis for each slow wave that is fitted, at least."""
+        sigma = (VOLUME_BLUR_PX,) * 3 + (0.0,) * (b.ndim - 3)
+        # Planes side by side make one picture: one scale and one peak for all of the volume.
+        a, b = (gaussian_filter(v, sigma, mode="constant").reshape(-1, *v.shape[2:]) for v in (a, b))
+    return Score(*(of(a, b, fit_scale=True) for of in (metrics.psnr, metrics.ssim, metrics.nrmse)))
 
 
 class Judge:
@@ -106,7 +94,7 @@ class Judge:
         shape = problem.measurement.shape
         kept = np.ones(shape, bool) if problem.erasures is None else ~problem.erasures
         # Blocks of the coarsest binning, on its grid, so that every setting predicts the same light.
-        binnings = binnings_of(problem)
+        binnings = problem.binnings
         block = binnings[-1]
         self._together = block // factor
         spans = [_common_blocks(n, binnings) for n in shape]
@@ -133,7 +121,6 @@ class Judge:
         self._scored = self._blocks(self.held & self.kept) > 0.5
         used = self._blocks(~self.erasures) > 1 - 1e-6
         self._waves, self._block_waves = _slow_waves(~self.erasures), _slow_waves(used)
-        self._camera: Part | None = None
 
     def _blocks(self, image: Array) -> Array:
         """Average over the coarsest binning's blocks, those that every binning has."""
@@ -167,7 +154,12 @@ class Judge:
         seen, shown = self._blocks(self.measurement), self._blocks(predicted)
         error = _misfit(seen, shown, self._block_waves)[self._scored] / self._block_noise
         count = min(PARTS, held.size)
-        point = Point(
+        marks: dict[str, Any] = {}
+        if self.problem.truth is not None:
+            shown = enlarged(self._on_sensor(planes), self.setting.binning, self.problem.measurement.shape)
+            volume = self.problem.volume
+            marks = asdict(score(shown if volume else shown[0], self.problem.truth, volume=volume))
+        return Point(
             self.setting.name,
             iterations,
             seconds,
@@ -176,14 +168,8 @@ class Judge:
             family=self.setting.family,
             binning=self.setting.binning,
             held_out_parts=tuple(float(np.mean(held[k::count] ** 2)) for k in range(count)),
+            **marks,
         )
-        if self.problem.truth is None:
-            return point
-        seen = self._on_sensor(planes)
-        shown = enlarged(seen, self.setting.binning, self.problem.measurement.shape)
-        truth = self.problem.truth
-        marks = score(shown if self.problem.volume else shown[0], truth, volume=self.problem.volume)
-        return replace(point, psnr_db=marks.psnr_db, ssim=marks.ssim, nrmse=marks.nrmse)
 
     def _on_sensor(self, planes: Array) -> Array:
         height, width = self.measurement.shape
@@ -193,7 +179,7 @@ class Judge:
 
     def _predict(self, planes: Array) -> Array:
         """Return the measurement that the setting's own model makes of what was found."""
-        part = self._part()
+        part = self._part
         placed = np.zeros(part.camera.domain_shape, part.dtype)
         placed[0, :, : planes.shape[1], : planes.shape[2]] = planes / part.problem.image_scale[0, 0]
         predicted: Array = part.camera.forward(placed)[0]
@@ -201,19 +187,15 @@ class Judge:
             predicted = predicted + part.background(placed)[0]
         return predicted * np.float32(self.noise)
 
+    @cached_property
     def _part(self) -> Part:
-        if self._camera is None:
-            problem = Problem.of(
-                Measurement(self.measurement, self.noise, erasures=self.erasures),
-                self.used,
-                ReconstructionOptions(
-                    model=self.setting.model,
-                    estimate_background=self.setting.background,
-                    prior="nonnegative",
-                ),
-            )
-            self._camera = Part(problem, slice(0, 1))
-        return self._camera
+        options = ReconstructionOptions(
+            model=self.setting.model,  # type: ignore[arg-type]
+            estimate_background=self.setting.background,
+            prior="nonnegative",
+        )
+        measured = Measurement(self.measurement, self.noise, erasures=self.erasures)
+        return Part(Problem.of(measured, self.used, options), slice(0, 1))
 
 
 def _slow_waves(used: npt.NDArray[np.bool_]) -> BackgroundRemoval:

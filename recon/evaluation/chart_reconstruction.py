@@ -7,25 +7,31 @@ to the noise, and the error on pixels that were held out (:mod:`recon.evaluation
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.namespace import Device, array_namespace
 from recon.base.noise import NoiseModel
+from recon.camera.camera_model import CAMERAS, MODELS, members_of_depths
+from recon.errors import InputError
 from recon.evaluation.chart_judge import Judge
-from recon.evaluation.scene import Family, make_scene
-from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.evaluation.trial import Setting, left_out, require_applicable, settings_for
+from recon.evaluation.scene import TestScene, make_scene
+from recon.evaluation.scored import Aside, Curve, Point
+from recon.evaluation.trial import Setting, Subject
+from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.options import PRECISIONS, ReconstructionOptions
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import IterationRecord, StopReason
+from recon.reconstruction.solvers import SOLVERS
+from recon.solvers.base import IterationRecord, StopReason
 from recon.types import Calibration
-
-__all__ = ["ChartProblem", "Setting", "left_out", "run_setting", "settings_for"]
 
 Array = npt.NDArray[Any]
 
@@ -35,8 +41,8 @@ COUNTS = (3, 5, 10, 20, 40, 80, 160, 320)
 """Iterations at which a run is scored."""
 
 
-@dataclass(frozen=True)
-class ChartProblem:
+@dataclass(frozen=True, eq=False)
+class ChartProblem(Subject[Setting]):
     """What is reconstructed over and over.
 
     Attributes
@@ -52,92 +58,140 @@ class ChartProblem:
         (height, width), or (n_z, height, width).
     """
 
+    kind = "reconstruction"
+
     measurement: npt.NDArray[np.float32]
     calibration: Calibration
     volume: bool
     erasures: npt.NDArray[np.bool_] | None = None
     noise: NoiseModel | float | None = None
     truth: npt.NDArray[np.float32] | None = None
-    kind: KindName = "reconstruction"
+
+    @classmethod
+    def of_scene(cls, scene: TestScene) -> ChartProblem:
+        """Return a test scene to chart on, with its truth."""
+        volume = not scene.spec.is_picture
+        return cls(scene.measurement, scene.calibration, volume, scene.erasures, scene.noise, scene.truth)
 
     @property
     def pixels(self) -> tuple[int, ...]:
         """Of the measurement."""
         return self.measurement.shape
 
-    def settings(self) -> tuple[Setting, ...]:
-        """As :func:`settings_for`."""
-        return settings_for(self)
+    @property
+    def binnings(self) -> list[int]:
+        """Those that leave enough pixels; erased ones cannot be averaged with others."""
+        return [1, *(b for b in (2, 4) if max(self.pixels) // b >= 24 and self.erasures is None)]
 
-    def run(self, setting: Setting, *, limit_s: float | None, aside: Aside) -> Curve:
-        """As :func:`run_setting`."""
-        return run_setting(self, setting, limit_s=limit_s, aside=aside)
+    def settings(self) -> tuple[Setting, ...]:
+        """Return every applicable setting, the quick ones first; which are not, and why: :meth:`left_out`."""
+        return _settings_for(self)
+
+    def left_out(self) -> tuple[str, ...]:
+        """Say which settings are not applicable, and why."""
+        asked = _asked(self)
+        refused: dict[tuple[str, str], list[str]] = {}
+        for solver, prior in product(SOLVERS, PRIORS):
+            if (reason := Setting(solver, "convolution", prior).refusal(asked)) is not None:
+                refused.setdefault((solver, reason), []).append(prior)
+        found = [
+            solver + ("" if len(priors) == len(PRIORS) else " with " + ", ".join(priors)) + f": {reason}"
+            for (solver, reason), priors in refused.items()
+        ]
+        if not _varies(self):
+            found.append("the local and low-rank models: the calibration has one PSF a depth")
+        for camera in CAMERAS.values():
+            if (reason := camera.refuses(asked.depths)) is not None:
+                found.append(f"the {camera.name} model: {reason}")
+        if self.binnings == [1]:
+            small = self.erasures is None
+            why = "too few pixels would be left" if small else "erased pixels cannot be averaged"
+            found.append(f"binning: {why}")
+        if not _has_gpu():
+            found.append("the gpu: there is none that CuPy can use")
+        return tuple(found)
+
+    def _curve(
+        self,
+        setting: Setting,
+        limit_s: float | None,
+        aside: Aside,
+        *,
+        counts: Sequence[int] = COUNTS,
+        seed: int = 0,
+    ) -> Curve:
+        """Reconstruct once and score on the way; ``seed`` is that of the pixels held out."""
+        judge = Judge(self, setting, seed)
+        points: list[Point] = []
+
+        def note(record: IterationRecord, now: Callable[[], Array]) -> None:
+            if record.iteration in counts:
+                with aside():
+                    points.append(judge.point(now(), record.iteration, record.seconds))
+
+        found = reconstruct(
+            Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
+            judge.used,
+            setting.options(
+                iterations=counts[-1], time_s=limit_s, tolerance=1e-7, field="full", judged=False
+            ),
+            on_progress=None if setting.one_step else note,
+        )
+        if setting.one_step:
+            with aside():
+                points = [judge.point(found.volume, 0, found.seconds)]
+        return Curve(tuple(points), StopReason.TIME not in found.stop_reasons)
 
     def warm_up(self, setting: Setting) -> None:
         """Reconstruct a small scene of the same sort once."""
-        family: Family = "beads" if self.volume else "sparse-picture"
-        scene = make_scene(family, size=16, grid=3, **({"depths": 2} if self.volume else {}))
-        small = ChartProblem(scene.measurement, scene.calibration, self.volume)
-        run_setting(small, replace(setting, binning=1), counts=(1,))
+        small = (
+            make_scene("beads", size=16, grid=3, depths=2)
+            if self.volume
+            else make_scene("sparse-picture", size=16, grid=3)
+        )
+        problem = ChartProblem(small.measurement, small.calibration, self.volume)
+        problem.run(replace(setting, binning=1), counts=(1,))
 
-    def fingerprint(self) -> str:
-        """Digest measurement, calibration, erasures, noise and truth."""
-        digest = hashlib.sha256(f"scores {SCORES}".encode())
-        for array in (self.measurement, self.calibration.psfs, self.calibration.source_positions_um):
-            digest.update(np.ascontiguousarray(array).data)
-        for part in (self.erasures, self.truth):
-            digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
-        digest.update(f"{self.volume} {self.noise}".encode())
-        return digest.hexdigest()[:16]
+    def _identity(self) -> Iterator[str | Array | None]:
+        yield from (f"scores {SCORES}", self.measurement)
+        yield from (self.calibration.psfs, self.calibration.source_positions_um)
+        yield from (self.erasures, self.truth, f"{self.volume} {self.noise}")
 
 
-def run_setting(
-    problem: ChartProblem,
-    setting: Setting,
-    *,
-    limit_s: float | None = None,
-    counts: Sequence[int] = COUNTS,
-    seed: int = 0,
-    aside: Aside = nothing_aside,
-) -> Curve:
-    """Reconstruct once and score on the way.
+@lru_cache(maxsize=2)
+def _settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
+    asked = _asked(problem)
+    own = [m for m in MODELS if m != "auto" and (_varies(problem) or m == "convolution")]
+    devices: list[Device] = ["cpu", "gpu"] if _has_gpu() else ["cpu"]
+    ways = product(SOLVERS, (*own, *CAMERAS), PRIORS, problem.binnings, (False, True), PRECISIONS, devices)
+    taken = (setting for setting in (Setting(*way) for way in ways) if setting.refusal(asked) is None)
+    return tuple(sorted(taken, key=lambda setting: setting.cost(volume=problem.volume)))
 
-    Parameters
-    ----------
-    limit_s : float, optional
-        Wall seconds after which the run stops.
-    counts : sequence of int
-        Iterations to score at, ascending.
-    seed : int
-        Of the pixels held out; the same for all settings that are compared.
-    aside : Aside
-        In which points are scored.
 
-    Raises
-    ------
-    InputError
-        When the setting does not apply to the problem.
-    """
-    require_applicable(problem, setting)
-    judge = Judge(problem, setting, seed)
-    points: list[Point] = []
+@lru_cache(maxsize=2)
+def _asked(problem: ChartProblem) -> Problem:
+    """Return the problem that solvers are asked about."""
+    calibration = problem.calibration
+    if not problem.volume:
+        first = members_of_depths(calibration.source_positions_um)[0][:1]
+        calibration = replace(
+            calibration,
+            psfs=calibration.psfs[first],
+            source_positions_um=calibration.source_positions_um[first],
+        )
+    measurement = Measurement(problem.measurement, erasures=problem.erasures, noise=problem.noise)
+    return Problem.of(measurement, calibration, ReconstructionOptions(model="convolution"))
 
-    def note(record: IterationRecord, now: Callable[[], Array]) -> None:
-        if record.iteration not in counts:
-            return
-        with aside():
-            points.append(judge.point(now(), record.iteration, record.seconds))
 
-    options = setting.options(
-        iterations=counts[-1], time_s=limit_s, tolerance=1e-7, field="full", judged=False
-    )
-    found = reconstruct(
-        Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
-        judge.used,
-        options,
-        on_progress=None if setting.one_step else note,
-    )
-    if setting.one_step:
-        with aside():
-            points = [judge.point(found.volume, 0, found.seconds)]
-    return Curve(tuple(points), StopReason.TIME not in found.stop_reasons)
+def _varies(problem: ChartProblem) -> bool:
+    positions = problem.calibration.source_positions_um
+    return len(positions) > len(members_of_depths(positions))
+
+
+@cache
+def _has_gpu() -> bool:
+    try:
+        array_namespace("gpu")
+    except InputError:
+        return False
+    return True

@@ -6,24 +6,24 @@ every second depth. All predict the same held-out pixels of one photograph, so t
 
 from __future__ import annotations
 
-import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.camera.camera_model import ModelName, members_of_depths
-from recon.camera.interpolation import grid_axes
+from recon.camera.varying_psfs import grid_axes
 from recon.errors import InputError
 from recon.evaluation.chart_calibration import ITERATIONS
 from recon.evaluation.chart_judge import Judge
-from recon.evaluation.chart_reconstruction import SCORES, ChartProblem, run_setting
+from recon.evaluation.chart_reconstruction import SCORES, ChartProblem
 from recon.evaluation.scene import make_scene
-from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
-from recon.evaluation.trial import Setting
+from recon.evaluation.scored import Aside, Curve, Point
+from recon.evaluation.trial import Setting, Subject, Turn, in_turns
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
-from recon.solvers.stopping import StopReason
+from recon.reconstruction.result import Reconstruction
 
 _SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
 """What a photograph is of is for its owner to say: both fronts are drawn."""
@@ -78,11 +78,15 @@ class OwnSetting:
 
 
 @dataclass(frozen=True)
-class OwnCalibrationsProblem:
-    """Calibrations that compete on one photograph."""
+class OwnCalibrationsProblem(Subject[OwnSetting]):
+    """Calibrations that compete on one photograph.
+
+    PSFs that cannot be used together are an InputError of their run.
+    """
+
+    kind = "calibration"
 
     calibrations: tuple[OwnCalibration, ...]
-    kind: KindName = "calibration"
 
     def __post_init__(self) -> None:
         labels = [c.label for c in self.calibrations]
@@ -109,65 +113,52 @@ class OwnCalibrationsProblem:
         found = [s for c in self.calibrations for s in _parts(c)]
         return tuple(sorted(found, key=lambda s: s.images))
 
-    def run(
-        self, setting: OwnSetting, *, limit_s: float | None = None, aside: Aside = nothing_aside
-    ) -> Curve:
-        """Reconstruct with either prior, and score.
-
-        Raises
-        ------
-        InputError
-            When the setting is of another problem, or its PSFs cannot be used together.
-        """
-        if setting not in self.settings():
-            raise InputError(f"The setting '{setting.name}' does not apply to these calibrations.")
+    def _curve(self, setting: OwnSetting, limit_s: float | None, aside: Aside) -> Curve:
+        """Reconstruct with either prior, and score."""
         own = next(c for c in self.calibrations if c.label == setting.label)
         members = list(setting.members)
-        calibration = own.problem.calibration
-        problem = replace(
-            self.calibrations[0].problem,
-            volume=True,
-            calibration=replace(
-                calibration,
-                psfs=calibration.psfs[members],
-                source_positions_um=calibration.source_positions_um[members],
-            ),
+        calibration = replace(
+            own.problem.calibration,
+            psfs=own.problem.calibration.psfs[members],
+            source_positions_um=own.problem.calibration.source_positions_um[members],
         )
-        points: list[Point] = []
-        spent = 0.0
-        for prior, group in _SCENES.items():
-            way = Setting("admm", setting.model, prior, background=True)
-            judge = Judge(problem, way, 0)
-            left_s = None if limit_s is None else max(limit_s - spent, 1e-3)
-            found = reconstruct(
-                Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
-                judge.calibration,
-                way.options(iterations=ITERATIONS, time_s=left_s, field="full", judged=False),
-            )
-            if StopReason.TIME in found.stop_reasons:
-                return Curve(tuple(points), finished=False)
-            spent += found.seconds
-            with aside():
-                point = judge.point(found.volume, len(found.histories[0]), found.seconds)
-            points.append(
-                replace(point, setting=setting.name, images=setting.images, family=setting.label, group=group)
-            )
-        return Curve(tuple(points), finished=True)
+        problem = replace(self.calibrations[0].problem, volume=True, calibration=calibration)
+        return in_turns((_turn(problem, setting, prior) for prior in _SCENES), limit_s, aside)
 
     def warm_up(self, setting: OwnSetting) -> None:
         """Reconstruct a small scene of the same sort."""
         scene = make_scene("beads", size=16, grid=3, depths=2)
         small = ChartProblem(scene.measurement, scene.calibration, volume=True)
         for prior in _SCENES:
-            run_setting(small, Setting("admm", setting.model, prior, background=True), counts=(1,))
+            small.run(_way(setting, prior), counts=(1,))
 
-    def fingerprint(self) -> str:
-        """Digest photographs, calibrations and the names that results are kept by."""
-        names = [s.name for s in self.settings()]
-        digest = hashlib.sha256(f"own calibrations {SCORES} {names}".encode())
+    def _identity(self) -> Iterator[str]:
+        yield f"own calibrations {SCORES} {[s.name for s in self.settings()]}"
         for c in self.calibrations:
-            digest.update(f"{c.label} {c.photographs} {c.whole} {c.problem.fingerprint()}".encode())
-        return digest.hexdigest()[:16]
+            yield f"{c.label} {c.photographs} {c.whole} {c.problem.fingerprint()}"
+
+
+def _way(setting: OwnSetting, prior: str) -> Setting:
+    return Setting("admm", setting.model, prior, background=True)
+
+
+def _turn(problem: ChartProblem, setting: OwnSetting, prior: str) -> Turn:
+    way = _way(setting, prior)
+    judge = Judge(problem, way, 0)
+
+    def reconstructed(left_s: float | None) -> Reconstruction:
+        return reconstruct(
+            Measurement(judge.measurement, erasures=judge.erasures, noise=judge.noise),
+            judge.calibration,
+            way.options(iterations=ITERATIONS, time_s=left_s, field="full", judged=False),
+        )
+
+    def scored(result: Reconstruction) -> Point:
+        point = judge.point(result.volume, len(result.histories[0]), result.seconds)
+        point = replace(point, setting=setting.name, family=setting.label)
+        return replace(point, images=setting.images, group=_SCENES[prior])
+
+    return reconstructed, scored
 
 
 def _parts(own: OwnCalibration) -> list[OwnSetting]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -117,19 +117,14 @@ class Kind:
         return next((s for s in self.scores if any(is_known(p, s.key) for p in points)), self.scores[0])
 
 
+_OF_PICTURES = (SSIM, NRMSE, HELD_OUT, RESIDUAL)
 KINDS: dict[str, Kind] = {
-    k.name: k
-    for k in (
+    kind.name: kind
+    for kind in (
         Kind(
             "reconstruction",
             (SECONDS, MEMORY),
-            (
-                Axis("psnr_db", "PSNR (dB)", more_is_better=True),
-                SSIM,
-                NRMSE,
-                HELD_OUT,
-                RESIDUAL,
-            ),
+            (Axis("psnr_db", "PSNR (dB)", more_is_better=True), *_OF_PICTURES),
         ),
         Kind(
             "hologram",
@@ -144,13 +139,7 @@ KINDS: dict[str, Kind] = {
         Kind(
             "calibration",
             (IMAGES, SECONDS, MEMORY),
-            (
-                Axis("psnr_db", "PSNR of the reconstruction (dB)", more_is_better=True),
-                SSIM,
-                NRMSE,
-                HELD_OUT,
-                RESIDUAL,
-            ),
+            (Axis("psnr_db", "PSNR of the reconstruction (dB)", more_is_better=True), *_OF_PICTURES),
         ),
     )
 }
@@ -233,45 +222,6 @@ class Curve:
 
     points: tuple[Point, ...]
     finished: bool
-
-
-class Named(Protocol):
-    """A setting, as far as those know it who do not run it."""
-
-    @property
-    def name(self) -> str:
-        """Different for each setting of a problem."""
-        ...
-
-
-class Problem(Protocol):
-    """Something that settings compete on. It is sent to other processes: it can be pickled."""
-
-    @property
-    def kind(self) -> KindName:
-        """Which scores it has."""
-        ...
-
-    @property
-    def pixels(self) -> tuple[int, ...]:
-        """Of what is computed, for titles."""
-        ...
-
-    def settings(self) -> Sequence[Named]:
-        """Return every applicable setting, the quick ones first."""
-        ...
-
-    def run(self, setting: Any, *, limit_s: float | None, aside: Aside) -> Curve:
-        """Run one of its settings, scoring ``aside``."""
-        ...
-
-    def warm_up(self, setting: Any) -> None:
-        """Run a setting once in small, so that what it needs is loaded and compiled."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Return a digest of all that scores depend on."""
-        ...
 
 
 def pareto(points: Iterable[Point], score: Axis | str, cost: Axis = SECONDS) -> list[Point]:

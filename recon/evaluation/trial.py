@@ -1,34 +1,33 @@
-"""One way to reconstruct, and which ways there are for a problem: charts and maps try them.
+"""What charts and maps have in common: subjects, the settings that compete on them, and how one is run.
 
-Solvers and priors are asked, not listed: what is registered takes part where its solver accepts the problem
-(:data:`recon.reconstruction.solvers.SOLVERS`, :data:`recon.priors.PRIORS`).
+Solvers, priors and camera models are asked, not listed: what is registered takes part where its solver
+accepts the problem (:data:`recon.reconstruction.solvers.SOLVERS`, :data:`recon.priors.PRIORS`,
+:data:`recon.camera.camera_model.CAMERAS`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from recon.base.namespace import Device, array_namespace
-from recon.camera.camera_model import MODELS, ModelName, members_of_depths
-from recon.camera.offered import CAMERAS
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.namespace import Device
+from recon.camera.camera_model import CAMERAS
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
+from recon.evaluation.scored import Aside, Curve, KindName, Point, nothing_aside
 from recon.priors import PRIORS
-from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import PRECISIONS, Precision
+from recon.reconstruction.options import Precision, ReconstructionOptions
 from recon.reconstruction.problem import Problem
+from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solvers import SOLVERS
-
-if TYPE_CHECKING:
-    from recon.evaluation.chart_reconstruction import ChartProblem
-
-VOLUME = "volume"
-"""How maps of volumes call the solver of volumes, the first of the registered ones."""
+from recon.solvers.base import StopReason
+from recon.verdict.cases import OF_VOLUMES
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +36,10 @@ class Setting:
 
     Attributes
     ----------
-    solver : str
-        A name of :data:`recon.reconstruction.solvers.SOLVERS`.
-    model, prior : str
+    solver, prior : str
+        Names of :data:`recon.reconstruction.solvers.SOLVERS` and :data:`recon.priors.PRIORS`.
+    model : str
+        Of the camera.
     binning : int
     background : bool
         Whether a smooth one is estimated as well.
@@ -49,7 +49,7 @@ class Setting:
     """
 
     solver: str
-    model: ModelName
+    model: str
     prior: str
     binning: int = 1
     background: bool = False
@@ -57,17 +57,20 @@ class Setting:
     device: Device = "cpu"
 
     @classmethod
-    def named(cls, method: str, model: ModelName = "convolution") -> Setting:
+    def named(cls, method: str, model: str = "convolution") -> Setting:
         """Return what a map's method is: a solver and a prior, "admm tv", or a solver alone.
+
+        A camera model between them counts instead of ``model``; " of volumes" changes nothing.
 
         Raises
         ------
         InputError
             When there is no such solver or prior.
         """
-        solver, _, prior = method.partition(" ")
-        offered = SOLVERS.named(next(iter(SOLVERS)) if solver == VOLUME else solver)
-        return cls(offered.name, model, PRIORS.named(prior or offered.prior).name)
+        solver, *rest = method.removesuffix(OF_VOLUMES).split(" ")
+        offered = SOLVERS.named(solver)
+        prior = PRIORS.named(rest[-1] if rest else offered.prior)
+        return cls(offered.name, " ".join(rest[:-1]) or model, prior.name)
 
     @property
     def name(self) -> str:
@@ -77,11 +80,7 @@ class Setting:
             parts.append("background")
         if self.binning > 1:
             parts.append(f"bin {self.binning}")
-        if self.precision != "float32":
-            parts.append(self.precision)
-        if self.device != "cpu":
-            parts.append(self.device)
-        return " ".join(parts)
+        return " ".join(parts + [p for p in (self.precision, self.device) if p not in ("float32", "cpu")])
 
     @property
     def family(self) -> str:
@@ -104,7 +103,7 @@ class Setting:
             more |= {"time_s": None, "tolerance": None}
         return ReconstructionOptions(
             solver=self.solver,
-            model=self.model,
+            model=self.model,  # type: ignore[arg-type]
             prior=self.prior,
             device=self.device,
             precision=self.precision,
@@ -114,9 +113,12 @@ class Setting:
         )
 
     def refusal(self, problem: Problem) -> str | None:
-        """Say why its solver does not take a problem (of any model and options); None: it does."""
-        asked = replace(problem, options=self.options(), model=self.model, smooth=self.background)
-        return SOLVERS.named(self.solver).accepts(asked)
+        """Say why its solver or camera does not take a problem (of any model and options); None: they do."""
+        asked = replace(problem, options=self.options(), model=self.model, smooth=self.background)  # type: ignore[arg-type]
+        reason = SOLVERS.named(self.solver).accepts(asked)
+        if reason is None and self.model in CAMERAS:
+            reason = CAMERAS[self.model].refuses(problem.depths)
+        return reason
 
     def cost(self, *, volume: bool) -> float:
         """Rough order of time, and of how much there is to learn."""
@@ -128,101 +130,120 @@ class Setting:
         return slow * more * SOLVERS.named(self.solver).cost / self.binning**2 * rank
 
 
-def settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
-    """Return every applicable setting, the quick ones first.
-
-    Which are not applicable, and why: :func:`left_out`.
-    """
-    scaled = _problem(problem)
-    found = [s for s in _all(problem) if s.refusal(scaled) is None]
-    return tuple(sorted(found, key=lambda s: s.cost(volume=problem.volume)))
-
-
-def left_out(problem: ChartProblem) -> tuple[str, ...]:
-    """Say which settings are not applicable to a problem, and why."""
-    scaled = _problem(problem)
-    refused: dict[tuple[str, str], list[str]] = {}
-    for solver, prior in product(SOLVERS, PRIORS):
-        if (reason := Setting(solver, "convolution", prior).refusal(scaled)) is not None:
-            refused.setdefault((solver, reason), []).append(prior)
-    found = [
-        solver + ("" if len(priors) == len(PRIORS) else " with " + ", ".join(priors)) + f": {reason}"
-        for (solver, reason), priors in refused.items()
-    ]
-    if not _varies(problem):
-        found.append("the local and low-rank models: the calibration has one PSF a depth")
-    if binnings_of(problem) == [1]:
-        small = problem.erasures is None
-        found.append(
-            f"binning: {'too few pixels would be left' if small else 'erased pixels cannot be averaged'}"
-        )
-    if not _has_gpu():
-        found.append("the gpu: there is none that CuPy can use")
-    return tuple(found)
-
-
-def require_applicable(problem: ChartProblem, setting: Setting) -> None:
-    """Raise InputError for a setting that does not apply: it would be run as another one, or not at all."""
-    if setting not in _all(problem) or setting.refusal(_problem(problem)) is not None:
-        raise InputError(f"The setting '{setting.name}' does not apply to this problem.")
-
-
-def binnings_of(problem: ChartProblem) -> list[int]:
-    """Return the binnings that leave enough pixels; erased ones cannot be averaged with others."""
-    largest = max(problem.measurement.shape)
-    return [1, *(b for b in (2, 4) if largest // b >= 24 and problem.erasures is None)]
-
-
 def own_methods(*, volume: bool) -> tuple[str, ...]:
-    """Return the methods, for pictures or volumes, that others' packages or this program have registered."""
-    priors = [name for name in PRIORS if not PRIORS.is_own(name)]
-    solvers = [name for name in SOLVERS if not SOLVERS.is_own(name)]
-    if not priors and not solvers:
+    """Return the methods, for pictures or volumes, that others' packages or this program have registered.
+
+    A prior or camera model comes with the first solver that takes it.
+    """
+    asked = list(_own_ways())
+    if not asked:
         return ()
     scene = make_scene("beads", size=16, depths=2) if volume else make_scene("sparse-picture", size=16)
-    problem = Problem.of(
-        scene.measurement, scene.calibration, ReconstructionOptions(model="convolution", judged=False)
-    )
-    found = [f"{name} {SOLVERS[name].prior}" for name in solvers]
-    for prior in priors:
-        ways = (f"{name} {prior}" for name in SOLVERS)
-        found += [way for way in ways if Setting.named(way).refusal(problem) is None][:1]
-    return tuple(method for method in found if Setting.named(method).refusal(problem) is None)
+    options = ReconstructionOptions(model="convolution", judged=False)
+    problem = Problem.of(scene.measurement, scene.calibration, options)
+    taken = ((way for way in ways if Setting.named(way).refusal(problem) is None) for ways in asked)
+    return tuple(way + (OF_VOLUMES if volume else "") for ways in taken for way in list(ways)[:1])
 
 
-def _all(problem: ChartProblem) -> Iterator[Setting]:
-    own = [m for m in MODELS if m != "auto" and (_varies(problem) or m == "convolution")]
-    models: list[ModelName] = [*own, *CAMERAS]  # type: ignore[list-item]
-    devices: list[Device] = ["cpu", "gpu"] if _has_gpu() else ["cpu"]
-    for solver, model, prior, binning, background, precision, device in product(
-        SOLVERS, models, PRIORS, binnings_of(problem), (False, True), PRECISIONS, devices
-    ):
-        yield Setting(solver, model, prior, binning, background, precision, device)
+def _own_ways() -> Iterator[list[str]]:
+    """Yield, of each that others have registered, the methods by which it can be tried."""
+    yield from ([f"{name} {SOLVERS[name].prior}"] for name in SOLVERS if not SOLVERS.is_own(name))
+    yield from ([f"{s} {name}" for s in SOLVERS] for name in PRIORS if not PRIORS.is_own(name))
+    yield from ([f"{s} {name} {SOLVERS[s].prior}" for s in SOLVERS] for name in CAMERAS)
 
 
-def _problem(problem: ChartProblem) -> Problem:
-    """Return the problem that solvers are asked about."""
-    calibration = problem.calibration
-    if not problem.volume:
-        first = members_of_depths(calibration.source_positions_um)[0][:1]
-        calibration = replace(
-            calibration,
-            psfs=calibration.psfs[first],
-            source_positions_um=calibration.source_positions_um[first],
-        )
-    measurement = Measurement(problem.measurement, erasures=problem.erasures, noise=problem.noise)
-    return Problem.of(measurement, calibration, ReconstructionOptions(model="convolution"))
+# Subjects -------------------------------------------------------------------------------------------
+class Named(Protocol):
+    """A setting, as far as those know it who do not run it."""
+
+    @property
+    def name(self) -> str:
+        """Different for each setting of a subject."""
+        ...
 
 
-def _varies(problem: ChartProblem) -> bool:
-    positions = problem.calibration.source_positions_um
-    return len(positions) > len(members_of_depths(positions))
+S = TypeVar("S", bound=Named)
 
 
-@cache
-def _has_gpu() -> bool:
-    try:
-        array_namespace("gpu")
-    except InputError:
-        return False
-    return True
+class Subject(ABC, Generic[S]):
+    """Something that settings compete on. It is sent to other processes: it can be pickled.
+
+    A subclass says what its settings are, runs one, and names what scores depend on.
+    """
+
+    kind: ClassVar[KindName]
+    """Which scores it has."""
+
+    @property
+    @abstractmethod
+    def pixels(self) -> tuple[int, ...]:
+        """Of what is computed, for titles."""
+
+    @abstractmethod
+    def settings(self) -> Sequence[S]:
+        """Return every applicable setting, the quick ones first."""
+
+    def run(
+        self, setting: S, *, limit_s: float | None = None, aside: Aside = nothing_aside, **how: Any
+    ) -> Curve:
+        """Run one of its settings, scoring ``aside``.
+
+        Parameters
+        ----------
+        setting
+            One of :meth:`settings`.
+        limit_s : float, optional
+            Wall seconds after which the run stops.
+        aside : Aside
+            In which points are scored.
+        **how
+            What else this subject's runs can be told: ``counts``, the iterations to score at, ascending.
+
+        Raises
+        ------
+        InputError
+            When the setting does not apply: it would be run as another one, or not at all.
+        """
+        if setting not in self.settings():
+            raise InputError(f"The setting '{setting.name}' does not apply to this {self.kind}.")
+        return self._curve(setting, limit_s, aside, **how)
+
+    @abstractmethod
+    def _curve(self, setting: S, limit_s: float | None, aside: Aside) -> Curve: ...
+
+    @abstractmethod
+    def warm_up(self, setting: S) -> None:
+        """Run a setting once in small, so that what it needs is loaded and compiled."""
+
+    @abstractmethod
+    def _identity(self) -> Iterable[str | npt.NDArray[Any] | None]:
+        """Yield all that scores depend on."""
+
+    def fingerprint(self) -> str:
+        """Return a digest of all that scores depend on."""
+        digest = hashlib.sha256()
+        for part in self._identity():
+            words = "none" if part is None else part
+            digest.update(words.encode() if isinstance(words, str) else np.ascontiguousarray(words).tobytes())
+        return digest.hexdigest()[:16]
+
+
+Turn = tuple[Callable[[float | None], Reconstruction], Callable[[Reconstruction], Point]]
+"""A reconstruction within so many seconds, and its score."""
+
+
+def in_turns(turns: Iterable[Turn], limit_s: float | None, aside: Aside) -> Curve:
+    """Return the points of several reconstructions; those for which the time is not enough are left out."""
+    points: list[Point] = []
+    spent = 0.0
+    for reconstructed, scored in turns:
+        left_s = None if limit_s is None else limit_s - spent
+        if left_s is not None and left_s <= 0:
+            return Curve(tuple(points), finished=False)
+        result = reconstructed(left_s)
+        if StopReason.TIME in result.stop_reasons:
+            return Curve(tuple(points), finished=False)
+        spent += result.seconds
+        with aside():
+            points.append(scored(result))
+    return Curve(tuple(points), finished=True)

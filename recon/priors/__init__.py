@@ -1,10 +1,8 @@
 """Priors: what is known about an object before the measurement, as value and proximal map."""
 
-from recon.priors.base import Prior, Sum
-from recon.priors.differences import Differences
+from recon.priors.base import L1, Box, NonNegativity, Prior, Separable, Sum, Zero
 from recon.priors.named import PRIORS, NamedPrior
-from recon.priors.simple import L1, Box, NonNegativity, Separable, Zero
-from recon.priors.total_variation import HaarTotalVariation, TotalVariation
+from recon.priors.total_variation import Differences, HaarTotalVariation, TotalVariation
 
 __all__ = [
     "L1",

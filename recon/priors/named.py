@@ -8,8 +8,7 @@ from typing import Literal
 
 from recon.base.registry import Registry
 from recon.errors import InputError
-from recon.priors.base import Prior
-from recon.priors.simple import L1, NonNegativity, Zero
+from recon.priors.base import L1, NonNegativity, Prior, Zero
 from recon.priors.total_variation import HaarTotalVariation, TotalVariation
 
 

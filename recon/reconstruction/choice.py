@@ -1,13 +1,16 @@
-"""What was chosen, in words and numbers."""
+"""What was chosen, in words and numbers, and what an error of the model costs."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from recon.camera.camera_model import ModelName
-from recon.reconstruction.overrides import Precision
+from recon.reconstruction.options import Precision
 
 Name = Literal[
     "model", "planes", "between", "field", "binning", "channels", "background", "iterations", "precision"
@@ -114,6 +117,15 @@ class Choice:
     decisions: tuple[Decision, ...]
     seconds: float
 
+    @property
+    def key(self) -> str:
+        """What tells the problem that was chosen from others: kept work of another is not gone on with."""
+        chosen = (
+            self.model, self.planes, self.between, self.binning, self.merged, self.background,
+            self.precision, self.psf_window, self.acceptance_px,
+        )  # fmt: skip
+        return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
+
     def lines(self) -> list[str]:
         """Return what was chosen and why, one or more lines a choice."""
         text = []
@@ -172,3 +184,19 @@ class Choice:
 
 def _known(value: float) -> float | None:
     return float(value) if value == value and abs(value) != float("inf") else None
+
+
+ERROR_SCALE = 0.5
+"""Relative PSF error that costs 3 dB."""
+LEFT_OUT_SCALE = 0.1
+"""Share of the light left out that costs 3 dB."""
+
+
+def loss_db(error: float) -> float:
+    """Return what a relative error of the PSFs costs, 0 or below."""
+    return -10 * float(np.log10(1 + (error / ERROR_SCALE) ** 2))
+
+
+def left_out_db(share: float) -> float:
+    """Return what leaving out a share of the light costs, 0 or below."""
+    return -10 * float(np.log10(1 + share / LEFT_OUT_SCALE)) if share > 0 else 0.0

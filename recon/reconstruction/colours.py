@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from recon.base.noise import estimate_deviation
 from recon.errors import InputError
-from recon.reconstruction.choice import Decision, Option
-from recon.reconstruction.estimates import ERROR_SCALE
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.choice import ERROR_SCALE, Decision, Option
+from recon.reconstruction.options import Overrides
 from recon.types import Calibration
 
 Array = npt.NDArray[Any]

@@ -1,17 +1,20 @@
-"""What was photographed, and what is known of the photograph: background, erased pixels, noise."""
+"""What was photographed, what is known of the photograph (background, erased pixels, noise), through what."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, require_finite, saturated_share
+from recon.base.checks import as_channels, require_finite, require_options, saturated_share, select_psf
 from recon.base.noise import NoiseModel, estimate_deviation
-from recon.base.options import require_options
+from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
+from recon.camera.field_registration import one_psf
 from recon.errors import InputError
+from recon.reconstruction.options import ReconstructionOptions
+from recon.types import Calibration
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
@@ -37,7 +40,7 @@ class Measurement:
         True where a pixel tells nothing: dead, saturated, not read (Kuo 2020, Eq. 3.10, has the complement).
     patterns : array, (n_patterns, height, width), optional
         Relative light on the pixels of the picture in each frame, not negative: a reconstruction of a plain
-        sheet lit by it (see :mod:`recon.camera.patterned`). One pattern of ones is the ordinary photograph.
+        sheet lit by it (see :mod:`recon.camera.factors`). One pattern of ones is the ordinary photograph.
     """
 
     image: npt.ArrayLike
@@ -83,8 +86,8 @@ class Measurement:
         require_options(noise=self.noise)
         counts = self.channels()
         background = self.background
-        data = counts if background is None else counts - like_data(background, counts, "background")
-        valid = np.ones(data.shape, bool) if self.erasures is None else ~_mask(self.erasures, data)
+        data = counts if background is None else counts - self.like(background, counts, "background")
+        valid = np.ones(data.shape, bool) if self.erasures is None else ~self._erased(data)
         if not valid.any(axis=(1, 2)).all():
             raise InputError("The erasures leave no pixel (True marks an erased one): is the mask inverted?")
         # As it came: once a background is off, saturated pixels no longer share a value.
@@ -94,6 +97,40 @@ class Measurement:
             if (said := _doubt(channel, values[kept]))
         )
         return Counts(data, valid, warnings)
+
+    def like(self, image: npt.ArrayLike, data: Floats, name: str) -> Floats:
+        """Broadcast a number, one image, or one for each channel (of patterned light: frame) to the data.
+
+        Raises
+        ------
+        InputError
+            When it is shaped otherwise.
+        """
+        if np.ndim(image) == 0:
+            return np.full_like(data, float(np.asarray(image)))
+        if self.patterns is not None and np.ndim(image) == 3:  # shaped as the frames: patterns first
+            image = np.moveaxis(np.asarray(image), 0, -1)
+        channels = as_channels(image, name)
+        if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
+            one = "channels" if self.patterns is None else "frames"
+            raise InputError(
+                f"The {name} has {_size(channels)} pixels and {len(channels)} {one}; the measurement has "
+                f"{_size(data)} and {len(data)}."
+            )
+        return np.broadcast_to(channels, data.shape)
+
+    def _erased(self, data: Floats) -> npt.NDArray[np.bool_]:
+        """Return the erasures as a mask of the data's shape."""
+        expected = (
+            "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
+        )
+        if self.erasures is None or np.ndim(self.erasures) == 0:
+            raise InputError(f"erasures is {self.erasures!r}: {expected}.")
+        mask = self.like(self.erasures, data, "erasures")
+        if not np.isin(mask, (0, 1)).all():
+            raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
+        erased: npt.NDArray[np.bool_] = mask != 0
+        return erased
 
     def deviations(self, counts: Counts) -> npt.NDArray[np.float64]:
         """Return every channel's noise deviation, counts; of frames under patterns their root mean square."""
@@ -142,17 +179,40 @@ def require_same_channels(psfs: Array, data: Array) -> None:
         )
 
 
-def like_data(image: npt.ArrayLike, data: Floats, name: str) -> Floats:
-    """Broadcast a number or an image to the data, channels first."""
-    if np.ndim(image) == 0:
-        return np.full_like(data, float(np.asarray(image)))
-    channels = as_channels(image, name)
-    if channels.shape[1:] != data.shape[1:] or len(channels) not in (1, len(data)):
-        raise InputError(
-            f"The {name} has {_size(channels)} pixels and {len(channels)} channels; the measurement has "
-            f"{_size(data)} and {len(data)}."
+def depths_of(
+    calibration: Calibration, options: ReconstructionOptions
+) -> tuple[Calibration, Depths, list[str]]:
+    """Return the depths that take part, sorted and registered, and warnings."""
+    if len(calibration.psfs) == 0:
+        raise InputError("The calibration holds no PSF: at least one is needed.")
+    if options.z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
+        return calibration, sort_by_depth(calibration), []
+    if options.model == "convolution":
+        psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
+        same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
+        own = slice(same, same + 1)
+        calibration = replace(
+            calibration,
+            psfs=calibration.psfs[own],
+            source_positions_um=calibration.source_positions_um[own],
         )
-    return np.broadcast_to(channels, data.shape)
+        return calibration, sort_by_depth(calibration), []
+    depth = one_depth(calibration, options.z_um)
+    try:
+        return depth, sort_by_depth(depth), []
+    except InputError as error:
+        if options.model != "auto":
+            raise
+        depth = central(depth)
+        return depth, sort_by_depth(depth), [f"One PSF for the whole field: {error}"]
+
+
+def central(calibration: Calibration) -> Calibration:
+    """Return one PSF for the whole field of one depth: the one on the axis."""
+    positions = calibration.source_positions_um
+    nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
+    own = slice(nearest, nearest + 1)
+    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])
 
 
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:
@@ -184,18 +244,11 @@ def _doubt(channel: int, values: Array) -> str:
     return ""
 
 
-def _mask(erasures: npt.ArrayLike, data: Floats) -> npt.NDArray[np.bool_]:
-    """Return erasures as a mask of the data's shape."""
-    given = np.asarray(erasures)
-    expected = "a mask of the measurement's pixels is expected, True (or 1) where one is erased, else False"
-    if given.ndim == 0:
-        raise InputError(f"erasures is {erasures!r}: {expected}.")
-    mask = like_data(given, data, "erasures")
-    if not np.isin(mask, (0, 1)).all():
-        raise InputError(f"erasures holds values from {mask.min():g} to {mask.max():g}: {expected}.")
-    erased: npt.NDArray[np.bool_] = mask != 0
-    return erased
-
-
 def _size(channels: Array) -> str:
     return f"{channels.shape[1]} x {channels.shape[2]}"
+
+
+def _asked(calibration: Calibration, z_um: float | None) -> float | None:
+    """Return the depth to look for: of PSFs of one depth, theirs."""
+    z = calibration.source_positions_um[:, 2]
+    return float(z[0]) if z_um is None and np.isfinite(z[0]) else z_um

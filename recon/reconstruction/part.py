@@ -9,20 +9,17 @@ import numpy as np
 
 from recon.base import fft
 from recon.base.namespace import array_namespace
-from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array, LinearOperator
-from recon.camera.camera_model import LOW_RANK_ERROR
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.camera.local_convolution import FieldOfPsfs, field_of, local_convolution
-from recon.camera.low_rank import low_rank
-from recon.camera.offered import CAMERAS
-from recon.camera.patterned import PatternedCamera
+from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
+from recon.camera.varying_psfs import FieldOfPsfs, field_of, local_convolution, low_rank
 from recon.errors import InputError
 from recon.priors import Prior, TotalVariation
-from recon.reconstruction.problem import Problem, window_of
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.result import window_of
 from recon.reconstruction.weights import default_tau, is_weighted, kind_of, penalty_of
 from recon.solvers import memory
 
@@ -259,20 +256,30 @@ class Part:
 
     @property
     def prior(self) -> Prior:
-        """The prior with its weight."""
-        return penalty_of(self.problem.prior, self.weight)
+        """The prior with its weight; of y and x differences where it is a named total variation."""
+        if self.problem.options.axis_weights is None:
+            return penalty_of(self.problem.prior, self.weight)
+        return self.prior_on(self.mean_axis_weights[1:])
 
-    def prior_on(self, axis_weights: Array, wrap: tuple[bool, ...]) -> Prior:
-        """Return the prior of an object (1, n_z, height, width): a named total variation is of all its axes.
+    @property
+    def mean_axis_weights(self) -> Array:
+        """Weights of the z, y and x differences, the mean of the planes, (3,)."""
+        problem = self.problem
+        mean: Array = np.broadcast_to(problem.axis_weights, (problem.n_planes, 3)).mean(axis=0)
+        return mean
+
+    def prior_on(self, axis_weights: Array, wrap: tuple[bool, ...] | None = None) -> Prior:
+        """Return the prior with a named total variation of these axes.
 
         Parameters
         ----------
-        axis_weights : ndarray, (3,) or (n_z, 3)
-            Weights of the z, y and x differences.
-        wrap : tuple of bool
-            Which of the three axes wrap around.
+        axis_weights : ndarray, (2,), (3,) or (n_z, 3)
+            Weights of the (z,) y and x differences: of an object ([n_z,] height, width).
+        wrap : tuple of bool, optional
+            Which of the axes wrap around.
         """
-        terms = list(self.prior.terms())
+        prior = penalty_of(self.problem.prior, self.weight)
+        terms = list(prior.terms())
         if not isinstance(self.problem.prior, Prior):
             for i, term in enumerate(terms):
                 if isinstance(term, TotalVariation) and term.axis_weights.shape == (2,):

@@ -10,32 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, check_psf, select_psf
-from recon.base.options import require_options
-from recon.camera.camera_model import (
-    Depths,
-    Extent,
-    ModelName,
-    choose_model,
-    members_of_depths,
-    one_depth,
-    sort_by_depth,
-)
-from recon.camera.field_registration import one_psf
-from recon.camera.light import energies, levelled
-from recon.camera.local_convolution import field_of
+from recon.base.checks import as_channels, check_psf, require_options
+from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.errors import InputError
-from recon.priors import Prior
+from recon.priors import PRIORS, Prior, TotalVariation
 from recon.reconstruction.measurement import (
     Floats,
     Measurement,
-    like_data,
+    depths_of,
     require_same_channels,
     require_same_pixels,
 )
-from recon.reconstruction.options import Field, ReconstructionOptions
-from recon.reconstruction.overrides import Precision
-from recon.reconstruction.result import Grid, Reconstruction
+from recon.reconstruction.options import Precision, ReconstructionOptions
+from recon.reconstruction.result import Grid, Reconstruction, grid_of, window_of
 from recon.reconstruction.solvers import SOLVERS, OfferedSolver, solver_for
 from recon.reconstruction.weights import CameraClass, name_of, require_prior
 from recon.types import Calibration
@@ -146,7 +133,7 @@ class Problem:
             options = replace(options, model="convolution")
         if measurement.patterns is not None and options.model == "auto":
             options = replace(options, model="convolution")
-        calibration, depths, doubts = _depths_of(calibration, options)
+        calibration, depths, doubts = depths_of(calibration, options)
         lone = measurement.patterns is not None
         require_same_channels(calibration.psfs, counts.data[:1] if lone else counts.data)
         require_same_pixels(calibration.psfs[0], counts.data)
@@ -160,7 +147,7 @@ class Problem:
             model, reason = choose_model(depths, model)
         asked = True if options.positive_background else options.estimate_background
         deviation = measurement.deviations(counts).astype(np.float32)
-        return cls(
+        problem = cls(
             measurement,
             calibration,
             options,
@@ -175,6 +162,9 @@ class Problem:
             extent,
             tuple(dict.fromkeys((*doubts, *depths.warnings, *counts.warnings))),
         )
+        if options.axis_weights is not None:
+            problem._require_axis_weights(options.axis_weights)
+        return problem
 
     def with_data(self, image: npt.ArrayLike) -> Problem:
         """Return the same problem with another photograph of the same camera: noise and scales stay.
@@ -198,7 +188,7 @@ class Problem:
                 f"The frame is {np.shape(image)}, those before {np.shape(self.measurement.image)}."
             )
         if measurement.background is not None:
-            counts = counts - like_data(measurement.background, counts, "background")
+            counts = counts - measurement.like(measurement.background, counts, "background")
         data = counts / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
@@ -338,6 +328,27 @@ class Problem:
         given = self.options.axis_weights
         return self.grid.axis_weights() if given is None else np.asarray(given, float)
 
+    def _require_axis_weights(self, given: npt.ArrayLike) -> None:
+        """Refuse weights of differences that the prior does not take, or that are none."""
+        if isinstance(self.prior, Prior):
+            raise InputError(
+                "axis_weights are for a prior by name; one given as an object has its own: leave them out."
+            )
+        if not any(isinstance(term, TotalVariation) for term in PRIORS.named(self.prior)(1.0).terms()):
+            raise InputError(
+                f"axis_weights weigh the differences of total variation; the prior {self.prior} has "
+                "none that can be weighed: leave them out, or take tv or tv-isotropic."
+            )
+        weights = np.asarray(given)
+        shapes = ((3,), (self.n_planes, 3))
+        if weights.dtype.kind not in "uif" or weights.shape not in shapes:
+            raise InputError(
+                f"axis_weights are numbers for the z, y and x differences, (3,) or ({self.n_planes}, 3), a "
+                f"row a depth; found {given!r}."
+            )
+        if not (np.isfinite(weights).all() and (weights >= 0).all()):
+            raise InputError(f"axis_weights must be 0 or more, and finite; found {given!r}.")
+
     def measured(self, solution: Array, channels: slice) -> Floats:
         """Return what a solution (some channels, n_z, ...) is in the window, in measurement units.
 
@@ -398,42 +409,6 @@ class Problem:
         }
 
 
-def window_of(
-    field: Field, sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
-) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Return the part of the operator's grid that a field takes, and where the axis is in it."""
-    (full_height, full_width), (row, column) = field_of(sensor_shape, psf_shape)
-    if field == "full":
-        return (slice(0, full_height), slice(0, full_width)), (row, column)
-    height, width = sensor_shape
-    top, left = max(row - height // 2, 0), max(column - width // 2, 0)
-    window = slice(top, min(top + height, full_height)), slice(left, min(left + width, full_width))
-    return window, (row - top, column - left)
-
-
-def grid_of(
-    calibration: Calibration,
-    z_um: npt.NDArray[np.float64],
-    window: tuple[slice, slice],
-    centre: tuple[int, int],
-) -> Grid:
-    """Return where the voxels of depths ``z_um`` lie, micrometres."""
-    pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
-    pitches = np.full(len(z_um), np.nan)
-    if pitch is not None and distance:
-        pitches = pitch * z_um / (1000 * distance)
-    shape = (len(z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return Grid(shape, centre, z_um, pitches, pitch)
-
-
-def central(calibration: Calibration) -> Calibration:
-    """Return one PSF for the whole field of one depth: the one on the axis."""
-    positions = calibration.source_positions_um
-    nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
-    own = slice(nearest, nearest + 1)
-    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])
-
-
 def _require(options: ReconstructionOptions) -> None:
     """Check what can be checked before there is a measurement."""
     if options.prior is not None:
@@ -451,37 +426,3 @@ def _require(options: ReconstructionOptions) -> None:
         )
     if options.positive_background and options.estimate_background is False:
         raise InputError("A positive background cannot be had without estimating one: leave one of them out.")
-
-
-def _depths_of(
-    calibration: Calibration, options: ReconstructionOptions
-) -> tuple[Calibration, Depths, list[str]]:
-    """Return the depths that take part, sorted and registered, and warnings."""
-    if len(calibration.psfs) == 0:
-        raise InputError("The calibration holds no PSF: at least one is needed.")
-    if options.z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
-        return calibration, sort_by_depth(calibration), []
-    if options.model == "convolution":
-        psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
-        same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
-        own = slice(same, same + 1)
-        calibration = replace(
-            calibration,
-            psfs=calibration.psfs[own],
-            source_positions_um=calibration.source_positions_um[own],
-        )
-        return calibration, sort_by_depth(calibration), []
-    depth = one_depth(calibration, options.z_um)
-    try:
-        return depth, sort_by_depth(depth), []
-    except InputError as error:
-        if options.model != "auto":
-            raise
-        depth = central(depth)
-        return depth, sort_by_depth(depth), [f"One PSF for the whole field: {error}"]
-
-
-def _asked(calibration: Calibration, z_um: float | None) -> float | None:
-    """Return the depth to look for: of PSFs of one depth, theirs."""
-    z = calibration.source_positions_um[:, 2]
-    return float(z[0]) if z_um is None and np.isfinite(z[0]) else z_um

@@ -1,4 +1,4 @@
-"""The one door from a measurement and a calibration to a picture or volume."""
+"""The one door, from a measurement and a calibration to a picture or volume, and what it is worth."""
 
 from __future__ import annotations
 
@@ -7,17 +7,24 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from recon.base.declare import with_overrides
+from recon.camera.camera_model import CAMERAS
+from recon.priors import PRIORS
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
-from recon.reconstruction.solve import Progress, judged, solve
+from recon.reconstruction.solve import Progress, solve
+from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.base import Keeper
 from recon.types import Calibration
+from recon.verdict.evidence import evidence_of, not_judged, observations, unsettled_by
+from recon.verdict.judge import Verdict, method_name, verdict_on
 
 FACTS = tuple(f.name for f in fields(Measurement) if f.name != "image")
 """What is known of a measurement, by the names that :func:`reconstruct` takes them by."""
@@ -82,3 +89,70 @@ def given(
     known = {name: value for name, value in overrides.items() if name in FACTS}
     asked = {name: value for name, value in overrides.items() if name not in FACTS}
     return known, with_overrides(options or ReconstructionOptions(), asked)
+
+
+def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
+    """Return the result with a verdict on whether to trust it, at the cost of about two iterations.
+
+    Parameters
+    ----------
+    result : Reconstruction
+    problem : Problem
+        That was solved.
+    started : bool
+        Whether it was started from another result.
+    """
+    if result.basis is not None:
+        problem, small = result.basis
+        verdict, said = _verdict(small, problem, started=started)
+    else:
+        verdict, said = _verdict(result, problem, started=started)
+    return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
+
+
+def _verdict(
+    result: Reconstruction, problem: Problem, *, started: bool
+) -> tuple[Verdict | None, tuple[str, ...]]:
+    foreign = [
+        f"the {what} {name}"
+        for what, name, own in (
+            ("solver", result.solver, SOLVERS.is_own(result.solver)),
+            ("prior", result.prior, PRIORS.is_own(result.prior)),
+        )
+        if not own
+    ]
+    if problem.n_planes > 1 and result.solver != "admm" and not foreign:
+        foreign.append(f"volumes by the solver {result.solver}")
+    if problem.model in CAMERAS:
+        foreign.append(f"the camera model {problem.model}")
+    if problem.patterned:
+        foreign.append("patterned light")
+    if foreign:
+        return None, (f"Not judged: there are no known cases of {' and '.join(foreign)}.",)
+    try:
+        picture = problem.n_planes == 1
+        # One plane is a picture: it fails as pictures do, by a wrong depth for one.
+        evidence = evidence_of(
+            observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
+            result.volume,
+            problem.depths.central,
+            _residuals(result, problem),
+            max(
+                unsettled_by(h, r, problem.stop_tolerance, started=started)
+                for h, r in zip(result.histories, result.stop_reasons, strict=True)
+            ),
+            points=not picture,
+        )
+        return verdict_on(evidence, method_name(result.solver, result.prior, volume=not picture)), ()
+    except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
+        return None, (not_judged(error),)
+
+
+def _residuals(result: Reconstruction, problem: Problem) -> list[float]:
+    if result.history:
+        return [history[-1].data_residual for history in result.histories]
+    # A solution in one step fits whatever there is, with negative light where the model is wrong.
+    assert result.state is not None
+    part = Part(problem, parts_of(problem)[0])
+    possible = np.maximum(result.state / problem.image_scale, 0).astype(part.dtype)
+    return [float(np.linalg.norm(part.operator.forward(possible) - part.data))]

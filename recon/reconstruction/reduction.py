@@ -14,12 +14,11 @@ from recon.base.noise import averaged_noise
 from recon.camera.camera_model import Extent, members_of_depths
 from recon.camera.field_registration import NOT_ON_AXIS
 from recon.errors import InputError
-from recon.reconstruction.between import with_planes_between
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import Colours, merged_input
-from recon.reconstruction.measurement import Measurement
-from recon.reconstruction.planes import put_back
-from recon.reconstruction.problem import Problem, central
+from recon.reconstruction.measurement import Measurement, central
+from recon.reconstruction.planes import put_back, with_planes_between
+from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
 from recon.types import Calibration
 

@@ -1,4 +1,4 @@
-"""What a reconstruction returns."""
+"""What a reconstruction returns, and where its voxels lie."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord, StopReason
-from recon.verdict.verdict import Verdict
+from recon.camera.varying_psfs import field_of
+from recon.reconstruction.options import Field
+from recon.solvers.base import IterationRecord, StopReason
+from recon.solvers.douglas_rachford import EmptyPlanes
+from recon.types import Calibration
+from recon.verdict.judge import Verdict
 
 if TYPE_CHECKING:
     from recon.reconstruction.choice import Choice
@@ -67,6 +70,34 @@ class Grid:
         return weights
 
 
+def window_of(
+    field: Field, sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Return the part of the operator's grid that a field takes, and where the axis is in it."""
+    (full_height, full_width), (row, column) = field_of(sensor_shape, psf_shape)
+    if field == "full":
+        return (slice(0, full_height), slice(0, full_width)), (row, column)
+    height, width = sensor_shape
+    top, left = max(row - height // 2, 0), max(column - width // 2, 0)
+    window = slice(top, min(top + height, full_height)), slice(left, min(left + width, full_width))
+    return window, (row - top, column - left)
+
+
+def grid_of(
+    calibration: Calibration,
+    z_um: npt.NDArray[np.float64],
+    window: tuple[slice, slice],
+    centre: tuple[int, int],
+) -> Grid:
+    """Return where the voxels of depths ``z_um`` lie, micrometres."""
+    pitch, distance = calibration.geometry.pixel_pitch_um, calibration.geometry.diffuser_distance_mm
+    pitches = np.full(len(z_um), np.nan)
+    if pitch is not None and distance:
+        pitches = pitch * z_um / (1000 * distance)
+    shape = (len(z_um), window[0].stop - window[0].start, window[1].stop - window[1].start)
+    return Grid(shape, centre, z_um, pitches, pitch)
+
+
 @dataclass(frozen=True, slots=True)
 class Reconstruction:
     """A reconstructed picture or volume with all that is needed to judge it: a picture is one plane.
@@ -111,7 +142,7 @@ class Reconstruction:
         Software and settings, JSON-compatible.
     basis : (Problem, Reconstruction) or None
         The smaller problem that was solved where the program chose, and its own result, from which
-        :func:`~recon.reconstruction.solve.judged` takes the verdict.
+        :func:`~recon.reconstruction.reconstruct.judged` takes the verdict.
     """
 
     volume: npt.NDArray[np.float32]

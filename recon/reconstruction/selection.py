@@ -12,15 +12,11 @@ import numpy.typing as npt
 from recon.base.blocks import block_mean
 from recon.camera.camera_model import ModelName
 from recon.errors import InputError
-from recon.reconstruction.between import between_of
 from recon.reconstruction.choice import Choice, Decision
 from recon.reconstruction.colours import channels_of, merged
-from recon.reconstruction.extent import binning_of, field_of
 from recon.reconstruction.measurement import Measurement, require_same_channels
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import Overrides
-from recon.reconstruction.planes import planes_of
-from recon.reconstruction.precision import precision_of
+from recon.reconstruction.options import Overrides, ReconstructionOptions
+from recon.reconstruction.planes import between_of, planes_of
 from recon.reconstruction.probe import (
     COARSE_PX,
     VARYING_ITERATIONS,
@@ -30,16 +26,21 @@ from recon.reconstruction.probe import (
 )
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reduction import reduced, reduced_calibration
-from recon.reconstruction.selected_camera import candidates, model_decision, model_of
-from recon.reconstruction.solvers import SOLVERS, require_solver
-from recon.reconstruction.solving import (
+from recon.reconstruction.rules import (
     USUAL_ITERATIONS,
     SmoothLight,
     background_of,
+    binning_of,
+    candidates,
+    field_of,
     is_stray,
     iterations_of,
+    model_decision,
+    model_of,
+    precision_of,
     steps_of_tolerance,
 )
+from recon.reconstruction.solvers import SOLVERS, require_solver
 from recon.reconstruction.weights import kind_of
 from recon.types import Calibration
 

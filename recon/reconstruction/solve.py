@@ -1,4 +1,4 @@
-"""From a problem to its reconstruction, and to what it is worth."""
+"""From a problem to its reconstruction."""
 
 from __future__ import annotations
 
@@ -10,27 +10,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.offered import CAMERAS
 from recon.errors import InputError
-from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
-from recon.reconstruction.positive_background import in_turns, is_negative, may_go_on
+from recon.reconstruction.planes import limit_of, signs_in_words, signs_of_light
 from recon.reconstruction.problem import Problem
-from recon.reconstruction.reduction import bring_back, places_of, put_planes_back, reduced_start
+from recon.reconstruction.reduction import bring_back, put_planes_back, reduced_start
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.selection import choose
-from recon.reconstruction.solvers import SOLVERS, OfferedSolver
-from recon.reconstruction.unmodelled_planes import limit_of, signs_in_words, signs_of_light
+from recon.reconstruction.solvers import OfferedSolver
 from recon.reconstruction.weights import is_weighted
-from recon.solvers import Outcome, StoppingRules, StopReason
-from recon.solvers.base import Callback, Keeper
-from recon.solvers.douglas_rachford import DouglasRachford
-from recon.solvers.empty_planes import EmptyPlanes
-from recon.solvers.stopping import IterationRecord
-from recon.verdict.collect import evidence_of, not_judged, observations, unsettled_by
-from recon.verdict.judge import method_name, verdict_on
-from recon.verdict.verdict import Verdict
+from recon.solvers import Outcome, Solver, StoppingRules, StopReason
+from recon.solvers.base import Callback, IterationRecord, Keeper
+from recon.solvers.douglas_rachford import DouglasRachford, EmptyPlanes
 
 Array = npt.NDArray[Any]
 Progress = Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], object]
@@ -40,6 +32,12 @@ width[, n_channels]), of one channel where channels are solved one after the oth
 
 ITERATIONS = 200
 """At most so many, where neither iterations nor a time are asked for."""
+TURNS = 3
+"""At most so many turns."""
+SLIGHT = 1.0
+"""What a background may miss zero by, in noise deviations of a pixel: less is no reason for turns."""
+SETTLED = 0.1
+"""Change of the background in a turn that counts as the last, in noise deviations."""
 
 
 def solve(
@@ -93,7 +91,7 @@ def solve(
             None if on_progress is None else _shown(problem, on_progress),
             cancel,
             keeper,
-            f"planes-{'_'.join(map(str, places_of(problem.reduction.choice)))}-" if rounds else "",
+            f"auto-{problem.reduction.choice.key}",
         )
         spent += result.seconds
         lost = StopReason.NOT_FINITE in result.stop_reasons
@@ -159,8 +157,9 @@ def _solve(
     for one in channels:
         part = Part(problem, one)
         try:
-            name = f"{prefix}channel-{one.start}" if len(channels) > 1 or not problem.together else prefix
-            found.append(_run(part, offered, rules, warm, on_progress, cancel, (keeper, name)))
+            channel = f"channel-{one.start}" if len(channels) > 1 or not problem.together else ""
+            kept = keeper, "-".join(filter(None, (prefix, channel)))
+            found.append(_run(part, offered, rules, warm, on_progress, cancel, kept))
         finally:
             part.close()
     return _together(problem, offered, found)
@@ -340,68 +339,66 @@ def _stacked(images: list[Array], flat: bool) -> npt.NDArray[np.float32] | None:
     return channels[0] if flat else np.ascontiguousarray(np.moveaxis(channels, 0, -1))
 
 
-def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:
-    """Return the result with a verdict on whether to trust it, at the cost of about two iterations.
+def is_negative(background: Array) -> bool:
+    """Whether a background (in noise deviations) is negative by more than can be overlooked."""
+    return bool(background.min() < -SLIGHT)
+
+
+def may_go_on(outcome: Outcome) -> bool:
+    """Whether a run ended by itself: turns follow neither a cancelled nor a timed out run."""
+    return outcome.stop_reason in (StopReason.CONVERGED, StopReason.ITERATIONS)
+
+
+def in_turns(
+    background: Array,
+    first: Outcome,
+    solver_for: Callable[[Array], Solver],
+    nearest: Callable[[Array], Array],
+    rules: StoppingRules,
+    callback: Callback | None,
+    cancel: threading.Event | None,
+) -> tuple[Outcome, Array, Solver]:
+    """Improve volume and background in turn where the free background is negative (Kuo 2020, Eq. 6.2).
+
+    Projecting the background's frequencies out of the data term solves Eq. 6.2 without ``g >= 0``; a
+    background found that way that is not negative solves Eq. 6.2 itself. Else in turn: the non-negative
+    background nearest to what the volume leaves of the data, then the volume for that background. The
+    objective falls with every turn, and both halves are feasible after each. A turn starts from zero, so that
+    it needs no more memory than the first run did.
 
     Parameters
     ----------
-    result : Reconstruction
-    problem : Problem
-        That was solved.
-    started : bool
-        Whether it was started from another result.
+    background : ndarray, (height, width)
+        The non-negative background to begin with, in noise deviations.
+    first : Outcome
+        The run with a free background; only its history counts, so that its volume need not be kept.
+    solver_for : callable
+        Returns a solver of what a background leaves of the data.
+    nearest : callable
+        Returns the non-negative background for a volume.
+    rules : StoppingRules
+        For every turn; of ``time_s`` it has what is left.
+
+    Returns
+    -------
+    Outcome
+        The last volume, with the history of everything.
+    ndarray, (height, width)
+        The background, in noise deviations.
+    Solver
+        The last turn's.
     """
-    if result.basis is not None:
-        problem, small = result.basis
-        verdict, said = _verdict(small, problem, started=started)
-    else:
-        verdict, said = _verdict(result, problem, started=started)
-    return replace(result, verdict=verdict, warnings=(*result.warnings, *said), basis=None)
-
-
-def _verdict(
-    result: Reconstruction, problem: Problem, *, started: bool
-) -> tuple[Verdict | None, tuple[str, ...]]:
-    foreign = [
-        f"the {what} {name}"
-        for what, name, own in (
-            ("solver", result.solver, SOLVERS.is_own(result.solver)),
-            ("prior", result.prior, PRIORS.is_own(result.prior)),
-        )
-        if not own
-    ]
-    if problem.n_planes > 1 and result.solver != "admm" and not foreign:
-        foreign.append(f"volumes by the solver {result.solver}")
-    if problem.model in CAMERAS:
-        foreign.append(f"the camera model {problem.model}")
-    if problem.patterned:
-        foreign.append("patterned light")
-    if foreign:
-        return None, (f"Not judged: there are no known cases of {' and '.join(foreign)}.",)
-    try:
-        picture = problem.n_planes == 1
-        # One plane is a picture: it fails as pictures do, by a wrong depth for one.
-        evidence = evidence_of(
-            observations(problem.measurement.image, problem.data, problem.valid, problem.noise),
-            result.volume,
-            problem.depths.central,
-            _residuals(result, problem),
-            max(
-                unsettled_by(h, r, problem.stop_tolerance, started=started)
-                for h, r in zip(result.histories, result.stop_reasons, strict=True)
-            ),
-            points=not picture,
-        )
-        return verdict_on(evidence, method_name(result.solver if picture else "volume", result.prior)), ()
-    except Exception as error:  # noqa: BLE001 - the result may be hours of work: it is worth more than this
-        return None, (not_judged(error),)
-
-
-def _residuals(result: Reconstruction, problem: Problem) -> list[float]:
-    if result.history:
-        return [history[-1].data_residual for history in result.histories]
-    # A solution in one step fits whatever there is, with negative light where the model is wrong.
-    assert result.state is not None
-    part = Part(problem, parts_of(problem)[0])
-    possible = np.maximum(result.state / problem.image_scale, 0).astype(part.dtype)
-    return [float(np.linalg.norm(part.operator.forward(possible) - part.data))]
+    history, seconds = list(first.history), first.seconds
+    for turn in range(TURNS):
+        left = None if rules.time_s is None else max(rules.time_s - seconds, 1e-3)
+        solver = solver_for(background)
+        outcome = solver.run(replace(rules, time_s=left), callback=callback, cancel=cancel)
+        for record in outcome.history:
+            history.append(replace(record, iteration=len(history) + 1, seconds=seconds + record.seconds))
+        seconds += outcome.seconds
+        before, background = background, nearest(outcome.solution)
+        if float(np.abs(background - before).max()) <= SETTLED or not may_go_on(outcome):
+            break
+        if turn + 1 < TURNS:
+            del solver, outcome
+    return Outcome(outcome.solution, tuple(history), outcome.stop_reason, seconds), background, solver

@@ -18,8 +18,7 @@ from recon.base.registry import Registry
 from recon.camera.base import Array, LinearOperator
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior
-from recon.solvers.base import Callback, Keeper, Outcome
-from recon.solvers.stopping import StoppingRules
+from recon.solvers.base import Callback, Keeper, Outcome, StoppingRules
 
 if TYPE_CHECKING:
     from recon.reconstruction.part import Part
@@ -161,10 +160,9 @@ def _varying_admm(part: Part, camera: LinearOperator, start: Array | None) -> Ru
     from recon.solvers.operator_admm import OperatorAdmm
     from recon.solvers.splitting import SensorData
 
-    problem = part.problem
-    mean = np.broadcast_to(problem.axis_weights, (problem.n_planes, 3)).mean(axis=0)
     data = SensorData(part.data, part.valid[0], part.removal)
-    return OperatorAdmm(camera, part.central, data, part.prior_on(mean, (False,) * 3), initial=start)
+    prior = part.prior_on(part.mean_axis_weights, (False,) * 3)
+    return OperatorAdmm(camera, part.central, data, prior, initial=start)
 
 
 def _sensor_admm(part: Part, start: Array | None) -> Runs:
@@ -209,7 +207,7 @@ class OneStep:
 
 def _wiener(part: Part, _: Array | None) -> Runs:
     """Wiener's penalty takes the place of a prior; bounds are kept by clipping."""
-    from recon.priors.simple import Separable
+    from recon.priors.base import Separable
     from recon.solvers.wiener import wiener
 
     def solve() -> Outcome:

@@ -23,13 +23,12 @@ from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
+from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import Solver
+from recon.solvers.base import IterationRecord, Solver
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
 from recon.solvers.prior_splits import PriorSplits, ratio
-from recon.solvers.stopping import IterationRecord
-from recon.solvers.structure import as_cropped_convolution
 
 SETTLING = (4, 8, 16, 32)
 """Iterations before which the penalty of the differences is set from the object so far."""
@@ -227,9 +226,9 @@ class DataSplit:
         start: Array,
         relax: float,
     ) -> None:
-        from recon.solvers import _data_kernels
+        from recon.solvers import _picture_kernels
 
-        self._kernels: Any = _data_kernels
+        self._kernels: Any = _picture_kernels
         self._camera, self._data, self._weight = camera, data, weight
         self._penalty = data.dtype.type(penalty)
         self._relax = data.dtype.type(relax)
@@ -238,8 +237,8 @@ class DataSplit:
         self.T = fft.rfft(start)
         fft.multiply(self.T, camera.spectrum)
         self._laplace = rows, columns[: self.T.shape[2]].copy()
-        self._grid_sums = np.zeros((height, _data_kernels.N_GRID_SUMS))
-        self._sensor_sums = np.zeros((camera.sensor_shape[0], _data_kernels.N_SENSOR_SUMS))
+        self._grid_sums = np.zeros((height, _picture_kernels.N_GRID_SUMS))
+        self._sensor_sums = np.zeros((camera.sensor_shape[0], _picture_kernels.N_SENSOR_SUMS))
         self._band = np.empty((camera.sensor_shape[0], width), data.dtype)
         self._Y, self._P = np.empty_like(self.T[0]), np.empty_like(self.T[0])
         self.Q = np.empty_like(self.T)

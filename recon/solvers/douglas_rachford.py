@@ -8,7 +8,7 @@ sparse volumes of Kuo 2020, Eqs. 4.2 and 6.2, ``p`` is ``tau ||x||_1`` for ``x >
     z <- z + alpha (u - x)
 
 ``e`` solves ``(I + gamma A A^H) e = b - A z`` on the sensor plane
-(:class:`~recon.solvers.sensor_system.SensorSystem`). Over-relaxation alpha = 1.7.
+(:class:`~recon.solvers.splitting.SensorSystem`). Over-relaxation alpha = 1.7.
 
 :class:`SparseDouglasRachford` does so for l1 on the processor without ever storing x and u: a plane is
 back-projected, updated, transformed and summed while it is in the core's cache. Planes in which u has been
@@ -20,9 +20,11 @@ that miss it come back, with ``z = -gamma A_z^H e``, the value of z that an empt
 from __future__ import annotations
 
 from copy import copy as shallow_copy
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from recon.base import fft
 from recon.base.namespace import require_memory, to_host
@@ -31,13 +33,77 @@ from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
 from recon.camera.planes import PlaneGroups
 from recon.errors import StructureError
-from recon.priors.base import Prior
-from recon.priors.simple import Separable
-from recon.solvers.empty_planes import EXCESS, REVIEW, EmptyPlanes, PlaneWatch
+from recon.priors.base import Prior, Separable
+from recon.solvers.base import IterationRecord
 from recon.solvers.prior_splits import require_exact
-from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
+
+PATIENCE = 10
+"""Iterations that a plane is empty before it is left out; twice as many each time it had to come back."""
+REVIEW = 10
+"""Iterations between looks at which planes may be left out: each changes the problem that is being solved."""
+EXCESS = 0.01
+"""How far above tau the residual's correlation with a plane may be for it to count as rightly empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class EmptyPlanes:
+    """Planes that took no part at the end, and whether they could be spared.
+
+    The optimality condition of l1 on a plane that is zero is ``A_z^H e <= tau`` at every voxel, with ``e``
+    the data's residual (both ways where voxels may be negative).
+
+    Attributes
+    ----------
+    planes : tuple of int
+    worst : float
+        Largest ``A_z^H e / tau`` on these planes; 0 where there are none.
+    """
+
+    planes: tuple[int, ...] = ()
+    worst: float = 0.0
+
+    @property
+    def certified(self) -> bool:
+        """Whether the condition holds, but for ``EXCESS``."""
+        return self.worst <= 1 + EXCESS
+
+
+class PlaneWatch:
+    """Keeps count of how long planes have been empty.
+
+    Attributes
+    ----------
+    active : ndarray of bool, (n_z,)
+        Planes that take part.
+    empty_for : ndarray of int, (n_z,)
+        Iterations since a plane last held light.
+    patience : ndarray of int, (n_z,)
+        Iterations after which each plane is left out.
+    """
+
+    def __init__(self, n_z: int) -> None:
+        self.active = np.ones(n_z, bool)
+        self.empty_for = np.zeros(n_z, np.int64)
+        self.patience = np.full(n_z, PATIENCE)
+
+    def note(self, light: npt.NDArray[np.float64]) -> None:
+        """Take down each plane's sum of magnitudes after an iteration."""
+        self.empty_for = np.where(light > 0, 0, self.empty_for + 1)
+
+    def due(self) -> npt.NDArray[np.bool_]:
+        """Return which active planes may be left out, at least one plane staying in."""
+        due = self.active & (self.empty_for >= self.patience)
+        if due.sum() == self.active.sum():
+            due[np.flatnonzero(due)[0]] = False
+        return due
+
+    def bring_back(self, planes: npt.NDArray[np.intp]) -> None:
+        """Let planes take part again."""
+        self.active[planes] = True
+        self.empty_for[planes] = 0
+        self.patience[planes] *= 2
+
 
 _THRESHOLD = 0.1
 """Threshold to begin with, relative to the expected height of a voxel."""
@@ -209,17 +275,17 @@ class SparseDouglasRachford(DouglasRachford):
         return isinstance(prior, Separable) and prior.upper == np.inf and prior.lower in (0.0, -np.inf)
 
     def _allocate(self) -> None:
-        from recon.solvers import _l1_kernels
+        from recon.solvers import _volume_kernels
 
         if not (isinstance(self.prior, Separable) and self.knows(self.prior)):
             raise StructureError("These sweeps are for l1 and non-negativity alone.")
-        self._kernels = _l1_kernels
+        self._kernels: Any = _volume_kernels
         self.positive = self.prior.lower == 0
         operator = self.operator
         # Without a threshold no plane is certain to be empty.
         self.drop_empty = self.tuning.drop_empty and self.weight > 0
         self.watch = PlaneWatch(len(self.z))
-        self._statistics = np.zeros((len(self.z), _l1_kernels.STATISTICS))
+        self._statistics = np.zeros((len(self.z), _volume_kernels.L1_STATISTICS))
         spectrum = fft.spectrum_shape(operator.grid_shape)
         self._totals = np.zeros((operator.groups.count, *spectrum), fft.complex_dtype(operator.dtype))
         self._regroup()

@@ -9,8 +9,7 @@ import numpy as np
 
 from recon.camera.base import Array, LinearOperator
 from recon.priors.base import Prior
-from recon.solvers.base import Solver
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Solver
 
 Restart = Literal["function", "gradient", "none"]
 

@@ -22,17 +22,14 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.threads import get_threads
-from recon.camera.background import BackgroundRemoval
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution3d import Convolution3D
-from recon.priors.base import Prior
-from recon.priors.simple import Separable
+from recon.camera.factors import BackgroundRemoval
+from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import Solver
+from recon.solvers.base import IterationRecord, Solver
 from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
-from recon.solvers.sensor_system import SensorSystem, residual_norm
-from recon.solvers.splitting import SensorData, Tuning, is_due
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.splitting import SensorData, SensorSystem, Tuning, is_due, residual_norm
 
 _PENALTY = 0.5
 """First penalty relative to the mean curvature of the data term."""

@@ -18,8 +18,7 @@ from recon.base.namespace import namespace_of, to_host
 from recon.base.threads import in_blocks
 from recon.camera.base import Array
 from recon.errors import StructureError
-from recon.priors.base import Prior
-from recon.priors.simple import Separable
+from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 
 STRIPS = 16
@@ -157,9 +156,9 @@ class PriorSplits:
     """
 
     def __init__(self, prior: Prior, start: Array) -> None:
-        from recon.solvers import _split_kernels
+        from recon.solvers import _picture_kernels
 
-        self._kernels: Any = _split_kernels
+        self._kernels: Any = _picture_kernels
         self.tv, self.separable, others = split_prior(prior)
         self.y = start
         self.others = tuple(ProxSplit(other, start) for other in others)
@@ -172,7 +171,7 @@ class PriorSplits:
         self._edges = np.array([height * s // strips for s in range(strips + 1)])
         self._below = np.empty((len(start), strips, width), start.dtype)
         self._above = np.empty_like(self._below)
-        self._sums = np.zeros((len(start) * height, _split_kernels.N_SUMS))
+        self._sums = np.zeros((len(start) * height, _picture_kernels.N_SUMS))
 
     @property
     def pixel_penalties(self) -> Array:
@@ -221,7 +220,7 @@ class PriorSplits:
         return np.stack([self.separable.prox(t, 1 / mu) for t, mu in zip(self.t_w, self.mu[1], strict=True)])
 
     def channel_sums(self) -> Array:
-        """Return the last sweep's sums (columns as in ``_split_kernels``), (n_channels, n_sums)."""
+        """Return the last sweep's sums (columns as in ``_picture_kernels``), (n_channels, n_sums)."""
         sums: Array = self._sums.reshape(len(self.y), -1, self._sums.shape[1]).sum(axis=1)
         return sums
 

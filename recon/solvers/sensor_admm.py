@@ -31,14 +31,12 @@ from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.erasures import Erasures
+from recon.camera.factors import Erasures, as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import Solver
+from recon.solvers.base import IterationRecord, Solver
 from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_eigenvalues
 from recon.solvers.prior_splits import PriorSplits
-from recon.solvers.stopping import IterationRecord
-from recon.solvers.structure import as_cropped_convolution
 
 BALANCING = (3, 6, 12, 24, 48, 96, 192)
 """Iterations before which the penalties are balanced; fixed after the last, so that convergence is sure."""
@@ -101,9 +99,9 @@ class SensorAdmm(Solver):
         data_steps: int = 1,
     ) -> None:
         super().__init__()
-        from recon.solvers import _sensor_kernels
+        from recon.solvers import _picture_kernels
 
-        self._kernels: Any = _sensor_kernels
+        self._kernels: Any = _picture_kernels
         structure = as_cropped_convolution(operator)
         camera = structure.convolution
         self._weight = np.ascontiguousarray(structure.weight)

@@ -40,9 +40,9 @@ class LeanTotalVariation(VolumeAdmm):
         return not others and bounds == (0.0, 0.0, np.inf)
 
     def _allocate(self, start: Array | None) -> None:
-        from recon.solvers import _tv_kernels
+        from recon.solvers import _volume_kernels
 
-        self._kernels = _tv_kernels
+        self._kernels = _volume_kernels
         self.splits = ()
         operator, zeros = self.operator, self.room.zeros
         dtype = operator.dtype
@@ -55,7 +55,7 @@ class LeanTotalVariation(VolumeAdmm):
         self.X = zeros(self.g.shape, self.g.dtype)
         self.S = zeros((nz, ny, 4, nx), dtype)
         self._totals = np.empty((operator.groups.count, *self.g.shape[1:]), self.g.dtype)
-        self._statistics = np.zeros((nz, _tv_kernels.STATISTICS))
+        self._statistics = np.zeros((nz, _volume_kernels.STATISTICS))
         if start is not None:
             fft.rfft(start[0], out=self.X)
             np.maximum(start[0], 0, out=self.S[:, :, _POSITIVE])

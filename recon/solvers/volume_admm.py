@@ -6,7 +6,7 @@ that leave the minimiser as it is:
 
 * The data term is not split. ``v = M x`` of Eq. 4.5 is a volume of which only one plane meets the data; the
   others act as a brake. Here the update of x solves the cropped data term exactly, on the sensor plane
-  (:class:`~recon.solvers.sensor_system.SensorSystem`), so that mu_1 is gone.
+  (:class:`~recon.solvers.splitting.SensorSystem`), so that mu_1 is gone.
 * Depth is not transformed. Per lateral spatial frequency ``T = Psi^T Psi + kappa`` is tridiagonal in z and is
   solved as such: no wrap-around between first and last plane, two-dimensional transforms only, and weights
   that may differ from plane to plane (voxels grow with depth).
@@ -29,13 +29,11 @@ from recon.base import fft
 from recon.base.namespace import require_memory, to_host
 from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
-from recon.priors.base import Prior
-from recon.priors.simple import Separable
+from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
+from recon.solvers.base import IterationRecord
 from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
-from recon.solvers.sensor_system import residual_norm
-from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, squares
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
 
 FIRST_PENALTY = 0.5
 """First penalty relative to the mean of ``sum_z |H_z|^2``."""

@@ -8,10 +8,9 @@ import numpy as np
 
 from recon.base import fft
 from recon.camera.base import Array, LinearOperator
+from recon.camera.factors import CroppedConvolution, as_cropped_convolution
 from recon.errors import StructureError
-from recon.solvers.base import Outcome
-from recon.solvers.stopping import StopReason
-from recon.solvers.structure import CroppedConvolution, as_cropped_convolution
+from recon.solvers.base import Outcome, StopReason
 
 FLATNESS = 1e-3
 """Share of plain Tikhonov in the penalty: keeps the lowest frequencies, which have no gradient, bounded."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.erasures import Erasures
+from recon.camera.factors import Erasures
 from recon.errors import InputError
 from recon.priors.base import Prior
 from recon.reconstruction.measurement import Floats

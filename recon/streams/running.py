@@ -10,9 +10,8 @@ from recon.errors import InputError
 from recon.reconstruction.measurement import Floats
 from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
-from recon.solvers.base import Solver
+from recon.solvers.base import Solver, StoppingRules
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.solvers.stopping import StoppingRules
 
 
 class Running:

@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.verdict.shipped import shipped_maps
-
 Floats = npt.NDArray[np.float64]
 
 FLOOR = {
@@ -63,20 +61,24 @@ ALIKE_VOLUMES: Mapping[str, float] = {
     "peaks": 2.0,
     "ends": 2.0,
 }
-"""Likewise of volumes, whose bright points are asked as well (:class:`~recon.verdict.content.Points`).
+"""Likewise of volumes, whose bright points are asked as well (:class:`~recon.verdict.evidence.Points`).
 ``missed`` is the share of the measurement's variance, noise included, that the result does not throw onto the
 sensor."""
 
 RANDOM_LENSLETS = 0.25
 """``ambiguity`` of entries from before it was kept: those maps have random lenslets, 0.17 to 0.33."""
 MIXED = Path(__file__).with_name("mixed.json")
+SHIPPED = Path(__file__).with_name("shipped.json")
+"""The stability maps that come with the program: a ``stability.json``."""
 
+OF_VOLUMES = " of volumes"
+"""Behind the solver and the prior in a method's name: where there is more than one depth."""
 GROUPS = {
     "picture tv": ("admm tv", "admm-sensor tv", "fista tv"),
     "picture l1": ("admm l1", "fista l1", "admm-sensor l1"),
     "wiener": ("wiener",),
-    "volume tv": ("volume tv",),
-    "volume l1": ("volume l1", "volume nonnegative"),
+    "volume tv": ("admm tv" + OF_VOLUMES,),
+    "volume l1": ("admm l1" + OF_VOLUMES, "admm nonnegative" + OF_VOLUMES),
 }
 """Methods that reach the same minimiser, and so fail alike."""
 
@@ -142,6 +144,13 @@ def place_of(evidence: Mapping[str, Any], weights: Mapping[str, float]) -> Float
 def is_whole(evidence: Mapping[str, Any], weights: Mapping[str, float]) -> bool:
     """Tell whether evidence holds all that is asked; cases from before something was measured do not."""
     return {*weights} - {*DERIVED, "ambiguity"} <= {*evidence}
+
+
+@cache
+def shipped_maps() -> dict[str, Any]:
+    """Return the shipped maps by name."""
+    maps: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))["maps"]
+    return maps
 
 
 @cache

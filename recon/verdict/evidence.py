@@ -1,11 +1,12 @@
-"""What the data alone tell about a reconstruction: light, misfit, load, missing pixels.
+"""What the data alone tell about a reconstruction: light, misfit, load, missing pixels, what it holds.
 
 Nothing here knows the truth. Everything is relative, so that it means the same at any exposure and size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.verdict.content import lit_and_edges, points_of
+from recon.base.checks import as_channels, saturated_share
+from recon.solvers.base import IterationRecord, StoppingRules, StopReason
 
 Array = npt.NDArray[Any]
 
@@ -24,6 +26,19 @@ NO_LESS = 1e-4
 """Least variance of the signal in units of the noise', so that ratios to it stay finite."""
 RING = (0.1, 0.25)
 """Spatial frequencies of details, cycles a pixel: periods from ten to four pixels."""
+LIT = 0.05
+"""Share of the brightest voxels' value (their 99.5th percentile) from which a voxel counts as lit, and a
+difference between neighbours as an edge."""
+MOST_SAMPLES = 4_000_000
+SMOOTH_PX = 0.7
+"""A point between pixels is shared by up to four: smoothed so far before peaks are looked for."""
+FOUND = 0.1
+STRONG = 0.5
+"""Height from which a peak counts as found and as strong, relative to the height at which the light lies
+(``sum y^2 / sum y``, which empty space around it does not change)."""
+DIVERGED = 1e3
+"""``unsettled`` of a run whose iterates were no longer finite; it is never more."""
+LIMITS = (StopReason.ITERATIONS, StopReason.TIME, StopReason.CANCELLED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +73,7 @@ class Evidence:
     unsettled : float
         Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
     height, peaks, ends : float or None
-        Of the bright points of a volume (:class:`~recon.verdict.content.Points`); None of a picture.
+        Of the bright points of a volume (:class:`Points`); None of a picture.
     """
 
     signal: float
@@ -220,3 +235,181 @@ def averaged(channels: list[Evidence]) -> Evidence:
     mean = {k: float(np.mean(v)) for k, v in numbers.items()}
     worst = {k: max(numbers[k]) for k in ("unexplained", "saturated", "unsettled", "load")}
     return Evidence(**{**mean, **worst, "planes": int(numbers["planes"][0])})  # type: ignore[arg-type]
+
+
+# What it holds --------------------------------------------------------------------------------------
+def lit_and_edges(volume: Array) -> tuple[float, float]:
+    """Return the shares of lit voxels and of edges, plane by plane: volumes may be as large as the memory."""
+    sample = volume.reshape(-1)[:: max(volume.size // MOST_SAMPLES, 1)]
+    white = float(np.percentile(sample, 99.5))
+    if white <= 0:
+        white = float(volume.max())
+    if white <= 0:
+        return 0.0, 0.0
+    level = LIT * white
+    lit = edges = 0
+    for z, plane in enumerate(volume):
+        step = np.zeros(plane.shape, bool)
+        step[:-1] |= np.abs(np.diff(plane, axis=0)) > level
+        step[:, :-1] |= np.abs(np.diff(plane, axis=1)) > level
+        if z + 1 < len(volume):
+            step |= np.abs(volume[z + 1] - plane) > level
+        lit += int(np.count_nonzero(plane > level))
+        edges += int(np.count_nonzero(step))
+    return lit / volume.size, edges / volume.size
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The bright points of a volume.
+
+    Attributes
+    ----------
+    height : float
+        Median height of the peaks found, as the camera sees them: a voxel's value times its PSF's norm, over
+        the noise. That is how far a single point stands above the noise of all pixels which it lights.
+    peaks : float
+        Strong peaks for each thousand measured pixels.
+    ends : float
+        Mean light of the two outermost planes over the mean plane's: above 1 where light that fits nowhere
+        gathers, or where the scene goes on beyond the calibrated depths.
+    """
+
+    height: float
+    peaks: float
+    ends: float
+
+
+def points_of(volume: Array, norms: npt.NDArray[np.float64], count: int) -> Points:
+    """Measure the bright points of a volume, three planes in memory at a time.
+
+    Parameters
+    ----------
+    volume : ndarray, (n_z, rows, columns)
+    norms : ndarray, (n_z,)
+        Norms of the planes' PSFs over the noise.
+    count : int
+        Measured pixels.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    light = np.zeros(len(volume))
+    squares = 0.0
+    heights = []
+    window: deque[tuple[Array, Array]] = deque(maxlen=3)  # planes, smoothed, each with its local maxima
+    for z in range(len(volume) + 1):
+        if z < len(volume):
+            seen = np.maximum(volume[z], 0) * np.float32(norms[z])
+            plane = gaussian_filter(seen, SMOOTH_PX)
+            window.append((plane, maximum_filter(plane, 3)))
+            light[z] = float(np.sum(seen, dtype=np.float64))
+            squares += float(np.sum(np.square(plane), dtype=np.float64))
+        elif len(window) == 3:
+            window.popleft()
+        if z > 0:  # the plane before is known with both its neighbours
+            middle = window[-2 if z < len(volume) else -1][0]
+            highest = np.max([maxima for _, maxima in window], axis=0)
+            heights.append(middle[(middle == highest) & (middle > 0)])
+    total = float(light.sum())
+    if total <= 0:
+        return Points(0.0, 0.0, 1.0)
+    found = np.concatenate(heights)
+    level = squares / total
+    strong = int(np.count_nonzero(found > STRONG * level))
+    above = found[found > FOUND * level]
+    return Points(
+        height=float(np.median(above)) if len(above) else 0.0,
+        peaks=1000 * strong / max(count, 1),
+        ends=float((light[0] + light[-1]) / 2 / light.mean()),
+    )
+
+
+# From a result --------------------------------------------------------------------------------------
+def observations(
+    measurement: npt.ArrayLike, data: Array, valid: npt.NDArray[np.bool_], noise: Array
+) -> list[Observation]:
+    """Return what the camera saw, a channel each.
+
+    Parameters
+    ----------
+    measurement : array
+        As it came: (height, width[, n_channels]).
+    data : ndarray, (n_channels, height, width)
+        Background subtracted, in units of the noise.
+    valid : ndarray of bool, shape of ``data``
+    noise : ndarray, (n_channels,)
+        Deviations, counts.
+    """
+    counts = as_channels(measurement, "measurement")
+    return [
+        Observation(d, v, float(n), saturated_share(c[v]))
+        for d, v, n, c in zip(data, valid, noise, counts, strict=False)
+    ]
+
+
+def evidence_of(
+    seen: Sequence[Observation],
+    volume: Array,
+    psfs: Array,
+    residuals: Sequence[float],
+    unsettled: float,
+    *,
+    points: bool = False,
+) -> Evidence:
+    """Measure all channels of a reconstruction.
+
+    Parameters
+    ----------
+    seen : sequence of Observation
+        One a channel.
+    volume : ndarray, (n_z, rows, columns[, n_channels])
+        The result in measurement units.
+    psfs : ndarray, (n_z, 1 or n_channels, height, width)
+        As calibrated.
+    residuals : sequence of float
+        Residual norms in units of the noise: one a channel, or one of all together.
+    unsettled : float
+    points : bool
+        Whether to look for the result's bright points as well: of volumes.
+    """
+    n = len(seen)
+    channels = [
+        measure(
+            one,
+            volume if volume.ndim == 3 else volume[..., c],
+            psfs[:, min(c, psfs.shape[1] - 1)],
+            residuals[c] if len(residuals) == n else residuals[0] / n**0.5,
+            unsettled=unsettled,
+            points=points,
+        )
+        for c, one in enumerate(seen)
+    ]
+    return averaged(channels)
+
+
+def not_judged(error: Exception) -> str:
+    """Say that there is no verdict, and why: a result is never lost for want of one."""
+    why = f"{type(error).__name__}: {error}"
+    return f"No verdict: judging the result failed ({why}). The result itself is whole."
+
+
+def unsettled_by(
+    history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float, *, started: bool
+) -> float:
+    """Return the last change over ten times the tolerance, where a limit ended the run; else 0.
+
+    A run that was ended before it could be seen to settle (:class:`~recon.solvers.base.StoppingRules`
+    ask for several calm iterations in a row) counts as if everything had changed: many solvers do not move
+    at all in their first iteration. One that was ``started`` from a result had not to begin anew: there the
+    residuals count as they do for those rules, as the change alone would call any start settled. Where they
+    are nil as well, the start was empty, and nothing is known.
+    """
+    if reason is StopReason.NOT_FINITE:
+        return DIVERGED
+    if not history or tolerance <= 0 or reason not in LIMITS:
+        return 0.0
+    change = history[-1].change
+    if len(history) < StoppingRules().patience:
+        unrest = history[-1].unrest
+        change = unrest if started and unrest > 0 else max(change, 1.0)
+    return min(float(change / (10 * tolerance)), DIVERGED) if np.isfinite(change) else DIVERGED

@@ -1,24 +1,56 @@
-"""From evidence to a verdict: what happened to data like these where the truth was known.
+"""Verdicts on reconstructions: the rules by which evidence is judged, and what is said.
 
-The verdict looks up the most similar cases (:mod:`recon.verdict.cases`) and asks how many of them failed.
-Which stress limits is asked the same way: were this one number as good as a good case's, how many would fail?
+A verdict looks up the most similar cases (:mod:`recon.verdict.cases`), where the truth was known, and asks
+how many of them failed. Which stress limits is asked the same way: were this one number as good as a good
+case's, how many would fail?
 """
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.verdict.cases import Cases, cases_of, group_of, place_of
-from recon.verdict.collect import DIVERGED
-from recon.verdict.evidence import Evidence
-from recon.verdict.verdict import LOST, NOISELESS, UNFINISHED, Finding, Region, Verdict, reliable_share
+from recon.verdict.cases import OF_VOLUMES, Cases, cases_of, group_of, place_of
+from recon.verdict.evidence import DIVERGED, Evidence
 
 Floats = npt.NDArray[np.float64]
 
+
+class Region(enum.StrEnum):
+    """Where a reconstruction lies."""
+
+    INSIDE = "inside"
+    NEAR = "near"
+    OUTSIDE = "outside"
+    UNKNOWN = "unknown"
+
+
+WORDS: Mapping[Region, str] = {
+    Region.INSIDE: "reliable: inside the region where {method} works",
+    Region.NEAR: "doubtful: near the boundary where {method} fails",
+    Region.OUTSIDE: "not reliable: outside the region where {method} works",
+    Region.UNKNOWN: "not judged: the stability maps hold no case of {method} that is much like this one",
+}
+
+UNFINISHED = 10.0
+"""``unsettled`` from which no similar case is asked any more: the picture had hardly begun to settle."""
+FIRST_ITERATIONS = "not reliable: the iterations were ended when the picture had hardly begun to settle"
+STILL_CHANGING = "doubtful: the iterations were ended while the picture still changed; similar ones are good"
+NOISELESS = 1e3
+"""``signal`` from which the data are no photograph's: a full well of 100,000 electrons gives some 300."""
+COMPUTED = (
+    "not judged: the measurement has next to no noise, as computed images have, and verdicts are made from "
+    "photographs"
+)
+LOST = 0.5
+"""Share of failures among similar cases from which a reconstruction is outside."""
+MOST = 2
+"""Stresses that are named."""
 NEIGHBOURS = 16
 """Cases that are asked. With twelve, 1 of 150 that were called reliable had failed, with sixteen none of 134,
 and with a tenth of failures allowed 2 of 165 (the mixed scenes, each judged by the cases of the others)."""
@@ -113,13 +145,109 @@ STRESSES: Mapping[str, tuple[int, str, str]] = {
 """By evidence: whether more of it is better, what is said, what would help."""
 
 
-def method_name(method: str, prior: str) -> str:
-    """Return the name that a method with a prior has on the maps."""
-    if method == "wiener":
+def reliable_share(method: str) -> float:
+    """Return the share of failures among similar cases up to which a reconstruction is inside.
+
+    Failures of volumes lie among the good ones, most of them little worse than trivial: with 5 % few volumes
+    would ever be inside, and with total variation no more of those that 10 % lets in fail. With l1 they do.
+    """
+    return 0.1 if group_of(method) == "volume tv" else 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One stress that makes a reconstruction less reliable.
+
+    Attributes
+    ----------
+    stress : str
+        Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`.
+    value : float
+        What was measured.
+    gain : float
+        By how much the share of failing cases would fall, were this one as in a good case; where no case is
+        much like it, by how much nearer the nearest would be.
+    words, help : str
+        What it is, and what would help.
+    """
+
+    stress: str
+    value: float
+    gain: float
+    words: str
+    help: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether to trust a reconstruction.
+
+    Attributes
+    ----------
+    region : Region
+    method : str
+        The maps' name of the method.
+    failing : float or None
+        Share of the most similar cases of the maps that failed; None where there are none.
+    findings : tuple of Finding
+        What limits, the most limiting first.
+    evidence : mapping
+        What was measured, see :class:`~recon.verdict.evidence.Evidence`.
+    basis : str
+        By which cases it was judged.
+    """
+
+    region: Region
+    method: str
+    failing: float | None
+    findings: tuple[Finding, ...]
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    basis: str = ""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in plain words: what, which stress limits it, what would help."""
+        said = [WORDS[self.region].format(method=self.method)]
+        unfinished = self.evidence.get("unsettled", 0.0) >= UNFINISHED
+        if unfinished and self.failing is not None and self.failing < LOST:
+            said = [FIRST_ITERATIONS]  # that is why; the share of similar cases would contradict it
+        elif self._still_changing:
+            said = [STILL_CHANGING]
+        elif self.region is Region.UNKNOWN and self.evidence.get("signal", 0.0) >= NOISELESS:
+            said = [COMPUTED]
+        elif self.failing is not None and self.region is not Region.UNKNOWN:
+            said[0] += f" (of the most similar simulated cases {self.failing:.0%} failed)"
+        if self.region in (Region.NEAR, Region.OUTSIDE):
+            said += [f"{f.words}. {f.help}" for f in self.findings[:MOST]]
+        elif self.region is Region.UNKNOWN and said[0] != COMPUTED:
+            said += [f"What sets it apart: {f.words}. {f.help}" for f in self.findings[:1]]
+        return tuple(f"{s}." for s in said)
+
+    @property
+    def _still_changing(self) -> bool:
+        """Whether nothing but the end of the run keeps it from being inside."""
+        if self.region is not Region.NEAR or self.failing is None:
+            return False
+        return self.failing <= reliable_share(self.method)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the verdict for a file."""
+        return {
+            "region": str(self.region),
+            "method": self.method,
+            "failing": self.failing,
+            "sentences": list(self.sentences),
+            "findings": [asdict(f) for f in self.findings],
+            "evidence": dict(self.evidence),
+            "basis": self.basis,
+        }
+
+
+def method_name(solver: str, prior: str, *, volume: bool = False) -> str:
+    """Return the name that a solver with a prior has on the maps, of pictures or of volumes."""
+    if solver == "wiener":
         return "wiener"
-    kind = "tv" if prior.startswith("tv") else prior
-    solver = "admm" if method == "admm-gpu" else method
-    return f"{solver} {kind}"
+    return f"{solver} {'tv' if prior.startswith('tv') else prior}{OF_VOLUMES if volume else ''}"
 
 
 def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> Verdict:
@@ -150,11 +278,17 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
     sources = [f"maps {', '.join(cases.maps)}"] if cases.maps else []
     sources += [f"{mixed} mixed scenes"] if mixed else []
     basis = f"{count} nearest of {len(cases.severities)} simulated cases ({'; '.join(sources)})"
-    if region is Region.UNKNOWN:
-        findings = _setting_apart(cases, place, numbers)
-    else:
-        findings = _findings(cases, place, numbers, share, count)
-    findings = _unfinished_first(_clipped_first(findings, numbers), numbers, reliable)
+    if region is Region.UNKNOWN:  # those stresses first without which cases would be nearest
+
+        def gain(relieved: Floats) -> float:
+            return _third_nearest(cases, place) - _third_nearest(cases, relieved)
+    else:  # those first whose removal would lower the share of failures most
+
+        def gain(relieved: Floats) -> float:
+            return share - failing_share(cases, relieved, count)[0]
+
+    findings = _clipped_first(_relieved(cases, place, numbers, gain), numbers)
+    findings = _unfinished_first(findings, numbers, reliable)
     return Verdict(region, method, share, findings, numbers, basis)
 
 
@@ -181,24 +315,8 @@ def failing_share(cases: Cases, place: Floats, count: int) -> tuple[float, float
     return float(np.sum(weight * failed) / np.sum(weight)), float(distance[order[2]])
 
 
-def _findings(
-    cases: Cases, place: Floats, numbers: Mapping[str, float], share: float, count: int
-) -> tuple[Finding, ...]:
-    """Return the stresses, those first whose removal would lower the share of failures most."""
-
-    def gain(relieved: Floats) -> float:
-        return share - failing_share(cases, relieved, count)[0]
-
-    return _relieved(cases, place, numbers, gain)
-
-
-def _setting_apart(cases: Cases, place: Floats, numbers: Mapping[str, float]) -> tuple[Finding, ...]:
-    """Return the stresses, those first without which cases would be nearest."""
-
-    def nearest(to: Floats) -> float:
-        return float(np.sort(np.linalg.norm(cases.places - to, axis=1))[2])
-
-    return _relieved(cases, place, numbers, lambda relieved: nearest(place) - nearest(relieved))
+def _third_nearest(cases: Cases, place: Floats) -> float:
+    return float(np.sort(np.linalg.norm(cases.places - place, axis=1))[2])
 
 
 def _relieved(

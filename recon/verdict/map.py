@@ -1,20 +1,131 @@
-"""What a map of a failure boundary is: two stresses, methods, a trial, and what the trials gave."""
+"""Stability maps: two stresses, methods, what each trial gave, and from where on that counts as a failure.
+
+Each criterion gives a severity, and from 1 on it is a failure:
+
+=============  ==========================================================================================
+criterion      severity
+=============  ==========================================================================================
+trivial        error over that of the trivial reconstruction: the measurement's back-projection ``A^H b``
+               with the best scale and offset that the truth itself would choose
+resolution     0.5 over the correlation with the truth on the ring of frequencies whose period is twice the
+               resolved distance (the resolution has fallen below half of nominal); that distance is the
+               shift at which the PSF's autocorrelation is 0.7, and at least two pixels
+spots          share of true points (away from others) without a peak within 1.5 pixels, and of peaks without
+               a point, over 10 %; where points are crowded, less what chance finds
+               (:mod:`recon.evaluation.scene_trial`)
+dip            0.2 over the least dip between neighbouring points (two-point resolution)
+convergence    change of the last iteration over ten times the tolerance, where a limit ended the run
+picture        ``10^((20 - PSNR) / 20)``: a hologram's error over a tenth of its picture's white
+precision      difference of float32 from float64 over 1 % of the solution
+alone          error over that of the same frames reconstructed one by one: the prior over time does harm
+=============  ==========================================================================================
+
+Severities are continuous, so that a boundary can be drawn between the cells of a coarse map.
+"""
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from recon.verdict.failure import Failure, Severities, worst
+from recon.base import metrics
+from recon.solvers.base import IterationRecord, StopReason
 
+Image = npt.NDArray[Any]
 Size = Literal["quick", "full"]
-SIZES: tuple[Size, ...] = ("quick", "full")
+
+WORST = 99.0
+"""Severities are cut here: an infinite one is no number for a file."""
+RING_CORRELATION = 0.5
+RING_WIDTH = 0.2
+"""Half width of the ring, relative to its frequency."""
+DIP = 0.2
+PSNR_DB = 20.0
+PRECISION = 0.01
 
 
+class Failure(enum.StrEnum):
+    """In which way a reconstruction failed."""
+
+    TRIVIAL = "no better than the trivial reconstruction"
+    RESOLUTION = "resolution below half of nominal"
+    SPOTS = "points lost or made up"
+    DIP = "neighbouring points not told apart"
+    CONVERGENCE = "not converged"
+    PICTURE = "picture below 20 dB"
+    PRECISION = "float32 differs from float64"
+    ALONE = "worse than each frame on its own"
+
+
+Severities = Mapping[Failure, float]
+
+
+def worst(severities: Severities) -> tuple[float, Failure | None]:
+    """Return the largest severity, and its criterion where it is a failure (1 or more)."""
+    if not severities:
+        raise ValueError("A cell needs at least one criterion.")
+    kind = max(severities, key=lambda k: severities[k])
+    value = bounded(severities[kind])
+    return value, kind if value >= 1 else None
+
+
+def bounded(severity: float) -> float:
+    """Return the severity within 0 and :data:`WORST`; NaN is the worst."""
+    return WORST if not severity <= WORST else max(float(severity), 0.0)
+
+
+def trivial_error(back_projection: Image, truth: Image) -> float:
+    """Return the NRMSE of the trivial reconstruction: ``a A^H b + c`` with the best ``a`` and ``c``.
+
+    Parameters
+    ----------
+    back_projection, truth : ndarray
+        Of one shape, any number of dimensions.
+    """
+    seen, wanted = (np.asarray(v, np.float64).ravel() for v in (back_projection, truth))
+    columns = np.stack([seen, np.ones_like(seen)], axis=1)
+    fitted = columns @ np.linalg.lstsq(columns, wanted, rcond=None)[0]
+    return float(np.linalg.norm(fitted - wanted) / np.linalg.norm(wanted))
+
+
+def relative_error(found: Image, truth: Image) -> float:
+    """Return the NRMSE after the best scale, for any number of dimensions."""
+    a, b = (np.asarray(v, np.float64).reshape(len(v), -1) for v in (found, truth))
+    return metrics.nrmse(a, b, fit_scale=True)
+
+
+def ring_correlation(found: Image, truth: Image, period_px: float) -> float:
+    """Return the correlation of two images (height, width) on a ring of spatial frequencies."""
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in truth.shape))
+    a, b = (np.fft.rfft2(window * (v - v.mean())) for v in (found, truth))
+    y, x = np.fft.fftfreq(truth.shape[0])[:, None], np.fft.rfftfreq(truth.shape[1])
+    ring = np.abs(np.hypot(y, x) * period_px - 1) <= RING_WIDTH
+    norm = float(np.sqrt(np.sum(np.abs(a[ring]) ** 2) * np.sum(np.abs(b[ring]) ** 2)))
+    return float(np.sum(a[ring] * b[ring].conj()).real) / norm if norm > 0 else 0.0
+
+
+def resolution_severity(found: Image, truth: Image, resolved_px: float) -> float:
+    """Severity of lost resolution; ``resolved_px`` is the distance that the optics resolve."""
+    return bounded(RING_CORRELATION / max(ring_correlation(found, truth, 2 * resolved_px), 1e-3))
+
+
+def convergence_severity(
+    history: tuple[IterationRecord, ...], reason: StopReason | None, tolerance: float
+) -> float:
+    """Severity of a run that was ended by a limit; 0 for one that settled or took one step."""
+    if reason is StopReason.NOT_FINITE:
+        return WORST
+    if not history or reason is not StopReason.ITERATIONS or tolerance <= 0:
+        return 0.0
+    return bounded(history[-1].change / (10 * tolerance))
+
+
+# Maps -----------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Axis:
     """A stress.
@@ -53,7 +164,7 @@ class Trial:
     error : float
         What the map's ``error`` says: NRMSE after the best scale, or decibels.
     severities : mapping
-        By criterion, see :mod:`recon.verdict.failure`.
+        By criterion, see :mod:`recon.verdict.map`.
     evidence : mapping
         What the data alone tell (see :mod:`recon.verdict.evidence`); empty where nothing was reconstructed.
     """
@@ -115,29 +226,16 @@ class Cell:
 
     def as_json(self) -> dict[str, Any]:
         """Return the cell for a file."""
-        return {
-            "method": self.method,
-            "ix": self.ix,
-            "iy": self.iy,
-            "error": self.error,
-            "severity": self.severity,
-            "failure": None if self.failure is None else self.failure.name.lower(),
-            "evidence": [dict(e) for e in self.evidence],
-            "seconds": self.seconds,
-        }
+        failure = None if self.failure is None else self.failure.name.lower()
+        return {**asdict(self), "failure": failure, "evidence": [dict(e) for e in self.evidence]}
 
     @staticmethod
     def from_json(entry: Mapping[str, Any]) -> Cell:
         """Return the cell of a file's entry."""
+        names = ("method", "ix", "iy", "error", "severity", "failure", "evidence", "seconds")
+        failure = None if entry["failure"] is None else Failure[entry["failure"].upper()]
         return Cell(
-            entry["method"],
-            int(entry["ix"]),
-            int(entry["iy"]),
-            float(entry["error"]),
-            float(entry["severity"]),
-            None if entry["failure"] is None else Failure[entry["failure"].upper()],
-            tuple(entry["evidence"]),
-            float(entry["seconds"]),
+            **{n: entry[n] for n in names} | {"failure": failure, "evidence": tuple(entry["evidence"])}
         )
 
 
@@ -145,21 +243,12 @@ def cell_of(method: str, ix: int, iy: int, trials: list[Trial], seconds: float) 
     """Summarise the draws of a cell."""
     judged = [worst(t.severities) for t in trials]
     order = np.argsort([severity for severity, _ in judged])
-    middle = int(order[len(order) // 2])
-    return Cell(
-        method,
-        ix,
-        iy,
-        float(np.median([t.error for t in trials])),
-        judged[middle][0],
-        judged[middle][1],
-        tuple(
-            {**t.evidence, "severity": severity}
-            for t, (severity, _) in zip(trials, judged, strict=True)
-            if t.evidence
-        ),
-        seconds,
+    severity, failure = judged[int(order[len(order) // 2])]
+    evidence = tuple(
+        {**t.evidence, "severity": of} for t, (of, _) in zip(trials, judged, strict=True) if t.evidence
     )
+    error = float(np.median([t.error for t in trials]))
+    return Cell(method, ix, iy, error, severity, failure, evidence, seconds)
 
 
 def severity_grid(cells: list[Cell], method: str, shape: tuple[int, int]) -> npt.NDArray[np.float64]:

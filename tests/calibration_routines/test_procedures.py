@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from calibration_routines import CalibrationError
-from calibration_routines.errors import RunEndedError
 from calibration_routines.optics.angular import AngularProcedure, AngularSweep
 from calibration_routines.plan_procedures import PlanProcedure, ResumeProcedure
-from calibration_routines.procedure import Listener, Outcome
-from calibration_routines.psf.exposure import SweepExposures
+from calibration_routines.procedure import Listener, Outcome, RunEndedError
 from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, VolumeSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from instrument.bench.bench import Bench, open_bench
@@ -25,6 +23,7 @@ from instrument.plan import Part, Plan, PlanError
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.run_control import EndedEarlyError, RunControl
 from instrument.runs.runner import RunState, RunStatus
+from tests.mocks.listeners import Following
 
 TINY = """
 [camera]
@@ -56,22 +55,6 @@ def slow_bench() -> Iterator[Bench]:
         yield opened
 
 
-class Heard(Listener):
-    def __init__(self, on_frame: Callable[[RunStatus], None] = lambda _: None) -> None:
-        self.steps: list[str] = []
-        self.found: SweepExposures | None = None
-        self._on_frame = on_frame
-
-    def step(self, words: str) -> None:
-        self.steps.append(words)
-
-    def exposures(self, found: SweepExposures) -> None:
-        self.found = found
-
-    def frame(self, status: RunStatus) -> None:
-        self._on_frame(status)
-
-
 def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Bench, tmp_path: Path) -> None:
     before = bench.source_position_um
     outlook = AXIAL.outlook(bench, tmp_path)
@@ -79,7 +62,7 @@ def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Benc
     assert list(tmp_path.iterdir()) == []
     assert sorted({round(place["z_um"]) for place in outlook.path}) == [60000, 75000, 100000, 150000]
     assert outlook.path[0] == outlook.path[-1]  # the reference
-    heard = Heard()
+    heard = Following()
     done = AXIAL.carry_out(bench, tmp_path, listener=heard)
     assert heard.steps == ["homing the stage", "finding exposures", "sweeping", "analysing"]
     assert heard.found is not None
@@ -138,7 +121,7 @@ def test_abort_between_two_frames_keeps_them_and_resume_makes_the_calibration(
             control.abort()
 
     with pytest.raises(RunEndedError) as ended:
-        AXIAL.carry_out(bench, tmp_path, control=control, listener=Heard(at_five))
+        AXIAL.carry_out(bench, tmp_path, control=control, listener=Following(at_five))
     run = ended.value.run
     assert run.condition is RunCondition.ABORTED
     assert len(run.records) == 5
@@ -163,7 +146,7 @@ def test_pause_waits_dark_until_it_goes_on(bench: Bench, tmp_path: Path) -> None
             assert bench.led_array.pattern.is_dark
             threading.Timer(0.05, control.resume).start()
 
-    done = AXIAL.carry_out(bench, tmp_path, control=control, listener=Heard(watch))
+    done = AXIAL.carry_out(bench, tmp_path, control=control, listener=Following(watch))
     assert RunState.PAUSED in states
     assert done.good
 

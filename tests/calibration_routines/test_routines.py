@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from calibration_routines import PointSweep
-from calibration_routines.options import MM
-from calibration_routines.procedure import Routine, routines
+from calibration_routines.procedure import MM, Routine, routines
 from calibration_routines.psf.sweep_options import PlannedSweep, Taking
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.forms.routines import forms

@@ -62,7 +62,7 @@ def noise_model(read_noise: float, counts_per_electron: float) -> Any:
 
 def wishes(**wanted: str) -> Any:
     """Return choices that are not left to the program, from words."""
-    from recon.reconstruction.overrides import Overrides
+    from recon.reconstruction.options import Overrides
 
     return Overrides.parse(wanted)
 
@@ -126,7 +126,7 @@ def resumed(
     kind: str, measurement: npt.NDArray[Any], calibration: Any, *, after: int, iterations: int, **options: Any
 ) -> Result:
     """Keep a reconstruction in a folder after some iterations, and go on with it."""
-    from instrument.files.checkpoint import CheckpointFolder
+    from instrument.reconstruction.checkpointing import CheckpointFolder
 
     run = {"picture": picture, "volume": volume}[kind]
     with TemporaryDirectory() as folder:
@@ -297,8 +297,9 @@ def hologram(  # noqa: PLR0913 - what the cases vary
 
 def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> Result:
     """Score settings of a reconstruction at counts of iterations; times are left out."""
-    from recon.evaluation.chart_reconstruction import ChartProblem, Setting, run_setting, settings_for
+    from recon.evaluation.chart_reconstruction import ChartProblem
     from recon.evaluation.scene import make_scene
+    from recon.evaluation.trial import Setting
 
     scene = make_scene(family, size=size)
     problem = ChartProblem(
@@ -311,9 +312,9 @@ def chart(family: Any, size: int, settings: Sequence[Mapping[str, Any]], counts:
     )
     scores = []
     for setting in settings:
-        curve = run_setting(problem, Setting(**setting), counts=counts)
+        curve = problem.run(Setting(**setting), counts=counts)
         scores += [(p.iterations, p.psnr_db, p.ssim, p.nrmse, p.residual, p.held_out) for p in curve.points]
-    return {"scores": np.array(scores), "settings": "\n".join(sorted(s.name for s in settings_for(problem)))}
+    return {"scores": np.array(scores), "settings": "\n".join(sorted(s.name for s in problem.settings()))}
 
 
 def stability_map(name: str, methods: Sequence[str]) -> Result:

@@ -13,11 +13,11 @@ from pytestqt.qtbot import QtBot
 
 from gui.panels.charts import ChartsPanel
 from gui.widgets.chart_view import describe
-from instrument.evaluation.chart_data import read_chart
+from instrument.evaluation.chart import read_chart
 from instrument.files.errors import FileError
 from instrument.files.images import read_image
 from instrument.files.stability_file import read_stability
-from recon.verdict.shipped import shipped_file
+from recon.verdict.cases import SHIPPED
 
 WAIT_MS = 60_000
 
@@ -63,7 +63,7 @@ def made(tmp_path: Path) -> Path:
 
 def test_every_shipped_map_and_method_is_drawn(panel: ChartsPanel) -> None:
     view = panel.stability
-    maps = read_stability(shipped_file())["maps"]
+    maps = read_stability(SHIPPED)["maps"]
     assert [view.map.itemData(i) for i in range(view.map.count())] == list(maps)
     for index, record in enumerate(maps.values()):
         view.map.setCurrentIndex(index)
@@ -169,7 +169,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     assert rows == [["● admm tv", "26", "0.4"], ["fista tv", "25", "0.8"], ["● wiener", "12", "0.01"]]
     assert "SIMULATED" in panel.heading.text()
     assert "local tv: one PSF only" in panel.heading.toolTip()
-    assert "volume l1: no time" in panel.heading.toolTip()
+    assert "admm l1: no time" in panel.heading.toolTip()
     # Less is better for errors, and scores that nobody knows are not on offer.
     assert [view.measure.itemData(i) for i in range(view.measure.count())] == ["psnr_db", "held_out"]
     view.measure.setCurrentIndex(1)

@@ -10,9 +10,8 @@ import pytest
 
 from calibration_routines.display.mask_alignment import AlignmentProcedure
 from calibration_routines.optics.beads import BeadProcedure
-from calibration_routines.options import Size
 from calibration_routines.plan_procedures import PlanProcedure
-from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.procedure import Outcome, Outlook, Size
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
 from gui.forms.routines import PLAN, forms

@@ -14,10 +14,10 @@ from pytestqt.qtbot import QtBot
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
 from gui.widgets.image_view import ImageView
+from instrument.bench.photograph import LightState
 from instrument.files.images import read_image
 from instrument.plan.led_shapes import BrightField
 from instrument.runs.run import Run
-from instrument.runs.snapshot import LightState
 
 WAIT_MS = 60_000
 

@@ -18,7 +18,7 @@ from gui.panels import PANELS
 from gui.session import BenchSession
 from gui.theme import THEMES
 from gui.widgets.dialogues import TextWindow, choose_path
-from instrument.runs.snapshot import LightState
+from instrument.bench.photograph import LightState
 
 WAIT_MS = 60_000
 

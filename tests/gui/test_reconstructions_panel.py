@@ -21,10 +21,10 @@ from gui.theme import apply_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.number_edit import NumberEdit
 from instrument.files.images import read_image, write_image
-from instrument.files.volume_source import VolumeSource
+from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
 from instrument.reconstruction.stored_result import open_result
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 
 WAIT_MS = 60_000
 SIZE, DEPTHS = 32, 4

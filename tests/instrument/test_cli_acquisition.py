@@ -10,7 +10,7 @@ import pytest
 
 from instrument.cli import main
 from instrument.plan import Plan
-from instrument.plan.file import load_plan, plan_toml, save_plan
+from instrument.plan.model import load_plan, plan_toml, save_plan
 from instrument.runs.run import FinishReason, Run, RunCondition
 from instrument.runs.writer import RunWriter
 from tests.mocks.devices import MockCamera, MockStage

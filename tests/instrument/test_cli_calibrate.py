@@ -249,7 +249,7 @@ def test_an_interrupted_sweep_says_what_is_kept_and_how_to_go_on(
 @pytest.mark.parametrize(
     ("function", "says"),
     [
-        ("calibration_routines.psf.sweep_procedure.expose_sweep", "no frame was kept"),
+        ("calibration_routines.psf.sweep.expose_sweep", "no frame was kept"),
         (
             "calibration_routines.psf.sweep.analyse_sweep",
             "All frames of the sweep are kept. For its calibration: ",

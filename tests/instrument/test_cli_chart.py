@@ -14,27 +14,28 @@ from typer.testing import CliRunner
 from instrument.cli import chart as module
 from instrument.reconstruction.job import Job
 from recon import Calibration, NoiseModel
-from recon.evaluation import chart_reconstruction as recon_chart
-from recon.evaluation.scored import Point
+from recon.evaluation.chart_reconstruction import ChartProblem
+from recon.evaluation.scored import Curve, Point
+from recon.evaluation.trial import Setting
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """Two settings, in this process."""
-    import instrument.evaluation.chart_job as job
+    import instrument.evaluation.chart as job
 
     settings = (
-        recon_chart.Setting("wiener", "convolution", "none"),
-        recon_chart.Setting("admm", "convolution", "tv"),
+        Setting("wiener", "convolution", "none"),
+        Setting("admm", "convolution", "tv"),
     )
     ran = []
 
     def here(problem, setting, limit_s):
         assert limit_s > 0
         ran.append(setting.name)
-        return recon_chart.run_setting(problem, setting, counts=(2, 5))
+        return problem.run(setting, counts=(2, 5))
 
-    monkeypatch.setattr(recon_chart.ChartProblem, "settings", lambda problem: settings)
+    monkeypatch.setattr(ChartProblem, "settings", lambda problem: settings)
     monkeypatch.setattr(job, "in_own_process", here)
     return ran
 
@@ -67,7 +68,7 @@ def test_a_chart_is_written_and_gone_on_with(quick, tmp_path):
 
 
 def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_path):
-    import instrument.evaluation.chart_job as job
+    import instrument.evaluation.chart as job
     from instrument.evaluation.chart_problems import problem_of_scene
 
     whole = job.in_own_process
@@ -75,12 +76,12 @@ def test_a_curve_that_the_budget_cut_off_is_drawn_again(quick, monkeypatch, tmp_
     def cut(problem, setting, limit_s):
         curve = whole(problem, setting, limit_s)
         shorter = setting.solver != "wiener"
-        return recon_chart.Curve(curve.points[:1], False) if shorter else curve
+        return Curve(curve.points[:1], False) if shorter else curve
 
     out = tmp_path / "chart"
     problem, about = problem_of_scene("sparse-picture", 32, 0)
     path = tmp_path / "chart.json"
-    arguments = {"budget_s": 100.0, "told": lambda *_: None}
+    arguments = {"budget_s": 100.0, "on_progress": lambda *_: None}
     monkeypatch.setattr(job, "in_own_process", cut)
     assert run("--scene", "sparse-picture", "--size", 32, "--out", out).exit_code == 0
     data = job.make_chart(problem, about, path, **arguments)
@@ -155,15 +156,15 @@ def test_mistakes_are_named(arguments, said, tmp_path):
 
 
 def test_a_setting_runs_in_a_process_of_its_own():
-    from instrument.evaluation.chart_job import in_own_process
+    from instrument.evaluation.chart import in_own_process
     from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    found = in_own_process(problem, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    found = in_own_process(problem, Setting("wiener", "convolution", "none"), 20.0)
     assert not isinstance(found, str)
     assert found.points[0].peak_mib < 500
     assert found.finished
-    refused = in_own_process(problem, recon_chart.Setting("admm", "convolution", "tv-haar"), 20.0)
+    refused = in_own_process(problem, Setting("admm", "convolution", "tv-haar"), 20.0)
     assert isinstance(refused, str)
 
 
@@ -171,7 +172,7 @@ def test_memory_taken_aside_does_not_count():
     # In a process of its own: what this one has freed before would be taken again, and not count as taken.
     program = """
 import numpy as np
-from instrument.evaluation.chart_job import MemoryMeter
+from instrument.evaluation.chart import MemoryMeter
 meter = MemoryMeter()
 own = np.ones(6 << 20)  # 48 MiB
 with meter.aside():
@@ -187,7 +188,7 @@ print(meter.peak_mib())
 
 @pytest.mark.usefixtures("quick")
 def test_holograms_are_charted(monkeypatch, tmp_path):
-    import instrument.evaluation.chart_job as job
+    import instrument.evaluation.chart as job
 
     def here(problem, setting, limit_s):
         if setting.frames == 2:
@@ -215,7 +216,7 @@ def test_holograms_are_charted(monkeypatch, tmp_path):
 def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
     import multiprocessing
 
-    from instrument.evaluation import chart_job as process
+    from instrument.evaluation import chart as process
 
     ended = []
     waited = SimpleNamespace(join=lambda: ended.append("parent is gone"))
@@ -228,7 +229,7 @@ def test_a_setting_ends_when_the_program_was_killed(monkeypatch):
 def test_ctrl_c_is_not_the_servers_and_not_lost(monkeypatch):
     import signal
 
-    from instrument.evaluation import chart_job as process
+    from instrument.evaluation import chart as process
 
     masks = []
     blocked = lambda: masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))  # noqa: E731
@@ -326,12 +327,12 @@ def test_photographs_that_do_not_fit_together_are_refused(few, tmp_path):
 
 
 def test_what_ends_a_setting_is_told_in_its_row():
-    from instrument.evaluation.chart_job import in_own_process
+    from instrument.evaluation.chart import in_own_process
     from instrument.evaluation.chart_problems import problem_of_scene
 
     problem, _ = problem_of_scene("sparse-picture", 32, 0)
-    broken = replace(problem, measurement=None)
-    found = in_own_process(broken, recon_chart.Setting("wiener", "convolution", "none"), 20.0)
+    broken = replace(problem, calibration=None)
+    found = in_own_process(broken, Setting("wiener", "convolution", "none"), 20.0)
     assert isinstance(found, str)
     assert "Error" in found
     assert "status" not in found
@@ -369,7 +370,7 @@ def test_whether_a_setting_is_even_with_the_best_is_said(capsys, names, said):
 
 
 def test_own_calibrations_are_compared(own, monkeypatch, tmp_path):
-    import instrument.evaluation.chart_job as job
+    import instrument.evaluation.chart as job
     import recon.evaluation.own_calibrations as module
 
     monkeypatch.setattr(module, "ITERATIONS", 3)
@@ -432,7 +433,7 @@ def test_a_damaged_chart_is_refused_by_name(quick, tmp_path, content):
 
 
 def test_settings_of_older_charts_have_their_names_of_now():
-    from instrument.evaluation.chart_job import _renamed
+    from instrument.evaluation.chart import _renamed
 
     assert _renamed("volume local tv background") == "admm local tv background"
     assert _renamed("admm-gpu convolution l1") == "admm convolution l1 gpu"

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from instrument.bench.config_file import default_text, parse_config
-from instrument.bench.display_setup import bench_display
 from instrument.cli import main
-from instrument.display.hologram_job import prepare_target
+from instrument.display.hologram import bench_display, prepare_target
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image, write_image
 from instrument.files.sample_images import SAMPLES, load_sample

@@ -13,7 +13,7 @@ import typer
 from instrument.cli.app import App
 from instrument.cli.options import Given, Only
 from instrument.files.errors import BenchError
-from recon.base.declare import RARE, identity, option
+from recon.base.declare import RARE, identity, option, require, with_overrides
 from recon.errors import InputError
 
 KINDS = ["plain", "fancy"]
@@ -146,6 +146,37 @@ def test_all_mistakes_are_told_at_once_with_their_flags_and_the_units_that_peopl
         run("in.tif", "-o", "x", "--z-mm", "nan")
     with pytest.raises(InputError, match="not liked"):
         run("in.tif", "-o", "x", "--count", "8")
+
+
+def test_messages_name_the_flag_that_was_typed() -> None:
+    with pytest.raises(BenchError, match="--sort must be one of plain, fancy, not 'x'"):
+        run("in.tif", "-o", "x", "--sort=x")
+    given = run("in.tif", "-o", "x", "--sort", "fancy")[3]
+    assert given.flags("kind") == ["--sort"]
+    assert run("in.tif", "-o", "x", "--kind", "fancy")[3].flags("kind") == ["--kind"]
+
+
+def test_an_old_name_is_answered_in_python_with_the_new_one() -> None:
+    with pytest.raises(InputError, match=r"has no option 'sort'\. It is called 'kind'"):
+        with_overrides(Main(), {"sort": "fancy"})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"kind": 5}, "kind must be one of plain, fancy, not 5"),
+        ({"level": [1.0]}, r"level must be auto, the name of a file or a number, not \[1.0\]"),
+        ({"count": "3"}, "count must be a whole number, 1 or more, 9 or less, not '3'"),
+        ({"rare": 1}, "rare must be True or False, not 1"),
+        ({"background": "yes"}, "background must be True or False, not 'yes'"),
+        ({"centre": (1.0, 2.0, 3.0)}, r"centre must be 2 values, not \(1.0, 2.0, 3.0\)"),
+        ({"depths": 3.0}, "depths must be several values, not 3.0"),
+        ({"way": 2}, "way must be one of left, right, not 2"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_in_words(wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        require(with_overrides(Main(), wrong))
 
 
 def test_what_does_not_apply_is_refused_from_its_declaration() -> None:

@@ -10,13 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from instrument.cli.stability import app
-from instrument.evaluation.stability_figure import ticks_of
+from instrument.evaluation.figures import ticks_of
 from instrument.files.errors import BenchError, FileError
 from instrument.files.stability_file import CellLog, read_stability
 from recon.evaluation import maps
 from recon.evaluation.maps import run_map
-from recon.verdict.failure import Failure
-from recon.verdict.map import Axis, StressMap, Trial
+from recon.verdict.map import Axis, Failure, StressMap, Trial
 
 CALLS: list[tuple[str, float, float]] = []
 

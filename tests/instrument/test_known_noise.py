@@ -7,8 +7,7 @@ from instrument.bench.bench import open_bench
 from instrument.bench.config_file import load_config
 from instrument.cli import main
 from instrument.files.images import ImageFile, read_image, write_image
-from instrument.reconstruction.job import Job
-from instrument.reconstruction.record import noise_of
+from instrument.reconstruction.job import Job, noise_of
 from recon import Calibration, NoiseModel
 
 FACTS = {"noise": {"read_noise_counts": 3.0, "counts_per_electron": 0.2}}

@@ -12,7 +12,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
 from instrument.reconstruction.mosaic import mosaic_named, mosaic_of, reduce_mosaic, require_mosaic
 from instrument.reconstruction.preparation import Crop
-from recon.camera.bayer import PATTERNS
+from recon.camera.factors import PATTERNS
 from recon.errors import InputError
 
 HEIGHT, WIDTH = 36, 48

@@ -12,7 +12,6 @@ import pytest
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import ImageFile, write_image
-from instrument.reconstruction.erasures import erasures_of, reduce_valid
 from instrument.reconstruction.job import find_calibration, job_from_calibration, job_from_files
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import (
@@ -22,7 +21,9 @@ from instrument.reconstruction.preparation import (
     check_pair,
     check_psf,
     dark_from_corners,
+    erasures_of,
     reduce,
+    reduce_valid,
     saturated_pixels,
 )
 from recon.errors import InputError

@@ -12,8 +12,7 @@ from instrument.files.errors import BenchError
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.request import PictureRequest, VolumeRequest
 from recon.errors import InputError
-from recon.reconstruction.options import ReconstructionOptions
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides, ReconstructionOptions
 
 SIZE = 48
 

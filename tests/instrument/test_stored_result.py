@@ -11,11 +11,9 @@ import tifffile
 from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.files.images import write_image
-from instrument.files.volume_source import open_volume, volume_in_memory
-from instrument.files.volume_zarr import write_volume_zarr
-from instrument.reconstruction.result_list import find_results, free_result
-from instrument.reconstruction.stored_result import open_result, record_file
-from instrument.reconstruction.volume_views import in_colour_of_depth, project
+from instrument.files.volumes import open_volume, volume_in_memory, write_volume_zarr
+from instrument.reconstruction.result_figures import in_colour_of_depth, project
+from instrument.reconstruction.stored_result import find_results, free_result, open_result, record_file
 from recon.reconstruction.result import Grid
 
 SHAPE = (5, 40, 30)
@@ -65,7 +63,7 @@ def test_a_tiff_in_one_piece_is_mapped_not_read(tmp_path, volume, monkeypatch):
 
 
 def test_side_views_of_large_planes_come_from_a_coarser_level(tmp_path, monkeypatch):
-    monkeypatch.setattr("instrument.files.volume_source._SIDE_PIXELS", 128 * 128)
+    monkeypatch.setattr("instrument.files.volumes._SIDE_PIXELS", 128 * 128)
     voxels = np.random.default_rng(1).random((2, 256, 256), np.float32)
     write_volume_zarr(tmp_path / "v.ome.zarr", voxels, UNKNOWN, {})
     source = open_volume(tmp_path / "v.ome.zarr")
@@ -203,7 +201,7 @@ def test_export_command_takes_results_too(tmp_path, volume, capsys):
     said = capsys.readouterr().err
     assert "a volume is exported as .tif" in said
     assert "exists already" in said
-    assert "are for runs" in said
+    assert "--label (for a run)" in said
 
 
 def test_results_of_a_folder_are_listed_newest_first(tmp_path):

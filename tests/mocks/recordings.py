@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.frame import FrameMetadata
 from instrument.plan import Plan
-from instrument.runs.frame_record import Gap
+from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 

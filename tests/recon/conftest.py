@@ -91,7 +91,7 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
     """
 
     def draw(x_name: str, x: Sequence[float], y_name: str, rows: Mapping[object, Sequence[float]]) -> str:
-        from instrument.evaluation.stability_figure import map_figure
+        from instrument.evaluation.figures import map_figure
         from instrument.files.figures import save_figure
 
         axes = Axis(x_name, x_name, "", tuple(x), ()), Axis(y_name, y_name, "", tuple(range(len(rows))), ())

@@ -8,7 +8,7 @@ import pytest
 from recon import InputError, reconstruct
 from recon.base.metrics import psnr
 from recon.base.noise import estimate_deviation
-from recon.camera.bayer import PATTERNS, interpolate_bayer, split_bayer
+from recon.camera.factors import PATTERNS, interpolate_bayer, split_bayer
 
 
 def mosaic(image, pattern):

@@ -10,8 +10,8 @@ from recon.base.metrics import psnr
 from recon.camera.base import estimate_norm
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.patterned import PatternedCamera
-from recon.reconstruction.problem import window_of
+from recon.camera.factors import PatternedCamera
+from recon.reconstruction.result import window_of
 
 SHAPE = (24, 30)
 

@@ -12,7 +12,7 @@ import recon
 from recon.errors import InputError
 from recon.evaluation.scene import make_scene
 from recon.reconstruction import solvers as offered
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 from recon.reconstruction.solvers import SOLVERS
 from recon.solvers.douglas_rachford import DouglasRachford

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import recon
-from recon.camera.camera_model import Depths, sort_by_depth
-from recon.camera.light import LEAST_GAIN, levelled
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.camera.camera_model import LEAST_GAIN, Depths, levelled, sort_by_depth
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
 

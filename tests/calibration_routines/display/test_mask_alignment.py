@@ -15,9 +15,8 @@ from calibration_routines.display.slm_calibration import measure_flatness, measu
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import display_text, parse_config
-from instrument.bench.display_setup import bench_display
 from instrument.cli import main
-from instrument.files.alignment_file import load_alignment
+from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.images import write_image
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, phase_levels
 from recon.errors import InputError

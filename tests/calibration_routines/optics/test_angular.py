@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from calibration_routines.optics.angular import (
+    AngularProcedure,
     AngularSweep,
     check_angular,
     farthest_um,
-    measure_angular_response,
 )
 from calibration_routines.optics.angular_response import AngularResponse, Curve, load_response
 from drivers.simulated.world import SimulatedWorld
@@ -22,6 +22,7 @@ from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.runs.runner import RunStatus
 from recon.optics.fall_off import gaussian_fall_off
+from tests.mocks.listeners import Following
 
 TINY = """
 [camera]
@@ -52,7 +53,9 @@ def bench() -> Iterator[Bench]:
 
 
 def test_the_response_and_its_cut_offs_are_the_sensors(bench: Bench, tmp_path: Path) -> None:
-    response, file = measure_angular_response(bench, AngularSweep(150e3, 14.0, 2.0, average=2), tmp_path)
+    done = AngularProcedure(AngularSweep(150e3, 14.0, 2.0, average=2)).carry_out(bench, tmp_path)
+    response, file = done.result, done.files[0]
+    assert isinstance(response, AngularResponse)
     world = bench.shared["simulated"]
     assert isinstance(world, SimulatedWorld)
     assert response.findings == ()
@@ -81,7 +84,9 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_response(
             raise Cut
 
     with pytest.raises(Cut):
-        measure_angular_response(bench, AngularSweep(150e3, 12.0, 3.0, average=1), tmp_path, on_progress=cut)
+        AngularProcedure(AngularSweep(150e3, 12.0, 3.0, average=1)).carry_out(
+            bench, tmp_path, listener=Following(cut)
+        )
     (run,) = tmp_path.iterdir()
     bench.close()
     assert main(["resume", str(run)]) == 0
@@ -93,7 +98,8 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_response(
 def test_angles_from_which_no_light_meets_the_sensor_are_left_out(bench: Bench, tmp_path: Path) -> None:
     """The sweep as it is without options: far more angles than the sensor sees."""
     sweep = AngularSweep(farthest_um(bench, 45.0), 45.0, 5.0, average=1, dark_frames=1)
-    response, _ = measure_angular_response(bench, sweep, tmp_path)
+    response = AngularProcedure(sweep).carry_out(bench, tmp_path).result
+    assert isinstance(response, AngularResponse)
     for curve in (response.along_x, response.along_y):
         assert len(curve.angles_deg) >= 4
         assert max(np.abs(curve.angles_deg)) < 30

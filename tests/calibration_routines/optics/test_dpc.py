@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration_routines.optics.dpc import DpcSetup, dpc_optics, measure_diffuser
+from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSetup, dpc_optics
 from drivers.simulated.led_microscope import LedMicroscopeWorld, led_image
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import led_microscope_text, parse_config
@@ -27,6 +27,7 @@ from recon.analysis.dpc import (
     transfer,
 )
 from recon.errors import InputError
+from tests.mocks.listeners import Following
 
 SETUP = DpcSetup(objective_na=0.1, magnification=4.0)
 SMALL = led_microscope_text().replace("pixels = 384", "pixels = 160")
@@ -38,7 +39,9 @@ def small_bench(text: str = SMALL) -> Bench:
 
 def test_height_and_slopes_are_the_diffusers(tmp_path: Path) -> None:
     with small_bench() as bench:
-        surface, file = measure_diffuser(bench, SETUP, tmp_path)
+        done = DpcProcedure(SETUP).carry_out(bench, tmp_path)
+        surface, file = done.result, done.files[0]
+        assert isinstance(surface, DiffuserSurface)
         world = bench.shared["simulated_led_microscope"]
         assert isinstance(world, LedMicroscopeWorld)
         assert bench.led_array is not None
@@ -67,8 +70,9 @@ def test_a_run_that_was_cut_off_is_resumed_to_its_surface(
         if status.done == 9:
             raise Cut
 
+    procedure = DpcProcedure(replace(SETUP, average=2, dark_frames=2))
     with small_bench() as bench, pytest.raises(Cut):
-        measure_diffuser(bench, replace(SETUP, average=2, dark_frames=2), tmp_path, on_progress=cut)
+        procedure.carry_out(bench, tmp_path, listener=Following(cut))
     (run,) = tmp_path.iterdir()
     assert main(["resume", str(run)]) == 0
     said = capsys.readouterr().out

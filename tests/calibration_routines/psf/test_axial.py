@@ -22,11 +22,11 @@ from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
-from instrument.files.errors import BenchError
-from instrument.plan import PlanError
+from instrument.files.errors import BenchError, SettingsError
 from instrument.runs.run import RunCondition
 from instrument.runs.runner import RunStatus
 from recon.types import Geometry
+from tests.mocks.listeners import Following
 
 TINY = """
 [camera]
@@ -43,7 +43,8 @@ control = "simulated"
 preset = "tiny"
 time_scale = 0
 """
-SWEEP = AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=5, average=2, dark_frames=2)
+ASKED = AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=5, average=2, dark_frames=2)
+SWEEP = ASKED.points()
 
 
 @pytest.fixture
@@ -115,16 +116,16 @@ def test_psfs_match_the_light_that_fell_on_the_sensor(bench: Bench, tmp_path: Pa
 
 
 def test_a_source_that_slipped_is_found_and_the_plane_taken_again(bench: Bench, tmp_path: Path) -> None:
-    watch = slip_at(bench, SWEEP.z_um[2], 1000.0)
-    done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=watch, on_event=carried_again(bench))
+    watch = slip_at(bench, ASKED.z_um[2], 1000.0)
+    done = calibrate_sweep(bench, SWEEP, tmp_path, listener=Following(watch, carried_again(bench)))
     assert [len(run.steps("psf")) for run in done.runs] == [10, 2]
     assert done.findings == ()
 
 
 def test_without_retakes_the_slip_is_reported(bench: Bench, tmp_path: Path) -> None:
-    watch = slip_at(bench, SWEEP.z_um[2], 1000.0)
+    watch = slip_at(bench, ASKED.z_um[2], 1000.0)
     once = replace(SWEEP, retakes=0)
-    done = calibrate_sweep(bench, once, tmp_path, on_progress=watch, on_event=carried_again(bench))
+    done = calibrate_sweep(bench, once, tmp_path, listener=Following(watch, carried_again(bench)))
     assert len(done.findings) == 1
     assert "z = 85.71 mm: the pattern lies" in done.findings[0]
     assert load_calibration(done.path).quality["good"] is False
@@ -154,7 +155,7 @@ def test_a_source_too_weak_for_the_camera_is_refused_in_words(tmp_path: Path) ->
 
 def test_planes_out_of_reach_are_refused_before_anything_moves(bench: Bench, tmp_path: Path) -> None:
     before = bench.source_position_um
-    with pytest.raises(PlanError, match="outside the stage's limits"):
+    with pytest.raises(SettingsError, match="outside the stage's limits"):
         calibrate_sweep(bench, AxialSweep(z_min_um=60e3, z_max_um=900e3, planes=3), tmp_path)
     assert bench.source_position_um == before
     assert list(tmp_path.iterdir()) == []
@@ -181,7 +182,7 @@ def test_a_bench_without_a_stage_takes_one_psf_by_hand(tmp_path: Path) -> None:
 )
 def test_senseless_sweeps_are_refused(wrong: dict[str, float], message: str) -> None:
     with pytest.raises(BenchError, match=message):
-        replace(SWEEP, **wrong)
+        replace(ASKED, **wrong)
 
 
 def test_the_plan_counts_its_frames() -> None:

@@ -28,20 +28,21 @@ from calibration_routines import (
 )
 from calibration_routines.psf.analysis import feature_size_px, optical_binning
 from calibration_routines.psf.stage_fit import fit_stage, judge_drift
-from calibration_routines.psf.sweep_record import read_retakes
+from calibration_routines.psf.sweep import Retake, read_retakes
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import prepare_resume
 from instrument.runs.run import FinishReason, RunCondition
-from instrument.runs.runner import Runner, RunStatus
+from instrument.runs.runner import RunStatus
 from recon import reconstruct
 from recon.base import metrics
 from recon.camera.camera_model import ModelName
 from recon.optics.fall_off import gaussian_fall_off, no_fall_off
 from recon.types import Geometry
+from tests.mocks.listeners import Following, KeepingControl
 
 TINY = """
 [camera]
@@ -147,7 +148,7 @@ def test_a_point_where_the_stage_slipped_is_taken_again_at_once(bench: Bench, tm
         events.append(event)
         world.carry_source(carrier)
 
-    done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=slip, on_event=hear)
+    done = calibrate_sweep(bench, SWEEP, tmp_path, listener=Following(slip, hear))
     assert [len(run.steps("psf")) for run in done.runs] == [18, 2]
     assert done.findings == ()
     visits = [e for e in events if isinstance(e, SourceVisit)]
@@ -169,7 +170,7 @@ def test_a_point_where_the_stage_slipped_is_taken_again_at_once(bench: Bench, tm
     assert all(p.quality.findings == () for p in points if not p.retaking)
     assert all(p.quality.snr > 20 and p.image.shape == (120, 160) for p in points)
     # a crash after the retake would not lose it: the folder says where it is
-    assert read_retakes(done.runs[0].path) == [(POINTS[5], done.runs[1].path.name)]
+    assert read_retakes(done.runs[0].path) == [Retake(POINTS[5], done.runs[1].path.name)]
 
 
 def test_retakes_are_bounded_and_a_point_that_stays_bad_is_flagged(bench: Bench, tmp_path: Path) -> None:
@@ -182,26 +183,28 @@ def test_retakes_are_bounded_and_a_point_that_stays_bad_is_flagged(bench: Bench,
         return (x + 2000.0, y, z) if here == pytest.approx((x, y, z), abs=1.0) else here
 
     world.carry_source(where)
-    runners: list[Runner] = []
-    done = calibrate_sweep(bench, replace(SWEEP, retakes=2), tmp_path, on_runner=runners.append)
+    control = KeepingControl()
+    done = calibrate_sweep(bench, replace(SWEEP, retakes=2), tmp_path, control=control)
     assert [len(run.steps("psf")) for run in done.runs] == [18, 2, 2]
     assert [q.source_um for q in done.quality if q.retake] == [POINTS[5]]
     assert any("beside where the stage says" in finding for finding in done.findings)
-    assert [runner.path for runner in runners] == [done.runs[0].path]
+    assert [runner.path for runner in control.runners] == [done.runs[0].path]
 
 
 def test_stop_during_a_retake_stops_the_sweep(bench: Bench, tmp_path: Path) -> None:
-    runners: list[Runner] = []
+    control = KeepingControl()
     found = expose_sweep(bench, SWEEP)
     too_long = replace(found, exposures_ms=tuple(1.6 * e for e in found.exposures_ms))
 
     def hear(event: SweepEvent) -> None:
         if isinstance(event, PointTaken) and event.retaking:
-            Thread(target=runners[0].stop).start()
+            Thread(target=control.runners[0].stop).start()
 
     with pytest.raises(CalibrationError, match="ended early"):
-        calibrate_sweep(bench, SWEEP, tmp_path, exposures=too_long, on_event=hear, on_runner=runners.append)
-    assert runners[0].status.reason is FinishReason.STOPPED
+        calibrate_sweep(
+            bench, SWEEP, tmp_path, exposures=too_long, control=control, listener=Following(on_event=hear)
+        )
+    assert control.runners[0].status.reason is FinishReason.STOPPED
     assert bench.led_array is not None
     assert bench.led_array.pattern.is_dark
 
@@ -216,7 +219,7 @@ def test_a_drift_of_brightness_is_taken_out_of_the_psfs(bench: Bench, tmp_path: 
         left = 1.0 - 0.12 * status.done / status.total
         world.options = options.model_copy(update={"source_brightness": left})
 
-    done = calibrate_sweep(bench, SWEEP, tmp_path / "drift", exposures=exposures, on_progress=dim)
+    done = calibrate_sweep(bench, SWEEP, tmp_path / "drift", exposures=exposures, listener=Following(dim))
     light = done.calibration.psfs.sum(axis=(1, 2, 3))
     assert done.findings == ()
     assert done.calibration.quality["drift"]["corrected"] is True
@@ -236,7 +239,7 @@ def test_a_source_that_dims_and_a_wrong_distance_are_reported(tmp_path: Path) ->
                 red, green, blue = world.emission
                 world.set_emission((red, 0.8 * green, blue))
 
-        done = calibrate_sweep(bench, SWEEP, tmp_path, on_progress=watch)
+        done = calibrate_sweep(bench, SWEEP, tmp_path, listener=Following(watch))
     assert any("moves 6" in finding and "too little for d/z" in finding for finding in done.findings)
     # only the second half of the frames of point 7 are dim: the LED is set anew for the next point
     assert load_calibration(done.path).quality["good"] is False
@@ -276,14 +279,14 @@ def test_a_sweep_that_was_cut_off_is_resumed_and_becomes_a_calibration(bench: Be
             raise Cut
 
     with pytest.raises(Cut):
-        calibrate_sweep(bench, SWEEP, tmp_path, on_progress=cut)
+        calibrate_sweep(bench, SWEEP, tmp_path, listener=Following(cut))
     (run,) = tmp_path.iterdir()
     with pytest.raises(CalibrationError, match="ended early"):
         finish_sweep(run)
     runner, findings = prepare_resume(bench, run)
     assert findings.stored >= 9
     events: list[SweepEvent] = []
-    watch_resumed(bench, runner, events.append)
+    watch_resumed(bench, runner, Following(on_event=events.append))
     assert runner.execute().condition is RunCondition.COMPLETED
     done = finish_sweep(run, bench)
     assert done.findings == ()
@@ -358,7 +361,7 @@ def test_points_on_a_line_are_held_against_the_stage_too(bench: Bench, tmp_path:
         world.carry_source((lambda: (8e3, 0.0, Z_UM)) if here else carrier)
 
     sweep = replace(SWEEP, points_um=line, retakes=0)
-    done = calibrate_sweep(bench, sweep, tmp_path, on_progress=slip)
+    done = calibrate_sweep(bench, sweep, tmp_path, listener=Following(slip))
     (stage,) = done.stages
     assert stage.gain_error == pytest.approx(0, abs=5e-3)
     assert [q.source_um for q in done.quality if q.retake] == [line[3]]

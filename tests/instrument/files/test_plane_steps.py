@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from instrument.files.volume_zarr import middle_step_um, uneven_steps
+from instrument.files.volumes import middle_step_um, uneven_steps
 
 
 @pytest.mark.parametrize(

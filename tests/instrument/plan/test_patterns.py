@@ -14,7 +14,6 @@ from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.cli import main
 from instrument.plan import Light, Part, Plan, PlanError, check
-from instrument.plan.file import load_plan, save_plan
 from instrument.plan.led_shapes import (
     Annulus,
     BrightField,
@@ -25,6 +24,7 @@ from instrument.plan.led_shapes import (
     LedShape,
     Single,
 )
+from instrument.plan.model import load_plan, save_plan
 from instrument.plan.patterns import LED_PATTERNS, led_shape, shape_buttons, shape_from_text, shape_text
 from instrument.runs.acquire import abilities_of, acquire
 from instrument.runs.run import Run

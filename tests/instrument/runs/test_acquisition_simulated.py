@@ -12,12 +12,11 @@ from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import OFF, SOURCE, Part, Plan, SourceGrid
-from instrument.runs.acquire import acquire, prepare
+from instrument.runs.acquire import acquire, prepare, prepare_resume
+from instrument.runs.inspection import verify
 from instrument.runs.recorder import record
-from instrument.runs.resume import prepare_resume
 from instrument.runs.run import Run, RunCondition
 from instrument.runs.runner import RunStatus
-from instrument.runs.verification import verify
 
 BENCH = """
 [bench]

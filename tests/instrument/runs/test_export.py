@@ -17,7 +17,7 @@ from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.plan import Part, Plan
 from instrument.runs.export import export
-from instrument.runs.frame_record import Gap
+from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run, RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 

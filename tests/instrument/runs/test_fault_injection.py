@@ -15,10 +15,9 @@ from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.bench.safety import StepsFailedError
 from instrument.plan import Part, Plan
-from instrument.runs.acquire import prepare
-from instrument.runs.resume import prepare_resume
+from instrument.runs.acquire import prepare, prepare_resume
+from instrument.runs.inspection import verify
 from instrument.runs.run import Run, RunCondition, RunError
-from instrument.runs.verification import verify
 from tests.mocks.devices import MockDevice, MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers")

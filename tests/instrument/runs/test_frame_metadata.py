@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import drivers.simulated.camera
-import instrument.runs.frame_record
-import instrument.runs.snapshot
+import instrument.bench.photograph
+import instrument.runs.log
 from drivers.frame import FrameMetadata, filled_in_by_bench, over_frames
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
+from instrument.bench.photograph import LightState, read_snapshot, write_snapshot
 from instrument.files.errors import FileError
 from instrument.files.images import read_image, write_image
 from instrument.plan import OFF, Light, Part, Plan, PlanError, SourceGrid
 from instrument.runs.acquire import acquire
 from instrument.runs.recorder import record
 from instrument.runs.run import LOG, PLAN, PROVENANCE, STATE, Run
-from instrument.runs.snapshot import LightState, read_snapshot, write_snapshot
 
 BENCH = """
 [bench]
@@ -57,7 +57,7 @@ class Warmer(FrameMetadata):
 @pytest.fixture
 def later_reader(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read with the later version's declaration."""
-    for module in (instrument.runs.frame_record, instrument.runs.snapshot):
+    for module in (instrument.runs.log, instrument.bench.photograph):
         monkeypatch.setattr(module, "FrameMetadata", Warmer)
 
 

@@ -12,8 +12,7 @@ from drivers.errors import DeviceError
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import Part, Plan, PlanError, SourcePoints, StagePoints
-from instrument.runs.acquire import prepare
-from instrument.runs.resume import inspect, prepare_resume
+from instrument.runs.acquire import inspect, prepare, prepare_resume
 from instrument.runs.run import FinishReason, Run, RunCondition, RunError
 from instrument.runs.runner import RunStatus
 from instrument.runs.writer import RunWriter

@@ -124,7 +124,7 @@ def test_stop_does_not_wait_for_the_exposure(here: Path) -> None:
 import threading
 from instrument.runs.acquire import prepare
 from instrument.bench.bench import open_bench
-from instrument.plan.file import load_plan
+from instrument.plan.model import load_plan
 from drivers.errors import StoppedError
 ended = threading.Event()
 started = threading.Event()

@@ -13,8 +13,9 @@ import zarr
 from ome_zarr_models.v05 import Image
 
 from drivers.frame import FrameMetadata
+from instrument.files.atomic import write_json
 from instrument.plan import Part, Plan
-from instrument.runs.durable import AppendOnlyLog, read_lines, write_json
+from instrument.runs.log import AppendOnlyLog, read_lines
 from instrument.runs.run import FinishReason, Run, RunCondition, RunError
 from instrument.runs.writer import BenchRecord, FrameToStore, RunWriter
 

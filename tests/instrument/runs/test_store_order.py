@@ -127,7 +127,7 @@ def test_the_test_above_can_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     disk = HonestDisk(root, monkeypatch)
     plan = Plan(label="order", parts=(Part(label="a"),))
     with RunWriter.create(root, label="order", bench=BENCH, plan=plan) as writer:
-        monkeypatch.setattr("instrument.runs.durable.SyncPool.folders", lambda *_: None)
+        monkeypatch.setattr("instrument.runs.frame_array.SyncPool.folders", lambda *_: None)
         writer.write([FrameToStore(0, np.zeros((4, 5), np.uint8), METADATA)])
     (run,) = (p for p in disk.after_power_cut(tmp_path / "copy").iterdir() if p.name[0] != ".")
     try:

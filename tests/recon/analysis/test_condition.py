@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from recon.analysis.condition import Voxel, condition_curve, condition_number, gram_matrix, group
+from recon.analysis.gram import Voxel, WindowProblem, condition_curve, condition_number, gram_matrix, group
 from recon.analysis.points import smallest_dip
-from recon.analysis.window import WindowProblem
 from recon.errors import InputError
 
 

@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.analysis.correlation import autocorrelate, correlate, critical_scale, similarity
-from recon.analysis.field import FieldPoint, convolution_holds_deg, field_of_view
+from recon.analysis.correlation import (
+    FieldPoint,
+    autocorrelate,
+    convolution_holds_deg,
+    correlate,
+    critical_scale,
+    field_of_view,
+    similarity,
+)
 from recon.analysis.resolution import (
     AxialResolution,
     axial_resolution,

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +12,14 @@ import pytest
 import recon
 from recon import InputError
 from recon.base.blocks import block_mean, enlarged
+from recon.camera.camera_model import CAMERAS, OfferedCamera
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.planes import put_back
-from recon.reconstruction.precision import drift, precision_of
 from recon.reconstruction.reduction import reduced_calibration
-from recon.solvers.stopping import StopReason
+from recon.reconstruction.rules import drift, precision_of
+from recon.solvers.base import StopReason
 
 solving = sys.modules[recon.solve.__module__]
 
@@ -231,7 +233,7 @@ def test_float32_gives_way_where_the_map_says_so(monkeypatch):
         "y": {"values": [32, 64]},
         "methods": {"admm tv": {"error": [[1e-4, 1e-3], [1e-3, 1e-2]]}},
     }}  # fmt: skip
-    monkeypatch.setattr("recon.reconstruction.precision.shipped_maps", lambda: rough)
+    monkeypatch.setattr("recon.reconstruction.rules.shipped_maps", lambda: rough)
     assert drift(1000, 64) > 5 * drift(100, 64)
     assert precision_of(Overrides(), 1000, 64).value == "float64"
     assert precision_of(Overrides(precision="float32"), 1000, 64).value == "float32"
@@ -407,56 +409,102 @@ class Kept:
         self.parts.add(part)
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"solver": "fista", "prior": "tv-haar"},
-        {"solver": "admm-sensor"},
-        {"solver": "wiener"},
-        {"prior": "none"},
-        {"precision": "float64"},
-        {"keeper": True},
-        {"warm": True},
-        {"memory_gib": 1.0},
-    ],
-)
-def test_nothing_switches_the_choice_off_for_a_picture(asked):
-    scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0)
-    limit = {} if asked.get("solver") == "wiener" else {"iterations": 3}
-    keeper = Kept() if asked.pop("keeper", False) else None
-    warm = None
-    if asked.pop("warm", False):
-        warm = recon.reconstruct(scene.measurement, scene.calibration, iterations=40, judged=False)
+# Another module than numpy, with its functions: what a GPU's is to the code.
+TWIN = types.ModuleType("twin")
+TWIN.__dict__.update({k: v for k, v in np.__dict__.items() if not k.startswith("__")})
+SAME_FOR_ALL = {
+    "checkpoint": {"keeper": True},
+    "float64": {"precision": "float64"},
+    "memory limit": {"memory_gib": 1.0},
+    "scratch files": {"scratch": "."},
+    "start": {"warm": True},
+    "device": {"device": "gpu"},
+    "end": {"iterations": 3, "tolerance": 0.0, "time_s": 60.0},
+    "end at the noise": {"stop_at_noise": True},
+}
+
+
+@pytest.fixture
+def a_gpu(monkeypatch):
+    """Arrays of another module, as on a GPU, with no memory of its own to ask for."""
+    monkeypatch.setattr("recon.reconstruction.part.array_namespace", lambda d: np if d == "cpu" else TWIN)
+    for module in ("volume_admm", "douglas_rachford"):
+        monkeypatch.setattr(f"recon.solvers.{module}.require_memory", lambda *_: None)
+
+
+def solved(scene, warm, asked):
+    """Reconstruct in a few iterations as asked; also return what was kept."""
+    keeper = Kept() if asked.get("keeper") else None
+    given = {name: value for name, value in asked.items() if name not in ("keeper", "warm")}
+    if asked.get("solver") != "wiener":
+        given = {"iterations": 3} | given
     result = recon.reconstruct(
-        scene.measurement, scene.calibration, **limit, **asked, keeper=keeper, warm=warm, judged=False
-    )
+        scene.measurement, scene.calibration, **given, judged=False, keeper=keeper,
+        warm=warm if asked.get("warm") else None,
+    )  # fmt: skip
     assert result.choice is not None
+    assert result.choice.precision == asked.get("precision", "float32")
+    return result, keeper
+
+
+PICTURE_SOLVERS = {
+    "fista": {"solver": "fista", "prior": "tv-haar"},
+    "admm": {"solver": "admm"},
+    "admm-sensor": {"solver": "admm-sensor"},
+    "wiener": {"solver": "wiener"},
+    "no prior": {"prior": "none"},
+}
+
+
+@pytest.mark.usefixtures("a_gpu")
+@pytest.mark.parametrize("what", [*SAME_FOR_ALL, *PICTURE_SOLVERS])
+def test_nothing_switches_the_choice_off_for_a_picture(what):
+    scene = make_scene("sparse-picture", size=64, spot_px=5.0, photons=1000.0)
+    warm = None
+    if what == "start":
+        warm = recon.reconstruct(scene.measurement, scene.calibration, iterations=40, judged=False)
+    result, keeper = solved(scene, warm, (SAME_FOR_ALL | PICTURE_SOLVERS)[what])
     assert result.choice.binning > 1
     assert result.image.shape == scene.truth.shape
-    assert result.choice.precision == asked.get("precision", "float32")
     if keeper is not None:
-        assert keeper.parts
+        assert keeper.parts == {f"auto-{result.choice.key}"}
     if warm is not None:
-        cold = recon.reconstruct(scene.measurement, scene.calibration, **limit, judged=False)
+        cold = recon.reconstruct(scene.measurement, scene.calibration, iterations=3, judged=False)
         apart, further = (float(np.linalg.norm(r.image - warm.image)) for r in (result, cold))
         assert apart < 0.3 * further
 
 
-@pytest.mark.parametrize(
-    "asked", [{"precision": "float64"}, {"keeper": True}, {"warm": True}, {"scratch": "."}]
-)
-def test_nothing_switches_the_choice_off_for_a_volume(beads, chosen_beads, asked):
-    keeper = Kept() if asked.pop("keeper", False) else None
-    warm = chosen_beads if asked.pop("warm", False) else None
-    result = recon.reconstruct(
-        beads.measurement, beads.calibration, prior="l1", iterations=3, **asked, keeper=keeper, warm=warm,
-        judged=False,
-    )  # fmt: skip
-    assert result.choice is not None
+@pytest.mark.usefixtures("a_gpu")
+@pytest.mark.parametrize("what", [*SAME_FOR_ALL, "solver"])
+def test_nothing_switches_the_choice_off_for_a_volume(beads, chosen_beads, what):
+    asked = SAME_FOR_ALL.get(what, {"solver": "admm"})
+    result, keeper = solved(beads, chosen_beads, asked | {"prior": "l1"})
     assert 1 < len(result.choice.planes) < 6
-    assert result.choice.model == chosen_beads.choice.model
+    if what == "device":  # says why it has one PSF a depth
+        assert "runs on the cpu only" in decision(result.choice, "model").why
+    else:
+        assert result.choice.model == chosen_beads.choice.model
     if keeper is not None:
-        assert "channel-0" in keeper.parts
+        assert f"auto-{result.choice.key}-channel-0" in keeper.parts
+
+
+def test_kept_work_belongs_to_what_was_chosen(chosen_beads):
+    choice = chosen_beads.choice
+    assert replace(choice, seconds=9.0, tolerance=0.0).key == choice.key
+    assert replace(choice, planes=(0, 1)).key != choice.key
+    assert replace(choice, binning=choice.binning + 1).key != choice.key
+
+
+def test_a_camera_model_of_ones_own_that_cannot_be_judged_is_named(beads, monkeypatch):
+    own = OfferedCamera(name="own", help="As the convolution.", make=lambda central, _depths: central)
+    unfit = replace(own, name="unfit", refuses=lambda _: "it is for one depth")
+    monkeypatch.setattr(CAMERAS, "_foreign", {"own": own, "unfit": unfit})
+    why = decision(choose(beads.measurement, beads.calibration, prior="l1"), "model").why
+    assert "left out: own, of which nobody knows what it costs and gains (--model own takes it)" in why
+    taken = choose(beads.measurement, beads.calibration, prior="l1", choose=Overrides(model="own"))
+    assert taken.model == "own"
+    assert decision(taken, "model").overruled
+    assert "left out" not in decision(taken, "model").why
 
 
 def test_a_solver_that_has_no_way_for_varying_psfs_has_one_convolution_and_says_so():

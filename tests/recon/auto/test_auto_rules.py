@@ -9,13 +9,13 @@ import pytest
 
 import recon
 from recon.camera import field_registration
-from recon.camera import registration_cache as remembered
+from recon.camera import field_registration as remembered
 from recon.camera.camera_model import sort_by_depth
 from recon.camera.field_registration import NOT_ON_AXIS
-from recon.camera.local_convolution import FieldOfPsfs
+from recon.camera.varying_psfs import FieldOfPsfs
 from recon.evaluation.chart_judge import score
 from recon.evaluation.scene import make_scene
-from recon.reconstruction.overrides import Overrides
+from recon.reconstruction.options import Overrides
 from recon.reconstruction.part import Part
 
 
@@ -165,4 +165,4 @@ def test_a_picture_is_judged_as_pictures_are_whatever_solves_it():
     volume = make_scene("beads", size=40, depths=3, grid=3, seed=7)
     result = recon.reconstruct(volume.measurement, volume.calibration, iterations=5)
     assert result.verdict is not None
-    assert result.verdict.method == "volume tv"
+    assert result.verdict.method == "admm tv of volumes"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.fft import dctn
 
-from recon.camera.background import BackgroundRemoval
 from recon.camera.convolution3d import Convolution3D
+from recon.camera.factors import BackgroundRemoval
 from recon.priors import L1, NonNegativity
 from recon.solvers import StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford

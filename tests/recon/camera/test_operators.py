@@ -8,7 +8,7 @@ from scipy.signal import convolve2d
 
 from recon.camera.base import LinearOperator, estimate_norm
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.erasures import Erasures
+from recon.camera.factors import Erasures
 
 
 def matrix(operator: LinearOperator) -> np.ndarray:

@@ -7,8 +7,7 @@ import pytest
 
 from drivers.simulated.options import WorldOptions
 from drivers.simulated.world import SimulatedWorld
-from recon.analysis.correlation import similarity
-from recon.analysis.field import across_field
+from recon.analysis.correlation import across_field, similarity
 from recon.camera.refocus import at_depth, central_psfs, paraxial_scale, refocus, refocus_psf, rescaled
 from recon.camera.registration import register
 from recon.errors import InputError

@@ -5,9 +5,13 @@ import pytest
 
 from recon.camera.base import estimate_norm
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.interpolation import interpolation_weights
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
-from recon.camera.low_rank import low_rank, principal_psfs
+from recon.camera.varying_psfs import (
+    FieldOfPsfs,
+    interpolation_weights,
+    local_convolution,
+    low_rank,
+    principal_psfs,
+)
 from recon.errors import InputError
 
 GRID = np.array([(y, x) for y in (-8, 1, 7) for x in (-9, 0, 8)], float)

@@ -13,16 +13,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import griddata
 
+from recon.analysis.gram import WindowProblem
 from recon.analysis.points import Noise, PointGrid, try_points
 from recon.analysis.resolution import axial_resolution
-from recon.analysis.window import WindowProblem
 from recon.evaluation.lenslets import build_camera
+from recon.evaluation.map_trials import local_condition
 from recon.evaluation.maps import map_named
-from recon.evaluation.maps_scene import local_condition
 from recon.evaluation.scene import SceneSpec
 from recon.evaluation.scene_trial import Options, judge_image, run_scene, scene_of, solve
-from recon.verdict.failure import DIP, worst
-from recon.verdict.map import boundary
+from recon.verdict.map import DIP, boundary, worst
 
 if TYPE_CHECKING:
     from tests.recon.conftest import DrawnMap
@@ -154,7 +153,7 @@ BOUNDARIES = [
     ("drift", "admm tv", (1, 3, 5, 8), 0.001, 5.2, 1.5),
     ("depth-error", "admm l1", (2, 4, 6, 9), 3000, 4.6, 1.5),
     ("background", "admm tv", (1, 10, 40), 1000, 19.0, 2.2),
-    ("density-voxels", "volume l1", (0.001, 0.003, 0.01, 0.03), 4, 0.0073, 1.5),
+    ("density-voxels", "admm l1 of volumes", (0.001, 0.003, 0.01, 0.03), 4, 0.0073, 1.5),
     ("mask-moved", "4 mask pixels an SLM pixel", (0.1, 0.25, 0.5, 1), 0.0, 0.32, 1.5),
     ("mask-defocus", "16 mask pixels an SLM pixel", (10, 25, 50, 100), 0.0, 28.0, 1.6),
 ]

@@ -8,9 +8,10 @@ import pytest
 from recon.base.blocks import block_mean
 from recon.errors import InputError
 from recon.evaluation.chart_judge import Judge
-from recon.evaluation.chart_reconstruction import ChartProblem, Setting, left_out, run_setting, settings_for
+from recon.evaluation.chart_reconstruction import ChartProblem
 from recon.evaluation.scene import make_scene
 from recon.evaluation.scored import Point, even_with_best, pareto
+from recon.evaluation.trial import Setting
 from recon.priors import PRIORS
 from recon.reconstruction.reconstruct import reconstruct
 from recon.types import Calibration
@@ -29,7 +30,7 @@ def problem(family="sparse-picture", **changes):
 
 
 def test_scores_come_on_the_way_and_get_better():
-    points = run_setting(problem(), Setting("admm", "convolution", "tv"), counts=(2, 10, 40)).points
+    points = problem().run(Setting("admm", "convolution", "tv"), counts=(2, 10, 40)).points
     assert [p.iterations for p in points] == [2, 10, 40]
     assert points[0].seconds < points[1].seconds < points[2].seconds
     assert points[0].psnr_db < points[2].psnr_db
@@ -48,11 +49,12 @@ def test_held_out_pixels_were_not_looked_at():
     spoilt = whole.measurement.copy()
     spoilt[judge.held] = 1e5
     points = [
-        run_setting(
-            ChartProblem(m, whole.calibration, False, None, 5.0, whole.truth),
+        ChartProblem(m, whole.calibration, False, None, 5.0, whole.truth)
+        .run(
             Setting("admm", "convolution", "tv"),
             counts=(20,),
-        ).points[0]
+        )
+        .points[0]
         for m in (whole.measurement, spoilt)
     ]
     assert points[0].psnr_db == pytest.approx(points[1].psnr_db, abs=1e-3)
@@ -84,16 +86,16 @@ def test_held_out_scores_are_of_the_same_light_at_every_binning(shape, monkeypat
     "setting", [Setting("fista", "convolution", "tv"), Setting("admm", "convolution", "l1", 1, True)]
 )
 def test_a_run_says_whether_time_cut_it_off(setting):
-    assert not run_setting(problem(), setting, limit_s=1e-6, counts=(1, 1000)).finished
-    assert run_setting(problem(), setting, limit_s=1000.0, counts=(1, 2)).finished
+    assert not problem().run(setting, limit_s=1e-6, counts=(1, 1000)).finished
+    assert problem().run(setting, limit_s=1000.0, counts=(1, 2)).finished
 
 
 def test_what_is_not_charted_is_said():
-    said = " ".join(left_out(problem(erased=0.2)))
+    said = " ".join(problem(erased=0.2).left_out())
     assert "erased pixels cannot be averaged" in said
     assert "one PSF a depth" in said
     assert "tv-haar" in said
-    varying = " ".join(left_out(problem("beads", depths=3, grid=3)))
+    varying = " ".join(problem("beads", depths=3, grid=3).left_out())
     assert "one PSF a depth" not in varying
     assert "too few pixels" in varying
     assert "wiener" in varying
@@ -151,19 +153,19 @@ def test_one_bright_pixel_does_not_make_settings_even():
 
 
 def test_settings_fit_the_problem():
-    single = settings_for(problem())
+    single = problem().settings()
     for method in {s.solver for s in single}:
         assert {s.precision for s in single if s.solver == method} == {"float32", "float64"}
     assert {s.prior for s in single if s.solver == "fista"} == set(PRIORS)
     assert not any(s.prior == "tv-haar" for s in single if s.solver != "fista")
     assert {s.model for s in single} == {"convolution"}
     assert single[0].solver == "wiener"
-    varying = settings_for(problem(grid=3))
+    varying = problem(grid=3).settings()
     assert {s.model for s in varying} == {"convolution", "lowrank", "local"}
-    volume = settings_for(problem("beads", depths=3))
+    volume = problem("beads", depths=3).settings()
     assert {s.solver for s in volume} == {"admm"}
     assert len({s.name for s in varying}) == len(varying)
-    assert not any(s.binning > 1 for s in settings_for(problem(erased=0.2)))
+    assert not any(s.binning > 1 for s in problem(erased=0.2).settings())
 
 
 @pytest.mark.parametrize(
@@ -175,7 +177,7 @@ def test_settings_fit_the_problem():
     ],
 )
 def test_kinds_of_settings_run(setting):
-    points = run_setting(problem(grid=3), setting, counts=(3,)).points
+    points = problem(grid=3).run(setting, counts=(3,)).points
     assert len(points) == 1
     assert np.isfinite([points[0].psnr_db, points[0].held_out, points[0].ssim]).all()
 
@@ -206,13 +208,13 @@ def test_precisions_agree(precision, method):
 def test_every_setting_of_a_picture_runs_and_no_other():
     """What the table of methods and priors says is what the solvers take."""
     case = problem()
-    for setting in settings_for(case):
+    for setting in case.settings():
         if setting.is_plain and setting.binning == 1:
-            assert run_setting(case, setting, counts=(1,)).points
+            assert case.run(setting, counts=(1,)).points
     for method in ("admm", "admm-sensor"):
         with pytest.raises(InputError, match="takes the priors"):
             reconstruct(
                 case.measurement, case.calibration, solver=method, model="convolution", prior="tv-haar"
             )
         with pytest.raises(InputError, match="does not apply"):
-            run_setting(case, Setting(method, "convolution", "tv-haar"))
+            case.run(Setting(method, "convolution", "tv-haar"))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.solvers.stopping import IterationRecord, StopReason
-from recon.verdict.failure import (
+from recon.solvers.base import IterationRecord, StopReason
+from recon.verdict.map import (
     WORST,
     Failure,
     bounded,

@@ -7,12 +7,11 @@ import pytest
 
 from recon.camera.convolution import PadCropConvolution
 from recon.errors import InputError
+from recon.evaluation.map_trials import _OffBalance
 from recon.evaluation.maps import MAPS, map_named, run_map
-from recon.evaluation.maps_solver import _OffBalance
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.verdict.failure import Failure
-from recon.verdict.map import Axis, Cell, StressMap, Trial, boundary, severity_grid
+from recon.verdict.map import Axis, Cell, Failure, StressMap, Trial, boundary, severity_grid
 
 X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
 Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))

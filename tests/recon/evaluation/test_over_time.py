@@ -7,9 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from recon.evaluation.map_trials import READ_NOISE_E, video_of
 from recon.evaluation.maps import map_named
-from recon.evaluation.maps_time import READ_NOISE_E, video_of
-from recon.verdict.failure import Failure
+from recon.verdict.map import Failure
 
 
 def test_points_are_cast_where_the_truth_has_them_and_move_as_asked() -> None:

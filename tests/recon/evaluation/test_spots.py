@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.evaluation.stability_spots import spot_severity
+from recon.evaluation.scene_trial import spot_severity
 
 Floats = np.ndarray
 

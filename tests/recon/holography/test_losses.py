@@ -131,7 +131,7 @@ def test_a_registered_loss_is_found_by_the_terminal(registered, capsys, tmp_path
     from instrument.files.images import write_image
     from instrument.files.slm_image import read_slm_image
 
-    monkeypatch.delitem(sys.modules, "instrument.cli.hologram", raising=False)
+    monkeypatch.delitem(sys.modules, "instrument.cli.display", raising=False)
     monkeypatch.chdir(tmp_path)
     small = default_text().replace("shape = [1080, 1920]", "shape = [96, 128]")
     Path("bench.toml").write_text(small.replace("expansion = 16 ", "expansion = 4 "))

@@ -10,8 +10,8 @@ import pytest
 from recon.base.registry import Registry
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.camera.factors import Erasures
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.errors import InputError, StructureError
 from recon.priors import (
     L1,

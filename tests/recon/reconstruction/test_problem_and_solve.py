@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon import Calibration, InputError, Options, Problem, choose, reconstruct, solve
+from recon import Calibration, InputError, Measurement, Options, Problem, choose, reconstruct, solve
 from recon.evaluation.scene import make_scene
 from recon.priors import PRIORS, NonNegativity, Prior, TotalVariation
 from recon.priors.named import NamedPrior
@@ -99,3 +99,68 @@ def test_a_prior_over_time_subtracts_the_background_and_keeps_to_its_solver(phot
     np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-3)
     with pytest.raises(InputError, match="a solver of its own"):
         solve_together(stream_problem(image, psf, solver="fista"), frames, "tv", iterations=3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"device": 5}, "device must be one of cpu, gpu, not 5"),
+        ({"precision": 5}, "precision must be one of auto, float32, float64, not 5"),
+        ({"choose": {"binning": 1}}, "choose must be an Overrides"),
+        ({"prior": 3}, "a Prior, not 3"),
+        ({"iterations": "5"}, "iterations must be a whole number"),
+        ({"scratch": 5}, "scratch must be the name of a file"),
+        ({"method": "admm"}, "has no option 'method'. It is called 'solver'"),
+    ],
+)
+def test_an_option_of_another_type_is_refused_in_words(photograph, wrong, said) -> None:
+    with pytest.raises(InputError, match=said):
+        reconstruct(*photograph, **wrong)
+
+
+@pytest.mark.parametrize("solver", ["admm", "admm-sensor", "fista"])
+def test_weights_of_differences_are_those_of_pictures_too(photograph, solver) -> None:
+    image, psf = photograph
+    asked = {"solver": solver, "tau": 0.05, "iterations": 40, "tolerance": 0.0, "judged": False}
+    even, same, along_x, along_y = (
+        reconstruct(image, psf, axis_weights=weights, **asked).image
+        for weights in (None, (7, 1, 1), (1, 0, 1), [[1, 1, 0]])
+    )
+    np.testing.assert_allclose(same, even, atol=1e-4 * even.max())
+    rough = [np.abs(np.diff(picture, axis=axis)).sum() for picture in (along_x, along_y) for axis in (0, 1)]
+    assert rough[1] < 0.5 * rough[0]  # differences along x cost, those along y do not
+    assert rough[2] < 0.5 * rough[3]
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"axis_weights": (1, 1)}, r"\(3,\) or \(1, 3\)"),
+        ({"axis_weights": "even"}, "found 'even'"),
+        ({"axis_weights": (1, -1, 1)}, "0 or more"),
+        ({"axis_weights": (1, 1, float("nan"))}, "finite"),
+        ({"axis_weights": (1, 1, 1), "prior": "l1"}, "the prior l1 has none that"),
+        ({"axis_weights": (1, 1, 1), "prior": TotalVariation(0.1)}, "has its own"),
+    ],
+)
+def test_weights_of_differences_that_are_none_are_refused(photograph, asked, said) -> None:
+    with pytest.raises(InputError, match=said):
+        reconstruct(*photograph, **asked)
+
+
+def test_erasures_and_background_of_patterned_light_are_shaped_as_its_frames(photograph) -> None:
+    image, psf = photograph
+    patterns = np.stack([np.linspace(0, 1, 24)[None] * np.ones((24, 1)), np.ones((24, 24))])
+    frames = np.stack([image * 0.5, image])
+    erased = np.zeros(frames.shape, bool)
+    erased[0, 3:6, 4:8] = True
+    each = Problem.of(Measurement(frames, background=frames * 0.1, erasures=erased, patterns=patterns), psf)
+    np.testing.assert_array_equal(each.valid, ~erased)
+    np.testing.assert_allclose(
+        each.data * each.noise[:, None, None], np.where(erased, 0, 0.9 * frames), rtol=1e-5
+    )
+    one = Problem.of(Measurement(frames, background=image, erasures=erased[0], patterns=patterns), psf)
+    np.testing.assert_array_equal(one.valid, ~np.stack([erased[0]] * 2))
+    assert np.isfinite(solve(each, replace(each.options, **QUICK)).image).all()
+    with pytest.raises(InputError, match="24 x 24 pixels and 3 frames"):
+        Problem.of(Measurement(frames, erasures=np.zeros((3, 24, 24)), patterns=patterns), psf)

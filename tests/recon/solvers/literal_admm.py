@@ -10,12 +10,11 @@ from typing import ClassVar
 import numpy as np
 
 from recon.camera.base import Array, LinearOperator
+from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior
-from recon.priors.differences import Differences
-from recon.solvers.base import Solver
+from recon.priors.total_variation import Differences
+from recon.solvers.base import IterationRecord, Solver
 from recon.solvers.prior_splits import split_prior
-from recon.solvers.stopping import IterationRecord
-from recon.solvers.structure import as_cropped_convolution
 
 
 class LiteralAdmm(Solver):

@@ -17,8 +17,7 @@ import numpy.typing as npt
 from recon.base import fft
 from recon.camera.base import Array
 from recon.camera.convolution3d import Convolution3D
-from recon.solvers.base import Solver
-from recon.solvers.stopping import IterationRecord
+from recon.solvers.base import IterationRecord, Solver
 
 
 class LiteralAdmm(Solver):

@@ -7,7 +7,7 @@ import pytest
 
 from recon.base import fft
 from recon.camera.convolution import PadCropConvolution
-from recon.camera.erasures import Erasures
+from recon.camera.factors import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
 from recon.solvers.prior_splits import split_prior

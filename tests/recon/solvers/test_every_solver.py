@@ -9,15 +9,14 @@ import pytest
 
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
-from recon.camera.low_rank import low_rank
+from recon.camera.factors import Erasures
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason
+from recon.solvers.base import IterationRecord
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
 from recon.solvers.operator_admm import OperatorAdmm
 from recon.solvers.splitting import SensorData
-from recon.solvers.stopping import IterationRecord
 from recon.solvers.tv_admm_volume import LeanTotalVariation
 from recon.solvers.volume_admm import VolumeAdmm
 from tests.recon.solvers.literal_admm import LiteralAdmm

@@ -10,8 +10,8 @@ import recon
 from recon.base import threads
 from recon.base.metrics import psnr
 from recon.base.namespace import array_namespace, require_memory
-from recon.camera.background import BackgroundRemoval
 from recon.camera.convolution3d import Convolution3D
+from recon.camera.factors import BackgroundRemoval
 from recon.errors import InputError
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import StoppingRules

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from recon.base import fft, threads
-from recon.camera.background import BackgroundRemoval
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
-from recon.camera.local_convolution import FieldOfPsfs, local_convolution
+from recon.camera.factors import BackgroundRemoval, Erasures
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
 from recon.solvers.operator_admm import OperatorAdmm

@@ -12,7 +12,7 @@ from recon.base import fft
 from recon.base.metrics import psnr
 from recon.camera.convolution import PadCropConvolution
 from recon.camera.convolution3d import Convolution3D
-from recon.camera.erasures import Erasures
+from recon.camera.factors import Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
 from recon.solvers.cosine_preconditioner import CosinePreconditioner

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from recon.verdict.content import FOUND, SMOOTH_PX, STRONG, points_of
+from recon.verdict.evidence import FOUND, SMOOTH_PX, STRONG, points_of
 
 RNG = np.random.default_rng(5)
 

@@ -10,13 +10,11 @@ import pytest
 
 import recon
 from recon import InputError, reconstruct
-from recon.camera.camera_model import Depths
-from recon.camera.light import plane_gains
+from recon.camera.camera_model import Depths, plane_gains
 from recon.evaluation.scene import SceneSpec, make_scene
-from recon.solvers.stopping import IterationRecord, StopReason
-from recon.verdict.collect import DIVERGED, unsettled_by
-from recon.verdict.evidence import Observation, _dimming, _similarity, measure
-from recon.verdict.verdict import Region
+from recon.solvers.base import IterationRecord, StopReason
+from recon.verdict.evidence import DIVERGED, Observation, _dimming, _similarity, measure, unsettled_by
+from recon.verdict.judge import Region
 
 RNG = np.random.default_rng(1)
 
@@ -191,7 +189,7 @@ def test_a_result_is_not_lost_where_judging_it_fails(monkeypatch: pytest.MonkeyP
     def fail(*_: object, **__: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(sys.modules[recon.solve.__module__], "evidence_of", fail)
+    monkeypatch.setattr(sys.modules[recon.judged.__module__], "evidence_of", fail)
     volume = make_scene(SceneSpec("beads", size=32, depths=2))
     picture = make_scene(SceneSpec("sparse-picture", size=32))
     for result in (

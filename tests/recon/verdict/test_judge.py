@@ -9,7 +9,9 @@ import pytest
 
 from recon.verdict import cases, judge
 from recon.verdict.evidence import Evidence
-from recon.verdict.verdict import Region
+from recon.verdict.judge import Region
+
+TV = "admm tv of volumes"
 
 
 def evidence(detail: float = 20.0, unexplained: float = 0.02, **others: float) -> Evidence:
@@ -78,17 +80,15 @@ def test_who_overexposed_a_volume_is_not_told_to_give_more_light(monkeypatch: py
     for k in range(60):
         numbers = evidence(20 + 0.1 * k, peaks=40.0 if k % 2 else 3.0, height=20.0, ends=0.4)
         severity = 2.0 if k % 2 else 0.5
-        entries.append(
-            {"scene": k, "method": "volume tv", "severity": severity, "evidence": numbers.as_json()}
-        )
+        entries.append({"scene": k, "method": TV, "severity": severity, "evidence": numbers.as_json()})
     monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries))
     cases.cases_of.cache_clear()
     grainy = {"peaks": 40.0, "height": 20.0, "ends": 0.4}
-    clipped = judge.verdict_on(evidence(22, saturated=0.05, **grainy), "volume tv")
+    clipped = judge.verdict_on(evidence(22, saturated=0.05, **grainy), TV)
     assert [f.stress for f in clipped.findings] == ["saturated", "peaks"]
     assert "A stronger prior (--tau) would help" in clipped.sentences[2]
     assert "light" not in " ".join(clipped.sentences).lower()
-    dim = judge.verdict_on(evidence(22, **grainy), "volume tv")
+    dim = judge.verdict_on(evidence(22, **grainy), TV)
     assert "More light or a stronger prior (--tau) would help" in dim.sentences[1]
 
 
@@ -184,19 +184,19 @@ def test_volumes_are_judged_by_their_points_and_cases_without_them_take_no_part(
             }
             numbers = evidence(20 + 0.1 * k, 0.03, planes=4, **(points if with_points else {})).as_json()
             severity = 2.0 if bad else 0.5
-            made.append({"scene": k, "method": "volume tv", "severity": severity, "evidence": numbers})
+            made.append({"scene": k, "method": TV, "severity": severity, "evidence": numbers})
         return made
 
     monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(True)))
     cases.cases_of.cache_clear()
-    good = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), "volume tv")
+    good = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), TV)
     assert good.region is Region.INSIDE
-    bad = judge.verdict_on(evidence(22, height=2.0, peaks=40.0, ends=1.6), "volume tv")
+    bad = judge.verdict_on(evidence(22, height=2.0, peaks=40.0, ends=1.6), TV)
     assert bad.region is Region.OUTSIDE
     assert {f.stress for f in bad.findings} <= {"height", "peaks", "ends"}
     monkeypatch.setattr(cases, "mixed_scenes", lambda: tuple(entries(False)))
     cases.cases_of.cache_clear()
-    old = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), "volume tv")
+    old = judge.verdict_on(evidence(22, height=20.0, peaks=3.0, ends=0.4), TV)
     assert old.region is Region.UNKNOWN
     assert old.failing is None
 
@@ -221,4 +221,4 @@ def test_a_verdict_is_a_record() -> None:
 def test_methods_have_the_names_of_the_maps() -> None:
     assert judge.method_name("admm", "tv-isotropic") == "admm tv"
     assert judge.method_name("wiener", "none") == "wiener"
-    assert judge.method_name("volume", "l1") == "volume l1"
+    assert judge.method_name("admm", "l1", volume=True) == "admm l1 of volumes"

@@ -1,0 +1,355 @@
+"""From image files to holograms: the bench's display, its mask's alignment, targets, optimiser, verdict."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import isqrt
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from instrument.bench.config import BenchConfig
+from instrument.files.errors import BenchError, FileError
+from instrument.files.images import read_image
+from instrument.files.record import RecordFormat, plain, value_of
+from recon.base.declare import record
+from recon.holography import (
+    DcTerm,
+    Display,
+    Hologram,
+    HologramModel,
+    HologramOptions,
+    HologramRecord,
+    ScatteringMask,
+    Scores,
+    Target,
+    compute_hologram,
+    random_mask,
+)
+from recon.holography.display import greatest_defocus_mm
+from recon.holography.judge import compare
+from recon.holography.options import Fit
+from recon.holography.pose import NODES, Pose
+from recon.holography.target import make_band
+
+if TYPE_CHECKING:
+    from drivers.slm import Slm
+
+
+Image = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class HologramResult:
+    """A hologram and what will be seen of it, plane by plane.
+
+    Attributes
+    ----------
+    hologram : Hologram
+    wanted, seen, unfiltered : tuple of ndarray
+        Target and image through the eye's low-pass, and the image before it, in units of the target's white.
+    scores : tuple of Scores
+        Alias-free, with the envelope that was asked for and all frames.
+    """
+
+    hologram: Hologram
+    wanted: tuple[Image, ...]
+    seen: tuple[Image, ...]
+    unfiltered: tuple[Image, ...]
+    scores: tuple[Scores, ...]
+
+    def facts(self, options: HologramOptions) -> dict[str, Any]:
+        """Return metrics and options, JSON-compatible."""
+        last = self.hologram.history[-1]
+        return {
+            "computed": True,
+            "metrics": [asdict(score) for score in self.scores],
+            "metrics_computed_for": {
+                "grid": "alias-free",
+                "envelope": options.envelope,
+                "frames": options.frames,
+                "phase_levels": options.phase_levels or "continuous",
+            },
+            "options": record(options),
+            "iterations": last.iteration,
+            "seconds": round(self.hologram.seconds, 3),
+            "stopped": str(self.hologram.stop_reason),
+        }
+
+
+def compute_and_judge(
+    display: Display,
+    targets: Sequence[Target],
+    options: HologramOptions | None = None,
+    *,
+    initial: npt.NDArray[Any] | None = None,
+    callback: Callable[[HologramRecord, Any], object] | None = None,
+    cancel: threading.Event | None = None,
+) -> HologramResult:
+    """Compute one hologram (of one or more planes) and judge it on the alias-free grid."""
+    model = HologramModel(display, targets, options)
+    hologram = compute_hologram(model, initial=initial, callback=callback, cancel=cancel)
+    if model.options.grid != "alias-free":
+        model = HologramModel(display, targets, options, grid="alias-free")
+    planes = range(len(targets))
+    wanted = tuple(np.asarray(model.wanted(p), float) / model.peaks[p] for p in planes)
+    seen = tuple(np.asarray(model.seen(hologram.slm, p), float) / model.peaks[p] for p in planes)
+    raw = tuple(np.asarray(model.intensity(hologram.slm, p), float) / model.peaks[p] for p in planes)
+    scores = tuple(compare(s, w, 1.0) for s, w in zip(seen, wanted, strict=True))
+    return HologramResult(hologram, wanted, seen, raw, scores)
+
+
+def prepare_target(
+    pixels: npt.NDArray[Any],
+    display: Display,
+    options: HologramOptions | None = None,
+    *,
+    z_mm: float = 0.0,
+) -> Target:
+    """Turn a picture into a target over the whole field of view, which is square.
+
+    Parameters
+    ----------
+    pixels : ndarray, (height, width), or (height, width, 3), of which the mean of the channels is taken
+        Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
+    options : HologramOptions
+        Its ``fit``, ``srgb`` and ``envelope``.
+    z_mm : float
+    """
+    options = options or HologramOptions()
+    image = field_picture(pixels, fit=options.fit, srgb=options.srgb)
+    small = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
+    if image.shape[0] < small[0] or image.shape[1] < small[1]:
+        wide, high = max(small[1], image.shape[1]), max(small[0], image.shape[0])
+        image = cv2.resize(image, (wide, high), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    if options.envelope == "shade":
+        ey, ex = (np.fft.fftshift(e) for e in display.envelope((image.shape[0], image.shape[1])))
+        image = image * ey[:, None] * ex
+    return Target(image, z_mm, white=1.0)
+
+
+def field_picture(
+    pixels: npt.NDArray[Any], *, fit: Fit = "cover", srgb: bool = False
+) -> npt.NDArray[np.float64]:
+    """Return a picture as it fills the square field, intensity in 0 to 1; see :class:`HologramOptions`.
+
+    Stretched, it keeps its own number of pixels.
+    """
+    image = np.asarray(pixels, np.float64)
+    if image.ndim == 3:
+        image = image.mean(axis=2)
+    image /= _white(pixels)
+    if srgb:
+        image = np.where(image <= 0.04045, image / 12.92, ((np.abs(image) + 0.055) / 1.055) ** 2.4)
+    height, width = image.shape
+    side = min(height, width) if fit == "cover" else max(height, width)
+    if fit == "cover":
+        top, left = (height - side) // 2, (width - side) // 2
+        image = image[top : top + side, left : left + side]
+    elif fit == "contain":
+        top, left = (side - height) // 2, (side - width) // 2
+        image = np.pad(image, ((top, side - height - top), (left, side - width - left)))
+    return image
+
+
+def _white(pixels: npt.NDArray[Any]) -> float:
+    if pixels.dtype == np.uint8:
+        return 255.0
+    return 65535.0 if pixels.dtype == np.uint16 else max(float(pixels.max()), 1e-30)
+
+
+def read_weights(path: Path) -> npt.NDArray[np.float64]:
+    """Read a weight image (grey, any scale); errors as ``read_image``."""
+    pixels = read_image(path).pixels
+    if pixels.ndim != 2 or pixels.min() < 0 or pixels.max() <= 0:
+        raise FileError(path, "is no weight image: grey, not negative, not all zero.")
+    return np.asarray(pixels, np.float64)
+
+
+def slm_size(config: BenchConfig) -> tuple[tuple[int, int], float]:
+    """Ask the bench's SLM for its shape and pixel pitch in micrometres; opens and closes it.
+
+    Raises
+    ------
+    BenchError
+        When the bench has no SLM.
+    DeviceError
+        When it does not answer.
+    """
+    from instrument.bench.bench import Bench
+
+    if "slm" not in config.devices:
+        raise BenchError(f"{config.label} has no [slm], so it is not known what to compute a hologram for.")
+    bench = Bench(config)
+    try:
+        slm: Slm = bench.open_device("slm")  # type: ignore[assignment]
+        return slm.shape, slm.pixel_pitch_um
+    finally:
+        bench.close()
+
+
+def bench_display(
+    config: BenchConfig,
+    size: tuple[tuple[int, int], float],
+    *,
+    expansion: int | None = None,
+    wavelength_nm: float | None = None,
+) -> Display:
+    """Return the display that ``[display]`` describes.
+
+    Parameters
+    ----------
+    config : BenchConfig
+    size : ((int, int), float)
+        The SLM's shape and pitch, from :func:`slm_size`.
+    expansion : int, optional
+        Another étendue expansion than the bench's, with a random mask of its own.
+    wavelength_nm : float, optional
+        Another wavelength; the mask keeps its height.
+
+    Raises
+    ------
+    BenchError, FileError
+        When SLM, binning, expansion and mask do not fit together.
+    """
+    table = config.display
+    q = expansion or table.expansion
+    k = expansion_side(q)
+    (height, width), pitch_um = size
+    binning = table.slm_binning
+    if height % binning or width % binning:
+        raise BenchError(f"An SLM of {height} x {width} pixels cannot be binned by slm_binning = {binning}.")
+    shape = (height // binning, width // binning)
+    if table.mask_file is not None and q == table.expansion:
+        base = config.path.parent if config.path else Path()
+        mask = _mask_from(base / table.mask_file, (shape[0] * k, shape[1] * k), table.wavelength_nm)
+    else:
+        mask = random_mask(
+            (shape[0] * k, shape[1] * k), seed=table.mask_seed, design_wavelength_nm=table.wavelength_nm
+        )
+    return Display(
+        shape,
+        mask,
+        slm_pitch_um=pitch_um * binning,
+        wavelength_nm=wavelength_nm or table.wavelength_nm,
+        focal_mm=table.focal_mm,
+        dc=DcTerm(table.dc_power, table.dc_phase_rad),
+        mask_fill=table.mask_fill,
+    )
+
+
+def depth_limit_mm(
+    config: BenchConfig, size: tuple[tuple[int, int], float], *, expansion: int | None = None
+) -> float:
+    """Return how far out of focus a plane may lie for :func:`bench_display`, without making its mask."""
+    table = config.display
+    k = expansion_side(expansion or table.expansion)
+    (height, width), pitch_um = size
+    binning = table.slm_binning
+    shape = (height // binning * k, width // binning * k)
+    return greatest_defocus_mm(shape, pitch_um * binning / k, table.wavelength_nm, table.focal_mm)
+
+
+def expansion_side(expansion: int) -> int:
+    """Return how many mask pixels an étendue expansion puts along each side of an SLM pixel.
+
+    Raises
+    ------
+    BenchError
+        When the expansion is no square.
+    """
+    side = isqrt(expansion)
+    if side * side != expansion:
+        raise BenchError(f"The expansion must be a square (1, 4, 9, 16, 25, 36 ...), not {expansion}.")
+    return side
+
+
+def _mask_from(path: Path, shape: tuple[int, int], wavelength_nm: float) -> ScatteringMask:
+    """Read a binary mask image: two values, the greater one is pi."""
+    from instrument.files.images import read_image
+
+    pixels = read_image(path).pixels
+    values = np.unique(pixels)
+    if pixels.shape != shape:
+        raise FileError(path, f"is a mask of {pixels.shape} pixels; SLM and expansion need {shape}.")
+    if len(values) != 2:
+        raise FileError(path, f"holds {len(values)} different values; a binary mask has two (0 and pi).")
+    return ScatteringMask((pixels == values[1]).astype(np.uint8), np.array([0.0, np.pi]), wavelength_nm)
+
+
+ALIGNMENT = RecordFormat(
+    "diffuserbench mask alignment", "mask alignment", make="Make one: diffuserbench align mask"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Where the mask was found.
+
+    Attributes
+    ----------
+    pose : Pose
+        Left over with the stage at ``stage_position``.
+    error : mapping of parameter name to float
+        Standard uncertainties.
+    rest : ndarray, float64, (rows, columns, 2)
+        Smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask pixels.
+    efficiency : float
+        Spot brightness over the model's ideal.
+    stage_position : mapping of axis name to float
+        Where the stage was.
+    mask_shape : (int, int)
+        Of the mask that it holds for, in pixels.
+    simulated : bool
+    """
+
+    pose: Pose
+    error: Mapping[str, float]
+    rest: npt.NDArray[np.float64]
+    efficiency: float
+    stage_position: Mapping[str, float]
+    mask_shape: tuple[int, int]
+    simulated: bool
+
+    def of(self, display: Display) -> Display:
+        """Return the display with this mask's displacement.
+
+        Raises
+        ------
+        FileError
+            When the alignment is another mask's.
+        """
+        if display.mask.shape != self.mask_shape:
+            raise FileError(
+                "alignment",
+                f"holds for a mask of {self.mask_shape} pixels; this display's has {display.mask.shape}.",
+            )
+        return replace(display, displacement=self.pose.displacement(self.mask_shape) + self.rest)
+
+
+def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -> None:
+    """Write an alignment with further facts; errors as ``write_text``."""
+    ALIGNMENT.write(path, {**plain(alignment), "rest": alignment.rest.round(4), **facts})
+
+
+def load_alignment(path: Path) -> Alignment:
+    """Read an alignment.
+
+    Raises
+    ------
+    FileError
+        When it is missing, no alignment, or damaged.
+    """
+    record = ALIGNMENT.read(path)
+    with ALIGNMENT.damaged(path):
+        alignment = value_of(Alignment, record)  # what is not the alignment's own are facts about it
+        if not np.isfinite(alignment.pose.vector()).all():
+            raise ValueError("the pose is not finite")
+        if alignment.rest.shape != (*NODES, 2) or not np.isfinite(alignment.rest).all():
+            raise ValueError(f"'rest' should be {(*NODES, 2)} numbers, not {alignment.rest.shape}")
+        return alignment

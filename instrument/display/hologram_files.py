@@ -1,0 +1,314 @@
+"""What is written of holograms: patterns, previews, pictures of the alignment, and Table 7.1."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.display.hologram import HologramResult
+from instrument.files.atomic import whole_file, write_text
+from instrument.files.errors import BenchError, FileError
+from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
+from instrument.files.images import side_car, write_image
+from instrument.files.slm_image import phase_levels, write_slm_image
+from recon.holography import Display, HologramOptions
+from recon.holography.judge import DISSERTATION, GRIDS, METHODS, Cell, average
+from recon.holography.losses import loss_of
+
+CHANNELS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, slots=True)
+class HologramFiles:
+    """Names and writes the files of one call: patterns, descriptions, previews.
+
+    One file a pattern: ``slm.png``, or ``slm-red.png``, ``slm-frame1.png``, ``slm-0001.png`` and their
+    combinations where there are colours, time-multiplexed frames or video frames.
+    """
+
+    out: Path
+    binning: int
+    options: HologramOptions
+    displays: Sequence[Display]
+    video: int = 0
+
+    def check(self, *, overwrite: bool) -> None:
+        """Refuse what could not be written, before any work."""
+        levels = self.options.phase_levels
+        if levels is not None and 256 % levels:
+            raise BenchError(
+                f"{levels} phase levels cannot be written in 256: 2, 4, 8, 16, 32, 64, 128 or 256 can."
+            )
+        expected = ".npy" if self.options.complex_slm else ".png"
+        if self.out.suffix.lower() != expected:
+            kind = "a complex" if self.options.complex_slm else "a phase"
+            raise FileError(self.out, f"{kind} pattern is written as {expected}.")
+        if not self.out.parent.is_dir():
+            raise FileError(self.out.parent, "there is no such folder.")
+        existing = [file for file in self.files() if file.exists()]
+        if existing and not overwrite:
+            raise FileError(existing[0], "exists already.", "Choose another name, or overwrite with --force.")
+
+    def label(self, number: int, channel: int) -> str:
+        """Return which pattern it is, for bar and report."""
+        parts = [f"frame {number + 1}/{self.video}"] if self.video else []
+        parts += [CHANNELS[channel]] if len(self.displays) > 1 else []
+        return " ".join(parts) or "hologram"
+
+    def files(self) -> list[Path]:
+        """Return every file that will be written."""
+        files = []
+        for number in range(max(self.video, 1)):
+            for channel in range(len(self.displays)):
+                patterns = self.patterns(number, channel)
+                files += [*patterns, *map(side_car, patterns), self._preview(number, channel)]
+        return files
+
+    def write(self, number: int, channel: int, result: HologramResult) -> None:
+        """Write one hologram's patterns and its preview."""
+        display = self.displays[channel]
+        facts = {
+            **result.facts(self.options),
+            "binning": self.binning,
+            "expansion": display.expansion,
+            "slm_shape": list(display.slm_shape),
+            "slm_pitch_um": display.slm_pitch_um,
+            "wavelength_nm": display.wavelength_nm,
+            "dc_power": display.dc.power,
+            "mask_fill": display.mask_fill,
+        }
+        patterns = self.patterns(number, channel)
+        for frame, path in enumerate(patterns):
+            about = {**facts, "frame": frame + 1, "of_frames": len(patterns)}
+            if self.options.complex_slm:
+                write_image(path, result.hologram.slm[frame], {"format": "diffuserbench SLM field", **about})
+            else:
+                write_slm_image(path, phase_levels(result.hologram.phase_rad[frame], self.binning), about)
+        lines = [
+            ("expansion", f"{display.expansion}x, {display.slm_shape[1]} x {display.slm_shape[0]} pixels"),
+            ("loss, method", f"{loss_of(self.options.loss).name}, {self.options.method}"),
+            ("judged", f"alias-free grid, envelope {self.options.envelope}, {self.options.frames} frame(s)"),
+            ("crop", f"{result.scores[0].crop_psnr_db:.1f} dB in the middle quarter"),
+            ("stopped", str(result.hologram.stop_reason)),
+            ("iterations", f"{result.hologram.history[-1].iteration}"),
+        ]
+        write_hologram_figure(
+            self._preview(number, channel),
+            result,
+            title=f"Hologram {patterns[0].stem}",
+            facts=lines,
+        )
+
+    def _stem(self, number: int, channel: int) -> str:
+        stem = self.out.stem
+        if self.video:
+            stem += f"-{number + 1:04d}"
+        if len(self.displays) > 1:
+            stem += f"-{CHANNELS[channel]}"
+        return stem
+
+    def patterns(self, number: int, channel: int) -> list[Path]:
+        """Return the pattern files of one hologram, one a time-multiplexed frame."""
+        stem = self._stem(number, channel)
+        if self.options.frames == 1:
+            return [self.out.with_name(stem + self.out.suffix)]
+        return [
+            self.out.with_name(f"{stem}-frame{frame + 1}{self.out.suffix}")
+            for frame in range(self.options.frames)
+        ]
+
+    def _preview(self, number: int, channel: int) -> Path:
+        return self.out.with_name(f"{self._stem(number, channel)}-preview.png")
+
+
+_DETAIL = "middle sixteenth of the field, raw intensity, half as bright"
+
+
+def write_hologram_figure(
+    path: Path, result: HologramResult, *, title: str, facts: list[tuple[str, str]]
+) -> None:
+    """Draw wanted, seen and unfiltered image, the SLM's phase and the convergence; errors as ``whole_file``.
+
+    The first plane is drawn large; further planes as a strip below.
+    """
+    score = result.scores[0]
+    phase = np.mod(np.angle(result.hologram.slm[0]), 2 * np.pi)
+    panels = (
+        Panel("Wanted", result.wanted[0], caption="through the eye's low-pass", white=1.0),
+        Panel(
+            "Seen (computed)",
+            np.maximum(result.seen[0], 0),
+            caption=f"low-pass: {score.psnr_db:.1f} dB, SSIM {score.ssim:.2f}",
+            white=1.0,
+        ),
+        Panel("Without the low-pass", _detail(result.unfiltered[0]), caption=_DETAIL, white=2.0),
+        Panel("SLM phase", phase, caption=f"{phase.shape[1]} x {phase.shape[0]}, 0 to 2 pi", white=2 * np.pi),
+    )
+    strip = tuple(
+        Panel(f"plane {number + 2}", np.maximum(seen, 0), caption=f"{other.psnr_db:.1f} dB", white=1.0)
+        for number, (seen, other) in enumerate(zip(result.seen[1:], result.scores[1:], strict=True))
+    )
+    history = result.hologram.history
+    convergence = Convergence(
+        [r.seconds for r in history],
+        [r.psnr_db for r in history],
+        "PSNR of the seen image against time",
+        f"{history[-1].psnr_db:.1f} dB",
+        "seconds of optimisation",
+    )
+    summary = Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True)
+    with whole_file(path) as temporary:
+        save_figure(summary_figure(summary), temporary)
+
+
+def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Cut out the middle of the field and sample it to squares, as the field is square."""
+    height, width = image.shape
+    cut = image[height * 3 // 8 : height * 5 // 8, width * 3 // 8 : width * 5 // 8]
+    side = max(cut.shape)
+    rows, columns = (np.arange(side) * n // side for n in cut.shape)
+    square: npt.NDArray[np.float64] = cut[np.ix_(rows, columns)]
+    return square
+
+
+Field = npt.NDArray[np.float64]
+
+
+def write_alignment_figure(
+    path: Path,
+    displacement: Field,
+    rest: Field,
+    mask_shape: tuple[int, int],
+    efficiencies: Sequence[tuple[int, float]],
+    title: str,
+    *,
+    simulated: bool,
+) -> None:
+    """Draw efficiency against frames and the displacement that is kept; errors as ``whole_file``.
+
+    Parameters
+    ----------
+    path : Path
+    displacement, rest : ndarray, (rows, columns, 2)
+        Of the pose, and the smooth rest; mask pixels on nodes from edge to edge of the mask.
+    mask_shape : (int, int)
+    efficiencies : sequence of (int, float)
+        Frames taken, and spot brightness over the model's ideal.
+    title : str
+    simulated : bool
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 4.4), dpi=100, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1.3, 1.3])
+    frames, values = zip(*efficiencies, strict=True)
+    left.plot(frames, values, "o-", color="#00798c")
+    left.set_ylim(0, max(1.05, 1.05 * max(values)))
+    left.set_xlabel("frames taken")
+    left.set_title("Spot brightness / model's ideal", loc="left")
+    left.grid(color="#e3e8ec")
+    height, width = mask_shape
+    for axes, field, words in (
+        (middle, displacement, "Shift, rotation and scale left"),
+        (right, rest, "Smooth rest"),
+    ):
+        y, x = np.meshgrid(
+            np.linspace(0, height, field.shape[0]), np.linspace(0, width, field.shape[1]), indexing="ij"
+        )
+        size = np.hypot(field[..., 0], field[..., 1])
+        arrows = axes.quiver(x, y, field[..., 1], field[..., 0], size, angles="xy", cmap="viridis")
+        figure.colorbar(arrows, ax=axes, label="mask pixels", shrink=0.7)
+        axes.set_aspect("equal")
+        axes.invert_yaxis()
+        axes.set_title(f"{words}: {np.sqrt(np.mean(size**2)):.2f} mask pixels rms", loc="left")
+    figure.suptitle(title + ("   SIMULATED" if simulated else ""), x=0.01, ha="left")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)
+
+
+def expansions_of(cells: Sequence[Cell]) -> list[int]:
+    """Return the expansions present, ascending."""
+    return sorted({cell.expansion for cell in cells})
+
+
+def rows(cells: Sequence[Cell], *, crop: bool) -> list[tuple[int, str, list[float]]]:
+    """Return ``(expansion, method, figures)`` in dB.
+
+    The figures are: what the dissertation prints (NaN where it has none), optimised and judged on the
+    dissertation's grid, the same judged without aliasing, optimised and judged without aliasing.
+    """
+    name = "crop_psnr_db" if crop else "psnr_db"
+    table = []
+    for q in expansions_of(cells):
+        for method in METHODS:
+            printed = DISSERTATION.get((q, method))
+            figures = [getattr(printed, name) if printed else float("nan")]
+            for grid, own in ((GRIDS[0], True), (GRIDS[0], False), (GRIDS[1], False)):
+                figures.append(getattr(average(cells, q, grid, method, own=own), name))
+            table.append((q, method, figures))
+    return table
+
+
+def write_csv(path: Path, cells: Sequence[Cell]) -> None:
+    """Write every picture's figures, one line a cell, and the dissertation's; errors as ``whole_file``."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    scores = ("psnr_db", "ssim", "crop_psnr_db", "crop_ssim")
+    writer.writerow(["expansion", "optimised_on", "judged_on", "method", "picture", *scores, "seconds"])
+    for (q, method), printed in DISSERTATION.items():
+        figures = [getattr(printed, s) for s in scores]
+        writer.writerow(
+            [q, "dissertation", "dissertation", method, "printed in the dissertation", *figures, ""]
+        )
+    for cell in cells:
+        judged = [("alias-free", cell.alias_free)]
+        if cell.grid == "dissertation":
+            judged.insert(0, ("dissertation", cell.own))
+        for name, found in judged:
+            figures = [f"{getattr(found, s):.4f}" for s in scores]
+            writer.writerow(
+                [cell.expansion, cell.grid, name, cell.method, cell.picture, *figures, f"{cell.seconds:.2f}"]
+            )
+    write_text(path, text.getvalue())
+
+
+def write_chart(path: Path, cells: Sequence[Cell], note: str) -> None:
+    """Draw PSNR by method, whole field above and middle quarter below; errors as ``whole_file``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    found = expansions_of(cells)
+    figure = Figure(figsize=(4.6 * len(found), 8.0), dpi=100, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(found), squeeze=False, sharey="row")
+    looks = (
+        ("printed in the dissertation", "#8496a5", "D"),
+        ("dissertation's grid, judged on it", "#edae49", "s"),
+        ("dissertation's grid, judged alias-free", "#d1495b", "v"),
+        ("alias-free grid, judged alias-free", "#00798c", "o"),
+    )
+    for line, crop in enumerate((False, True)):
+        table = rows(cells, crop=crop)
+        for column, q in enumerate(found):
+            ax = axes[line][column]
+            values = [figures for expansion, _, figures in table if expansion == q]
+            for i, (name, colour, marker) in enumerate(looks):
+                places = [x + 0.12 * (i - 1.5) for x in range(len(METHODS))]
+                ax.plot(places, [v[i] for v in values], marker, color=colour, markersize=8, label=name)
+            ax.set_xticks(range(len(METHODS)), METHODS)
+            ax.grid(True, axis="y", color="#e3e8ec")
+            ax.set_title(f"{q}x expansion, {'middle quarter' if crop else 'whole field'}", loc="left")
+            if column == 0:
+                ax.set_ylabel("PSNR of the low-passed image, dB")
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.suptitle(f"Table 7.1 (computed). {note}", x=0.01, ha="left", fontsize=11)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary)

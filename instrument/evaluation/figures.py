@@ -1,0 +1,361 @@
+"""A chart of cost against accuracy as a picture and as a page that answers the mouse; a map's picture."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from instrument.evaluation.chart import ChartData, colours_of, in_words, title_of
+from instrument.files.atomic import whole_file, write_text
+from instrument.files.figures import save_figure
+from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_INK = "#22303c"
+_BOUNDARY = "#d1495b"
+
+
+def chart_page(data: ChartData) -> str:
+    """Return a page: points to hover over, families to switch off, axes to choose; the front by name."""
+    known = [k for k in data.kind.scores if any(getattr(p, k.key) == getattr(p, k.key) for p in data.points)]
+    payload = json.dumps(
+        {
+            "points": [p.to_json() for p in data.points],
+            "colours": colours_of(data),
+            "costs": [asdict(axis) for axis in data.kind.costs],
+            "scores": [asdict(axis) for axis in known],
+            "groups": list(dict.fromkeys(p.group for p in data.points)),
+        }
+    ).replace("</", "<\\/")  # "</" inside a script would end it
+    kind = "SIMULATED. " if data.about.get("simulated") else ""
+    title = html.escape(f"{kind}{title_of(data)}")
+    return _PAGE.replace("@TITLE@", title).replace("@DATA@", payload)
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>@TITLE@</title><style>
+:root{color-scheme:light dark;--ink:#22303c;--ground:#fff;--line:#ddd}
+@media(prefers-color-scheme:dark){:root{--ink:#dfe6ec;--ground:#14191e;--line:#36404a}}
+body{font:14px system-ui,sans-serif;margin:1.5em;color:var(--ink);background:var(--ground)}
+h1{font-size:1.2em}label{margin-right:1em}svg text{fill:var(--ink)}svg .grid{stroke:var(--line)}
+#tip{position:absolute;background:var(--ground);border:1px solid #8496a5;padding:.4em .6em;
+font-size:12px;white-space:pre;pointer-events:none;display:none}.front{stroke:var(--ink);stroke-width:1.5}
+polyline{fill:none}
+</style></head><body><h1>@TITLE@</h1>
+<p><span id="which">of: <select id="group"></select></span> x: <select id="x"></select>
+y: <select id="y"></select> <span id="keys"></span></p>
+<svg id="plot" width="900" height="520"></svg><div id="tip"></div>
+<p>On the front (nothing is both cheaper and better):</p><ol id="named"></ol>
+<script>
+const data = @DATA@, plot = document.getElementById("plot"), tip = document.getElementById("tip");
+const xs = document.getElementById("x"), ys = document.getElementById("y"), off = new Set();
+const group = document.getElementById("group"), named = document.getElementById("named");
+for (const axis of data.costs) xs.add(new Option(axis.words, axis.key));
+for (const axis of data.scores) ys.add(new Option(axis.words, axis.key));
+for (const name of data.groups) group.add(new Option(name, name));
+if (data.groups.length < 2) document.getElementById("which").hidden = true;
+for (const [name, colour] of Object.entries(data.colours)) {
+  const label = document.createElement("label"), box = document.createElement("input");
+  box.type = "checkbox"; box.checked = true; label.style.color = colour;
+  box.onchange = () => { box.checked ? off.delete(name) : off.add(name); draw(); };
+  label.append(box, " " + name); document.getElementById("keys").append(label);
+}
+function node(kind, attributes, text) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", kind);
+  for (const [k, v] of Object.entries(attributes)) made.setAttribute(k, v);
+  if (text !== undefined) made.textContent = text;
+  plot.append(made); return made;
+}
+const short = v => String(Number(Number(v).toPrecision(3)));
+function scale(values, logarithmic, from, to) {
+  const f = v => logarithmic ? Math.log10(Math.max(v, 1e-4)) : v;
+  const all = values.map(f); let low = Math.min(...all), high = Math.max(...all);
+  const rim = (high - low || 1) * 0.05; low -= rim; high += rim;
+  const place = v => from + (f(v) - low) / (high - low) * (to - from);
+  let ticks = [];
+  if (logarithmic) {
+    const steps = high - low > 3 ? [1] : [1, 2, 5];
+    for (let e = Math.floor(low); e <= high; e++) for (const s of steps) ticks.push(s * 10 ** e);
+    ticks = ticks.filter(v => f(v) >= low && f(v) <= high);
+  } else for (let i = 0; i <= 5; i++) ticks.push(low + (high - low) * i / 5);
+  return [place, ticks];
+}
+function draw() {
+  plot.replaceChildren(); named.replaceChildren();
+  const x = data.costs.find(a => a.key === xs.value), y = data.scores.find(a => a.key === ys.value);
+  const left = 60, right = 880, top = 15, bottom = 470;
+  const seen = data.points.filter(p => p.group === group.value && !off.has(p.family) &&
+    p[x.key] !== null && p[y.key] !== null);
+  if (!seen.length) { node("text", {x: left, y: 40}, "nothing to show"); return; }
+  const [px, tx] = scale(seen.map(p => p[x.key]), x.logarithmic, left, right);
+  const [py, ty] = scale(seen.map(p => p[y.key]), y.logarithmic, bottom, top);
+  for (const v of tx) {
+    node("line", {x1: px(v), x2: px(v), y1: top, y2: bottom, class: "grid"});
+    node("text", {x: px(v), y: bottom + 18, "font-size": 12, "text-anchor": "middle"}, short(v));
+  }
+  for (const v of ty) {
+    node("line", {x1: left, x2: right, y1: py(v), y2: py(v), class: "grid"});
+    node("text", {x: left - 6, y: py(v) + 4, "font-size": 12, "text-anchor": "end"}, short(v));
+  }
+  node("text", {x: (left + right) / 2, y: bottom + 40, "font-size": 13, "text-anchor": "middle"}, x.words);
+  const sign = y.more_is_better ? 1 : -1, front = [];
+  for (const p of [...seen].sort((a, b) => a[x.key] - b[x.key] || sign * (b[y.key] - a[y.key])))
+    if (!front.length || sign * p[y.key] > sign * front[front.length - 1][y.key]) front.push(p);
+  const runs = new Map();
+  for (const p of seen) runs.set(p.setting, [...(runs.get(p.setting) || []), p]);
+  const line = (ps, attributes) => node("polyline", {...attributes,
+    points: ps.map(p => px(p[x.key]) + "," + py(p[y.key])).join(" ")});
+  for (const ps of runs.values()) line(ps, {stroke: data.colours[ps[0].family], "stroke-opacity": 0.3});
+  node("polyline", {class: "front", points: front.map((p, i) => (i ? px(p[x.key]) + "," +
+    py(front[i - 1][y.key]) + " " : "") + px(p[x.key]) + "," + py(p[y.key])).join(" ")});
+  const words = p => p.setting + (p.iterations ? ", " + p.iterations + " iterations" : "");
+  for (const p of front) {
+    const item = document.createElement("li");
+    item.textContent = words(p) + ": " + x.words + " " + short(p[x.key]) + ", " + y.words + " " +
+      short(p[y.key]);
+    named.append(item);
+  }
+  for (const p of seen) {
+    const on = front.includes(p);
+    const dot = node("circle", {cx: px(p[x.key]), cy: py(p[y.key]), r: on ? 6 : 4,
+      fill: data.colours[p.family], "fill-opacity": 0.7, class: on ? "front" : ""});
+    dot.onmousemove = event => {
+      tip.style.display = "block";
+      tip.style.left = event.pageX + 12 + "px"; tip.style.top = event.pageY + "px";
+      tip.textContent = words(p) + (on ? "\\non the front" : "") + [...data.costs, ...data.scores]
+        .filter(a => p[a.key] !== null)
+        .map(a => "\\n" + a.words + ": " + Number(p[a.key]).toPrecision(4)).join("");
+    };
+    dot.onmouseleave = () => { tip.style.display = "none"; };
+  }
+}
+group.onchange = xs.onchange = ys.onchange = draw; draw();
+</script></body></html>
+"""
+
+
+_LEAST = {"seconds": 1e-4, "peak_mib": 0.1}
+"""Smaller ones are drawn here: what costs next to nothing has no place on a logarithmic axis."""
+_NARROW = 3.0
+"""Times the least value up to which an axis is linear, whatever it should be."""
+_MOST_NAMES = 12
+"""Names of a front that fit beside a panel; of more, the cheapest are left out."""
+
+
+_SAME_PLACE = (0.02, 0.03)
+"""Parts of a panel's width and height within which two labels would cover each other."""
+
+
+def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
+    """Write chart.png, chart.html and chart.csv into a folder; return their paths."""
+    picture, page, table = (folder / f"chart.{kind}" for kind in ("png", "html", "csv"))
+    with whole_file(picture) as temporary:
+        save_figure(chart_figure(data), temporary)
+    write_text(page, chart_page(data))
+    write_text(table, data.to_csv())
+    return picture, page, table
+
+
+def chart_figure(data: ChartData) -> Figure:
+    """Draw a row of two panels for each group; the fronts as lines, their settings by number and name."""
+    from matplotlib.figure import Figure
+
+    groups = list(dict.fromkeys(p.group for p in data.points))
+    colours = colours_of(data)
+    views = _views(data)
+    figure = Figure(figsize=(13.5, 1.0 + 4.1 * len(groups)), layout="constrained")
+    grid = figure.subplots(len(groups), 3, squeeze=False, width_ratios=(1.35, 1.0, 0.6))
+    for row, group in zip(grid, groups, strict=True):
+        own = [p for p in data.points if p.group == group]
+        text = row[2]
+        text.set_axis_off()
+        blocks = []
+        for place, (axes, (cost, score)) in enumerate(zip(row, views, strict=False)):
+            front = _draw(axes, own, cost, score, colours)
+            heading = f"{group}: {score.words.split(' (')[0]}" if group else ""
+            axes.set_title(heading, fontsize=9, loc="left")
+            blocks.append(_named(front, f"Front, {'left' if place == 0 else 'right'}"))
+        text.text(0.0, 1.0, "\n\n".join(blocks), fontsize=8.5, va="top", transform=text.transAxes)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=5, frameon=False)
+    kind = "SIMULATED " if data.about.get("simulated") else ""
+    figure.suptitle(f"{kind}{title_of(data)}", fontsize=11, x=0.01, ha="left")
+    return figure
+
+
+def _views(data: ChartData) -> tuple[tuple[Axis, Axis], tuple[Axis, Axis]]:
+    """Return cost and score of the two panels."""
+    kind: Kind = data.kind
+    cost, score = kind.costs[0], kind.score_of(data.points)
+    if kind.name == "hologram":
+        return (cost, score), (cost, kind.scores[1])
+    other = kind.costs[1]
+    known = any(is_known(p, other.key) for p in data.points)
+    return (cost, score), (other if known or other is not MEMORY else cost, score)
+
+
+def _draw(
+    axes: Axes, points: Sequence[Point], cost: Axis, score: Axis, colours: Mapping[str, str]
+) -> list[Point]:
+    """Draw every setting's curve and the front; return the front's settings, as they are numbered."""
+    known = [p for p in points if is_known(p, cost.key) and is_known(p, score.key)]
+    for family, colour in colours.items():
+        mine = [p for p in known if p.family == family]
+        for number, name in enumerate(dict.fromkeys(p.setting for p in mine)):
+            run = [p for p in mine if p.setting == name]
+            axes.plot(
+                [_x(p, cost) for p in run],
+                [getattr(p, score.key) for p in run],
+                "o-",
+                ms=3 if len(run) > 1 else 5,
+                lw=0.6,
+                alpha=0.6,
+                color=colour,
+                label=None if number else family,
+            )
+    front = pareto(points, score, cost)
+    axes.plot(
+        [_x(p, cost) for p in front],
+        [getattr(p, score.key) for p in front],
+        "-",
+        drawstyle="steps-post",  # between two points of the front the cheaper one is all there is
+        color="black",
+        lw=1.4,
+        label="Pareto front",
+    )
+    axes.set(xlabel=cost.words, ylabel=score.words)
+    if cost.logarithmic and _is_wide([_x(p, cost) for p in known]):
+        axes.set_xscale("log")
+    if score.logarithmic and _is_wide([float(getattr(p, score.key)) for p in known]):
+        axes.set_yscale("log")
+    axes.grid(alpha=0.25)
+    axes.margins(0.07, 0.1)
+    # Each setting is named at its best point on the front.
+    named = sorted({p.setting: p for p in front}.values(), key=lambda p: _x(p, cost))[-_MOST_NAMES:]
+    places = [(_x(p, cost), float(getattr(p, score.key))) for p in named]
+    up = 1 if score.more_is_better else -1
+    for turn, (first, last) in enumerate(_together(axes, places)):
+        axes.annotate(
+            str(first + 1) if first == last else f"{first + 1}-{last + 1}",
+            places[last],
+            # In turns on the front's outer and inner side: neighbours do not cover each other.
+            xytext=(10, -9 * up) if turn % 2 else (-9, 9 * up),
+            textcoords="offset points",
+            fontsize=8,
+            fontweight="bold",
+            ha="center",
+            va="center",
+            bbox={"boxstyle": "round,pad=0.1", "color": "white", "alpha": 0.8},
+            arrowprops={"arrowstyle": "-", "lw": 0.5, "shrinkA": 0, "shrinkB": 2},
+        )
+    return named
+
+
+def _together(axes: Axes, places: Sequence[tuple[float, float]]) -> list[tuple[int, int]]:
+    """Return the first and last of neighbours for which one label must do: they lie on top of each other."""
+    runs: list[tuple[int, int]] = []
+    before = None
+    for number, place in enumerate(places):
+        at = axes.transLimits.transform(axes.transScale.transform(place))  # in fractions of the panel
+        if before is not None and all(abs(at - before) < _SAME_PLACE):
+            runs[-1] = (runs[-1][0], number)
+        else:
+            runs.append((number, number))
+        before = at
+    return runs
+
+
+def _is_wide(values: Sequence[float]) -> bool:
+    """Tell whether a logarithmic axis has ticks to show: over a narrow range it has hardly any."""
+    return bool(values) and max(values) > _NARROW * min(values)
+
+
+def _x(point: Point, cost: Axis) -> float:
+    return max(float(getattr(point, cost.key)), _LEAST.get(cost.key, 0.0))
+
+
+def _named(front: Sequence[Point], heading: str) -> str:
+    lines = [f"{number}  {in_words(p)}" for number, p in enumerate(front, start=1)]
+    return "\n".join([heading, *lines]) if lines else f"{heading}: nothing known"
+
+
+# Stability maps -------------------------------------------------------------------------------------
+def map_figure(record: Mapping[str, Any]) -> Figure:
+    """Draw a map as ``stability.json`` has it (one entry of ``maps``).
+
+    Severity is shown from blue (far from failing) over white (at the boundary) to brown (failed); each cell
+    carries its error; the red line is the boundary, severity 1.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    methods = record["methods"]
+    columns = min(len(methods), 3)
+    rows = -(-len(methods) // columns)
+    figure = Figure(figsize=(max(4.6 * columns + 0.9, 7.0), 3.5 * rows + 1.0), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[len(methods) :]:
+        axis.set_axis_off()
+    images = [
+        _draw_map(axis, name, method, record)
+        for axis, (name, method) in zip(axes, methods.items(), strict=False)
+    ]
+    bar = figure.colorbar(images[0], ax=list(axes), shrink=0.8, ticks=[-1, 0, 1])
+    bar.ax.set_yticklabels(["10 times\nbelow", "boundary", "10 times\nabove"], fontsize=8)
+    bar.set_label("severity", fontsize=9, color=_INK)
+    figure.suptitle(f"{record['title']} (SIMULATED)", fontsize=12, color=_INK, wrap=True)
+    return figure
+
+
+def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[str, Any]) -> Any:
+    severity = np.array([[np.nan if v is None else v for v in row] for row in method["severity"]], float)
+    level = np.log10(np.maximum(severity, 1e-2))
+    image = axes.imshow(level, origin="lower", aspect="auto", cmap="BrBG_r", vmin=-1, vmax=1)
+    n_y, n_x = severity.shape
+    for iy in range(n_y):
+        for ix in range(n_x):
+            error = method["error"][iy][ix]
+            if error is not None:
+                dark = abs(level[iy, ix]) > 0.75
+                axes.text(
+                    ix,
+                    iy,
+                    f"{error:.2g}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    color="white" if dark else _INK,
+                )
+    if n_x > 1 and n_y > 1 and np.isfinite(level).all() and level.min() < 0 <= level.max():
+        axes.contour(level, levels=[0.0], colors=[_BOUNDARY], linewidths=2.2)
+    for which, count in (("x", n_x), ("y", n_y)):
+        about = record[which]
+        getattr(axes, f"set_{which}ticks")(range(count))
+        getattr(axes, f"set_{which}ticklabels")(ticks_of(about), fontsize=8)
+        getattr(axes, f"set_{which}label")(_label(about), fontsize=9, color=_INK)
+    axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=_INK, loc="left")
+    return image
+
+
+def ticks_of(axis: Mapping[str, Any]) -> list[str]:
+    """Return the names of an axis' ticks: their own where it has some, else the values."""
+    own: list[str] = axis.get("ticks", [])
+    return own or [_short(v) for v in axis["values"]]
+
+
+def _label(axis: Mapping[str, Any]) -> str:
+    return f"{axis['label']} ({axis['unit']})" if axis["unit"] else str(axis["label"])
+
+
+def _short(value: float) -> str:
+    return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"

@@ -1,0 +1,374 @@
+"""Volumes on disk: written as OME-Zarr 0.5, and opened to be looked at plane by plane.
+
+What OME-Zarr says of an image (axes, steps, units, smaller levels to browse) is made here for frames and
+calibrations too. Of an opened volume nothing is read that is not looked at.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instrument.files.atomic import whole_folder
+from instrument.files.errors import FileError
+
+if TYPE_CHECKING:
+    from recon.reconstruction.result import Grid
+
+EVEN = 0.01
+"""Steps that differ by less than this part of the smallest are taken for even."""
+
+
+def middle_step_um(z_um: npt.NDArray[np.float64]) -> float:
+    """Return the step beside the middle plane, positive: what OME files get; NaN where it is not known."""
+    if len(z_um) < 2:
+        return float("nan")
+    middle = min(len(z_um) // 2, len(z_um) - 2)
+    return abs(float(z_um[middle + 1] - z_um[middle]))
+
+
+def uneven_steps(z_um: npt.NDArray[np.float64]) -> str:
+    """Say that planes are not evenly spaced, and which step an OME file has; empty where they are.
+
+    Parameters
+    ----------
+    z_um : ndarray, float64, (n_z,)
+        Depths of the planes, ascending or descending; not finite where they are not known.
+    """
+    steps = np.abs(np.diff(z_um))
+    if len(steps) < 2 or not np.isfinite(steps).all() or np.ptp(steps) <= EVEN * steps.min():
+        return ""
+    return (
+        f"steps of {steps.min():.4g} to {steps.max():.4g} µm. OME files know one step for all: "
+        f"{middle_step_um(z_um):.4g} µm, that of the middle, is written. Other programs stretch the others."
+    )
+
+
+SUFFIXES = (".ome.zarr", ".zarr")
+"""Names that ask for OME-Zarr."""
+_SMALLEST_LEVEL = 128
+"""Levels are halved laterally until the longer side is at most this many pixels."""
+
+
+def is_zarr_name(path: Path) -> bool:
+    """Whether a name asks for OME-Zarr."""
+    return path.name.lower().endswith(SUFFIXES)
+
+
+def write_volume_zarr(
+    path: Path, volume: npt.NDArray[np.float32], grid: Grid, attributes: dict[str, Any]
+) -> None:
+    """Write a volume as OME-Zarr 0.5, whole or not at all; a folder of that name is replaced.
+
+    Parameters
+    ----------
+    path : Path
+        The folder to be.
+    volume : ndarray, float32, (n_z, height, width) or (n_z, height, width, n_channels)
+        Stored as ``z, y, x`` or, in OME-Zarr's order, ``c, z, y, x``.
+    grid : Grid
+        OME-Zarr knows one voxel size for all planes: that of the middle one is written where it is known, and
+        every plane's own ``z_um`` and ``pitch_um`` beside it in the group's attribute ``diffuserbench``.
+    attributes : dict
+        JSON-compatible; what else shall stand in the attribute ``diffuserbench``.
+
+    Raises
+    ------
+    OSError
+        When the disk is full or not writable; what was there before stays as it was.
+    """
+    import zarr
+
+    data = volume[None] if volume.ndim == 3 else np.moveaxis(volume, -1, 0)
+    colour = volume.ndim == 4
+    with whole_folder(path) as draft:
+        group = zarr.open_group(draft, mode="w", zarr_format=3)
+        names = ["c", "z", "y", "x"] if colour else ["z", "y", "x"]
+        levels = []
+        for level, step, pixels in _levels(data):
+            pixels = pixels if colour else pixels[0]
+            group.create_array(
+                str(level),
+                data=np.ascontiguousarray(pixels),
+                chunks=(1,) * (pixels.ndim - 2) + pixels.shape[-2:],
+                dimension_names=names,
+            )
+            levels.append(step)
+        group.attrs["ome"] = ome_attributes(
+            path.name, names, _steps(grid), levels=levels, more={"type": "local mean"}
+        )
+        planes = {"z_um": _known(grid.z_um), "pitch_um": _known(grid.pitch_um)}
+        group.attrs["diffuserbench"] = attributes | planes
+
+
+def _levels(
+    data: npt.NDArray[np.float32],
+) -> Sequence[tuple[int, int, npt.NDArray[np.float32]]]:
+    """Return (level, lateral step, pixels), each level the mean of 2 x 2 pixels of the one before."""
+    levels, step = [(0, 1, data)], 1
+    while max(data.shape[-2:]) > _SMALLEST_LEVEL and min(data.shape[-2:]) >= 2:
+        height, width = (n // 2 * 2 for n in data.shape[-2:])
+        blocks = data[..., :height, :width].reshape(*data.shape[:-2], height // 2, 2, width // 2, 2)
+        data = blocks.mean(axis=(-3, -1), dtype=np.float32)
+        step *= 2
+        levels.append((len(levels), step, data))
+    return levels
+
+
+def _steps(grid: Grid) -> dict[str, float | None]:
+    """Return the middle plane's voxel size; None where it is not known."""
+    if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
+        return {}
+    middle = len(grid.z_um) // 2
+    pitch = float(grid.pitch_um[middle])
+    return {"z": float(grid.spacing_um[middle]), "y": pitch, "x": pitch}
+
+
+def _known(values: npt.NDArray[np.float64]) -> list[float] | None:
+    return [float(v) for v in values] if np.isfinite(values).all() else None
+
+
+_KINDS = {"t": ("time", "second"), "c": ("channel", ""), "z": ("space", "micrometer")}
+_KINDS |= dict.fromkeys("yx", _KINDS["z"])
+
+
+def ome_attributes(
+    name: str,
+    axes: Sequence[str],
+    steps: Mapping[str, float | None],
+    *,
+    levels: Sequence[int] = (1,),
+    more: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the attribute ``ome`` of an image's group.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder; its suffix is left off.
+    axes : sequence of str
+        Of ``t``, ``c``, ``z``, ``y``, ``x``, in the array's order.
+    steps : mapping of axis to float or None
+        From one to the next: seconds, micrometres. An axis that is not known, or not there, has no unit and
+        the step 1.
+    levels : sequence of int
+        Lateral binning of each level, the first 1; the levels are called ``0``, ``1`` ...
+    more : mapping, optional
+        Further keys of the multiscale.
+    """
+    datasets = []
+    for level, binning in enumerate(levels):
+        scale = [(steps.get(a) or 1.0) * (binning if a in "yx" else 1) for a in axes]
+        transformations: list[dict[str, Any]] = [{"type": "scale", "scale": scale}]
+        if binning > 1:
+            # The centre of a larger pixel lies half of the difference away from that of the first small one.
+            shift = [(steps.get(a) or 1.0) * (binning - 1) / 2 if a in "yx" else 0.0 for a in axes]
+            transformations.append({"type": "translation", "translation": shift})
+        datasets.append({"path": str(level), "coordinateTransformations": transformations})
+    multiscale = {
+        "name": name.removesuffix(".zarr").removesuffix(".ome"),
+        "axes": [ome_axis(axis, known=bool(steps.get(axis))) for axis in axes],
+        "datasets": datasets,
+        **(more or {}),
+    }
+    return {"version": "0.5", "multiscales": [multiscale]}
+
+
+def ome_axis(axis: str, *, known: bool) -> dict[str, str]:
+    """Return an axis as OME-Zarr describes it; with its unit where its step is known."""
+    kind, unit = _KINDS[axis]
+    return {"name": axis, "type": kind, **({"unit": unit} if known and unit else {})}
+
+
+Plane = npt.NDArray[np.float32]
+_SIDE_PIXELS = 1 << 20
+"""Slices along depth are read from the finest level whose planes are no larger: each touches every plane."""
+
+
+class VolumeSource:
+    """Voxels that are read when they are asked for; may be asked from any thread.
+
+    Parameters
+    ----------
+    path : Path
+        Where it lies, for messages.
+    levels : sequence of callable
+        ``read(z, y, x)`` takes slices or numbers and returns (..., n_channels); the finest level first.
+    shapes : sequence of (int, int, int)
+        ``(n_z, height, width)`` of each level.
+    n_channels : int
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        levels: list[Callable[[Any, Any, Any], npt.NDArray[Any]]],
+        shapes: list[tuple[int, int, int]],
+        n_channels: int,
+        close: Callable[[], object] | None = None,
+    ) -> None:
+        self.path = path
+        self.shape = shapes[0]
+        self.n_channels = n_channels
+        self._levels = levels
+        self._shapes = shapes
+        self._close = close
+        self._lock = threading.Lock()  # readers of files are not made for several threads
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of all voxels, were they in memory."""
+        return 4 * int(np.prod(self.shape)) * self.n_channels
+
+    def plane(self, z: int) -> Plane:
+        """Return a plane, float32 (height, width) or (height, width, n_channels)."""
+        return self._read(self._levels[0], z, slice(None), slice(None))
+
+    def across_y(self, y: int) -> Plane:
+        """Return the slice at row ``y``, float32 (n_z, width[, n_channels]); coarser for large planes."""
+        level = self._side_level()
+        rows = self._shapes[level][1]
+        row = min(y * rows // self.shape[1], rows - 1)
+        return self._read(self._levels[level], slice(None), row, slice(None))
+
+    def across_x(self, x: int) -> Plane:
+        """Return the slice at column ``x``, float32 (n_z, height[, n_channels]); coarser as above."""
+        level = self._side_level()
+        columns = self._shapes[level][2]
+        column = min(x * columns // self.shape[2], columns - 1)
+        return self._read(self._levels[level], slice(None), slice(None), column)
+
+    def close(self) -> None:
+        """Close the files; nothing can be read afterwards."""
+        if self._close is not None:
+            with self._lock:
+                self._close()
+
+    def _side_level(self) -> int:
+        for level, (_, height, width) in enumerate(self._shapes):
+            if height * width <= _SIDE_PIXELS:
+                return level
+        return len(self._shapes) - 1
+
+    def _read(self, read: Callable[[Any, Any, Any], npt.NDArray[Any]], z: Any, y: Any, x: Any) -> Plane:
+        try:
+            with self._lock:
+                voxels = np.asarray(read(z, y, x), np.float32)
+        except (OSError, ValueError) as error:
+            raise FileError(self.path, f"cannot be read at plane {z}: {error}.") from error
+        # A damaged voxel must not make the whole view blank.
+        voxels = np.nan_to_num(voxels, nan=0.0, posinf=0.0, neginf=0.0)
+        return voxels[..., 0] if self.n_channels == 1 else voxels
+
+
+def open_volume(path: Path | str) -> VolumeSource:
+    """Open a volume: OME-Zarr (``z, y, x`` or ``c, z, y, x``), TIFF (``ZYX``, ``ZCYX``, or pages), .npy.
+
+    Raises
+    ------
+    FileError
+        When it is no volume, or the file is damaged; it names the shape that was found.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileError(path, "there is no such file.")
+    if is_zarr_name(path) or (path / "zarr.json").is_file():
+        return _open_zarr(path)
+    if path.suffix.lower() == ".npy":
+        return _open_npy(path)
+    if path.suffix.lower() in (".tif", ".tiff"):
+        return _open_tiff(path)
+    raise FileError(path, "is no volume: an OME-Zarr folder, a TIFF or a .npy file is expected.")
+
+
+def volume_in_memory(voxels: npt.NDArray[Any], path: Path) -> VolumeSource:
+    """Return a source of an array, (n_z, height, width) or (n_z, height, width, n_channels).
+
+    ``path`` is what messages call it. The array may be a memory map.
+
+    Raises
+    ------
+    FileError
+        When it has another number of axes, or no voxel.
+    """
+    if voxels.ndim not in (3, 4) or 0 in voxels.shape or voxels.dtype.kind not in "uif":
+        raise FileError(
+            path,
+            f"holds {voxels.dtype} {voxels.shape}; a volume of real numbers is expected: planes, rows, "
+            "columns, and perhaps channels.",
+        )
+    view = voxels[..., None] if voxels.ndim == 3 else voxels
+    shape = (view.shape[0], view.shape[1], view.shape[2])
+    return VolumeSource(path, [lambda z, y, x: view[z, y, x]], [shape], view.shape[3])
+
+
+def _open_zarr(path: Path) -> VolumeSource:
+    import zarr
+
+    try:
+        group: Any = zarr.open_group(path, mode="r")
+        multiscale = group.attrs["ome"]["multiscales"][0]
+        names = [axis["name"] for axis in multiscale["axes"]]
+        arrays = [group[dataset["path"]] for dataset in multiscale["datasets"]]
+    except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise FileError(path, f"is no OME-Zarr 0.5 image: {error!r}.") from error
+    if names not in (["z", "y", "x"], ["c", "z", "y", "x"]):
+        raise FileError(path, f"has the axes {', '.join(names)}; a volume has z, y, x, or c before them.")
+
+    def reader(array: Any) -> Callable[[Any, Any, Any], npt.NDArray[Any]]:
+        if len(names) == 3:
+            return lambda z, y, x: np.asarray(array[z, y, x])[..., None]
+        return lambda z, y, x: np.moveaxis(np.asarray(array[:, z, y, x]), 0, -1)
+
+    shapes = [(a.shape[-3], a.shape[-2], a.shape[-1]) for a in arrays]
+    n_channels = 1 if len(names) == 3 else int(arrays[0].shape[0])
+    return VolumeSource(path, [reader(a) for a in arrays], shapes, n_channels)
+
+
+def _open_npy(path: Path) -> VolumeSource:
+    try:
+        return volume_in_memory(np.load(path, mmap_mode="r", allow_pickle=False), path)
+    except (ValueError, EOFError, OSError) as error:
+        raise FileError(path, f"is no plain .npy array: {error}.") from error
+
+
+def _open_tiff(path: Path) -> VolumeSource:
+    """Map the file where it lies in one piece, else read it page by page."""
+    import tifffile
+
+    try:
+        tiff = tifffile.TiffFile(path)
+    except (OSError, tifffile.TiffFileError) as error:
+        raise FileError(path, f"is no TIFF: {error}.") from error
+    series: Any = tiff.series[0]
+    axes = series.axes.replace("S", "C")
+    if len(axes) == 3 and axes.endswith("YX"):
+        axes = "ZYX"  # a stack of pages from elsewhere: whatever its axis is called, it is the depth
+    shape = dict(zip(axes, series.shape, strict=True))
+    if axes not in ("ZYX", "ZCYX", "ZYXC"):
+        tiff.close()
+        raise FileError(
+            path, f"holds {series.axes} {series.shape}; a volume (ZYX, with or without C) is expected."
+        )
+    if series.dataoffset is not None and series.dtype.byteorder in ("=", "|", "<"):
+        tiff.close()
+        mapped = tifffile.memmap(path, mode="r")
+        return volume_in_memory(np.moveaxis(mapped, 1, -1) if axes == "ZCYX" else mapped, path)
+    per_plane = shape.get("C", 1) if axes == "ZCYX" else 1
+
+    def read(z: Any, y: Any, x: Any) -> npt.NDArray[Any]:
+        numbers = [z] if isinstance(z, int) else list(range(*z.indices(shape["Z"])))
+        planes = []
+        for number in numbers:
+            pages = [series[number * per_plane + c].asarray() for c in range(per_plane)]
+            whole = np.stack(pages, axis=-1) if axes != "ZYXC" else pages[0]
+            planes.append(whole[y, x])
+        return planes[0] if isinstance(z, int) else np.stack(planes)
+
+    size = (shape["Z"], shape["Y"], shape["X"])
+    return VolumeSource(path, [read], [size], shape.get("C", 1), tiff.close)

@@ -1,0 +1,199 @@
+"""Looking at runs: those of a folder, a picture of one, and whether one is what it says it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from instrument.bench.photograph import Progress
+from instrument.files.atomic import whole_file
+from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What reading a whole run found.
+
+    Attributes
+    ----------
+    frames : int
+        Frames that are as they were written.
+    damaged : tuple of DamagedFrame
+        Frames that the log calls written and that are not as they were.
+    problems : tuple of str
+        Whatever else contradicts itself.
+    """
+
+    frames: int
+    damaged: tuple[DamagedFrame, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong. A run that ended early is sound, only not complete."""
+        return not self.damaged and not self.problems
+
+
+def verify(run: Run, on_progress: Progress | None = None) -> Verification:
+    """Read every frame of a run and hold it, its metadata and the image array against the log.
+
+    ``on_progress`` is called with frames read and frames to read.
+    """
+    damaged = run.damaged(on_progress)
+    return Verification(len(run.records) - len(damaged), damaged, tuple(_contradictions(run)))
+
+
+def _contradictions(run: Run) -> list[str]:
+    problems: list[str] = []
+    if run.torn_bytes:
+        problems.append(f"the log ends in a half line of {run.torn_bytes} bytes")
+    if run.reason is FinishReason.COMPLETED and run.plan is not None and run.missing():
+        problems.append(f"marked as completed, but frames {_few(run.missing())} are not there")
+    beyond = [index for index in run.records if not 0 <= index < run.n_frames]
+    if beyond:
+        problems.append(f"the log has frames {_few(beyond)}, beyond the plan's {run.n_frames}")
+    gaps = [index for gap in run.gaps for index in range(gap.first, gap.first + gap.count)]
+    if both := sorted(set(gaps) & set(run.records)):
+        problems.append(f"frames {_few(both)} are both stored and lost")
+    if run.plan is None and (nowhere := sorted(set(run.missing()) - set(gaps))):
+        problems.append(f"frames {_few(nowhere)} are neither stored nor accounted for as lost")
+    if run.has_frames:
+        problems += _array_contradictions(run)
+    if run.plan is not None:
+        for step in run.plan.whole_steps():
+            record = run.records.get(step.index)
+            if record is not None and record.average != step.average:
+                problems.append(f"frame {step.index} averages {record.average}, planned were {step.average}")
+    return problems
+
+
+def _array_contradictions(run: Run) -> list[str]:
+    problems: list[str] = []
+    array = run.array
+    if run.plan is not None and array.n_frames != len(run.plan):
+        problems.append(f"the image array is for {array.n_frames} frames, the plan has {len(run.plan)}")
+    if run.plan is None and run.reason is not None and array.n_frames != run.n_frames:
+        problems.append(f"the image array is for {array.n_frames} frames, the log knows {run.n_frames}")
+    height, width = array.frame_shape[:2]
+    for index, record in run.records.items():
+        roi, binning = record.metadata.roi, record.metadata.binning
+        if (roi[2] // binning, roi[3] // binning) != (height, width):
+            problems.append(
+                f"frame {index}: its region {roi} at binning {binning} is not {height} x {width} pixels"
+            )
+    return problems
+
+
+def _few(indices: list[int]) -> str:
+    text = ", ".join(map(str, indices[:8]))
+    return text if len(indices) <= 8 else f"{text} and {len(indices) - 8} more"
+
+
+COLUMNS, ROWS = 4, 3
+
+
+def contact_sheet(run: Run, path: Path) -> list[int]:
+    """Write a picture of up to twelve of a run's frames, spread evenly, as PNG; returns which.
+
+    Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red.
+
+    Raises
+    ------
+    RunError
+        When the run has no frames.
+    FileError
+        When ``path`` cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    stored = sorted(run.records)
+    if not stored:
+        raise RunError(run.path, "has no frames to show.")
+    chosen = np.unique(np.linspace(0, len(stored) - 1, min(len(stored), COLUMNS * ROWS)).round().astype(int))
+    indices = [stored[i] for i in chosen]
+    rows = -(-len(indices) // COLUMNS)
+    figure = Figure(figsize=(3.2 * COLUMNS, 2.9 * rows + 0.5), layout="constrained")
+    mark = "  SIMULATED" if run.is_simulated else ""
+    figure.suptitle(
+        f"{run.path.name}: {run.condition}, {len(stored)} of {run.n_frames} frames{mark}  (red: saturated)"
+    )
+    labels = {step.index: step.label for step in run.steps()} if run.plan is not None else {}
+    for place, index in enumerate(indices, start=1):
+        axes = figure.add_subplot(rows, COLUMNS, place)
+        axes.imshow(_shown(run, index))
+        metadata = run.metadata(index)
+        axes.set_title(
+            f"{index} {labels.get(index, '')}  {metadata.exposure_ms:g} ms\n{metadata.led_pattern}",
+            fontsize=8,
+        )
+        axes.set_axis_off()
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=100, format="png")
+    return indices
+
+
+def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    frame = run.frame(index)
+    step = max(1, frame.shape[1] // 640)
+    frame = frame[::step, ::step].astype(np.float32)
+    low, high = np.percentile(frame, (0.1, 99.9))
+    grey = np.clip((frame - low) / max(high - low, 1.0), 0, 1)
+    picture = grey if grey.ndim == 3 else np.repeat(grey[..., None], 3, axis=2)
+    full_scale = (1 << run.metadata(index).significant_bits) - 1
+    saturated = frame >= full_scale if frame.ndim == 2 else np.any(frame >= full_scale, axis=2)
+    picture[saturated] = (1, 0, 0)
+    return picture.astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """One run of a folder.
+
+    Attributes
+    ----------
+    path : Path
+    condition : RunCondition or None
+        None when it cannot be read; ``problem`` says why.
+    label : str
+    stored, frames : int
+        Frames on the disk, and those that belong to it.
+    is_recording : bool
+    is_simulated : bool
+    problem : str
+    """
+
+    path: Path
+    condition: RunCondition | None = None
+    label: str = ""
+    stored: int = 0
+    frames: int = 0
+    is_recording: bool = False
+    is_simulated: bool = False
+    problem: str = ""
+
+
+def run_paths(folder: Path) -> list[Path]:
+    """Return the folders of the runs in a folder, the oldest first; empty where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if not p.name.startswith(".") and (p / STATE).is_file())
+
+
+def summary(path: Path) -> RunSummary:
+    """Return what became of a run."""
+    try:
+        run = Run.open(path)
+        return RunSummary(
+            path,
+            run.condition,
+            run.label,
+            len(run.records),
+            run.n_frames,
+            run.plan is None,
+            run.is_simulated,
+            run.error,
+        )
+    except RunError as error:
+        return RunSummary(path, problem=error.problem)

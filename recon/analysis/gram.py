@@ -1,0 +1,270 @@
+"""What of ``A^T A`` a few voxels need: can neighbours be told apart, and a window reconstructed exactly.
+
+If an oracle tells which voxels are lit, their values are a least-squares problem with the columns of these
+voxels alone; its condition number bounds what noise does to them (Kuo 2020, sec. 4.4, Fig. 4.5). Columns are
+never put together to a matrix: their inner products (the Gram matrix, double precision) are enough, whose
+eigenvalues are the squares of the singular values.
+
+``min_y>=0 1/2 ||A y - b||^2`` needs the sensor only through ``A^T b`` and ``A^T A``. Where the object is
+known to lie in a window of some thousand voxels, both are small: ``A^T A`` holds the cross-correlations of
+the planes' PSFs at the shifts within the window. The minimiser is that of a reconstruction on the whole
+sensor which is told that nothing is outside the window, at the cost of some small transforms an iteration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base import fft
+from recon.errors import InputError
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+Direction = Literal["x", "z", "xz"]
+
+WORST = 1e7
+"""Condition numbers above this are rounding: the Gram matrix holds their squares, in 16 digits."""
+TOLERANCE = 3e-5
+MOST_ITERATIONS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Voxel:
+    """A voxel: depth plane, and rows and columns from the axis in sensor pixels."""
+
+    plane: int
+    row: int = 0
+    column: int = 0
+
+
+def group(direction: Direction, count: int, separation: int, *, first_plane: int = 0) -> tuple[Voxel, ...]:
+    """Return voxels of a regular group.
+
+    Parameters
+    ----------
+    direction : "x", "z" or "xz"
+        A line of ``count`` along the columns or along depth, or a square of ``count`` in both.
+    count : int
+        For ``"xz"`` a square number.
+    separation : int
+        Voxels from one to the next; in ``"xz"`` in both directions.
+    first_plane : int
+        Nearest plane of the group.
+    """
+    if direction == "x":
+        start = -separation * (count - 1) // 2
+        return tuple(Voxel(first_plane, 0, start + separation * k) for k in range(count))
+    if direction == "z":
+        return tuple(Voxel(first_plane + separation * k) for k in range(count))
+    side = round(count**0.5)
+    if side * side != count:
+        raise InputError(f"A group in x and z is a square: 4, 9, 16, ... sources, not {count}.")
+    start = -separation * (side - 1) // 2
+    return tuple(
+        Voxel(first_plane + separation * j, 0, start + separation * i)
+        for j in range(side)
+        for i in range(side)
+    )
+
+
+def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Floats:
+    """Inner products of the columns of voxels: each plane's PSF, shifted, and cropped to the sensor.
+
+    Parameters
+    ----------
+    planes : ndarray, (n_z, height, width)
+        On-axis PSFs.
+    voxels : sequence of Voxel
+
+    Returns
+    -------
+    ndarray, float64, (n, n)
+    """
+    height, width = planes.shape[1:]
+    for voxel in voxels:
+        if not 0 <= voxel.plane < len(planes) or abs(voxel.row) >= height or abs(voxel.column) >= width:
+            raise InputError(f"{voxel} is not within {len(planes)} planes of {height} x {width} pixels.")
+    gram = np.empty((len(voxels), len(voxels)))
+    for i, first in enumerate(voxels):
+        for j in range(i, len(voxels)):
+            gram[i, j] = gram[j, i] = _product(planes, first, voxels[j])
+    return gram
+
+
+def condition_number(gram: Floats) -> float:
+    """Condition number of the columns with this Gram matrix, each column divided by its norm.
+
+    Infinite where a column is zero or the columns are dependent as far as double precision tells.
+    """
+    norms = np.sqrt(np.diag(gram))
+    if not (norms > 0).all():
+        return float("inf")
+    values = np.linalg.eigvalsh(gram / np.outer(norms, norms))
+    if values[0] <= values[-1] / WORST**2:
+        return float("inf")
+    return float(np.sqrt(values[-1] / values[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionCurve:
+    """Condition number of groups of ``count`` sources at growing separations, in voxels."""
+
+    direction: Direction
+    count: int
+    separations: tuple[int, ...]
+    values: tuple[float, ...]
+
+
+def condition_curve(
+    planes: Array, direction: Direction, count: int, separations: Sequence[int]
+) -> ConditionCurve:
+    """Compute one curve of Fig. 4.5; separations for which there are too few planes are left out."""
+    kept, values = [], []
+    side = round(count**0.5) if direction == "xz" else count
+    for separation in separations:
+        depth = separation * (side - 1) + 1 if direction != "x" else 1
+        reach = separation * (side - 1) + 1 if direction != "z" else 1
+        if depth > len(planes) or reach > planes.shape[2] // 2:
+            continue
+        voxels = group(direction, count, separation, first_plane=(len(planes) - depth) // 2)
+        kept.append(int(separation))
+        values.append(condition_number(gram_matrix(planes, voxels)))
+    return ConditionCurve(direction, count, tuple(kept), tuple(values))
+
+
+def _product(planes: Array, first: Voxel, second: Voxel) -> float:
+    """Inner product of two shifted, cropped PSFs, without copies."""
+    cuts: list[list[slice]] = [[], []]
+    for size, a, b in zip(
+        planes.shape[1:], (first.row, first.column), (second.row, second.column), strict=True
+    ):
+        # On the sensor both are present from max(a, b, 0) to size + min(a, b, 0).
+        low, high = max(a, b, 0), size + min(a, b, 0)
+        if high <= low:
+            return 0.0
+        cuts[0].append(slice(low - a, high - a))
+        cuts[1].append(slice(low - b, high - b))
+    one, two = planes[first.plane][tuple(cuts[0])], planes[second.plane][tuple(cuts[1])]
+    return float(np.einsum("ij,ij->", one, two, dtype=np.float64))
+
+
+# Windows --------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class WindowSolution:
+    """What a window was reconstructed to.
+
+    Attributes
+    ----------
+    volume : ndarray, float64, (n_z, height, width)
+    iterations : int
+    change : float
+        Relative change in the last iteration.
+    """
+
+    volume: Floats
+    iterations: int
+    change: float
+
+
+class WindowProblem:
+    """Reconstructs windows about the axis with tau = 0: least squares with non-negativity (Eq. 4.2).
+
+    The sensor is taken for large enough to hold the shifted PSFs: right for windows small against the dark
+    rim around the pattern.
+
+    Parameters
+    ----------
+    planes : ndarray, (n_z, height, width)
+        On-axis PSFs of the window's planes.
+    half : (int, int)
+        Rows and columns that the window reaches from the axis: ``2 half + 1`` voxels.
+    """
+
+    def __init__(self, planes: Array, half: tuple[int, int]) -> None:
+        if planes.ndim != 3:
+            raise InputError(f"Planes are (n_z, height, width), not {planes.shape}.")
+        self.half = half
+        self.n_z = len(planes)
+        self.sensor_shape = planes.shape[1:]
+        self._norms = np.sqrt(np.einsum("zij,zij->z", planes, planes, dtype=np.float64))
+        if not (self._norms > 0).all():
+            raise InputError("A plane's PSF is zero everywhere.")
+        reach = [2 * h for h in half]
+        self._grid = fft.fast_shape([n + r for n, r in zip(self.sensor_shape, reach, strict=True)])
+        self._spectra = np.stack([self._spectrum(p / n) for p, n in zip(planes, self._norms, strict=True)])
+        self._small = fft.fast_shape([2 * r + 1 for r in reach])
+        # (frequencies, n_z, n_z): one small matrix product for each frequency.
+        self._gram = self._correlations(reach)
+        # Circulant embedding: the window's A^T A is a compression of it, so its norm bounds ours.
+        self._lipschitz = float(np.linalg.eigvalsh(self._gram)[:, -1].max())
+
+    def adjoint(self, data: Array) -> Floats:
+        """Return ``A^T b`` in the window; columns have norm 1."""
+        spectrum = self._spectrum(data)
+        return np.stack(
+            [self._around(fft.irfft(spectrum * np.conj(h), self._grid[1]), self.half) for h in self._spectra]
+        )
+
+    def solve(
+        self, data: Array, *, iterations: int = MOST_ITERATIONS, tolerance: float = TOLERANCE
+    ) -> WindowSolution:
+        """Reconstruct from an image (height, width): accelerated projected gradient with restart.
+
+        The step is 1 over a bound of the norm of ``A^T A``. In units of the PSFs as given.
+        """
+        if data.shape != self.sensor_shape:
+            raise InputError(f"The image is {data.shape}, the PSFs are {self.sensor_shape}.")
+        target = self.adjoint(data)
+        x = np.zeros_like(target)
+        y, t, change = x, 1.0, np.inf
+        done = 0
+        for done in range(1, iterations + 1):  # noqa: B007 (how many it took)
+            new = np.maximum(y - (self._normal(y) - target) / self._lipschitz, 0.0)
+            step = new - x
+            if float(np.vdot(y - new, step)) > 0:  # the momentum points against the descent
+                t = 1.0
+            t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
+            y = new + (t - 1) / t_next * step
+            x, t = new, t_next
+            size = float(np.linalg.norm(x))
+            change = float(np.linalg.norm(step)) / size if size > 0 else 0.0
+            if change < tolerance:
+                break
+        return WindowSolution(x / self._norms[:, None, None], done, change)
+
+    def _normal(self, x: Floats) -> Floats:
+        """``A^T A x`` in the window."""
+        rows, columns = (2 * h + 1 for h in self.half)
+        padded = np.zeros((self.n_z, *self._small))
+        padded[:, :rows, :columns] = x
+        spectra = fft.rfft(padded).reshape(self.n_z, -1)
+        seen = np.matmul(self._gram, spectra.T[:, :, None])[:, :, 0].T
+        shape = (self.n_z, *fft.spectrum_shape(self._small))
+        return fft.irfft(np.ascontiguousarray(seen).reshape(shape), self._small[1])[:, :rows, :columns]
+
+    def _correlations(self, reach: list[int]) -> npt.NDArray[np.complex128]:
+        gram = np.empty((self.n_z, self.n_z, *fft.spectrum_shape(self._small)), np.complex128)
+        for j in range(self.n_z):
+            for k in range(j, self.n_z):
+                product = np.conj(self._spectra[j]) * self._spectra[k]
+                near = self._around(fft.irfft(product, self._grid[1]), (reach[0], reach[1]))
+                kernel = np.zeros(self._small)
+                kernel[: near.shape[0], : near.shape[1]] = near
+                kernel = np.roll(kernel, (-reach[0], -reach[1]), (0, 1))
+                gram[j, k] = fft.rfft(kernel)
+                gram[k, j] = np.conj(gram[j, k])
+        return np.ascontiguousarray(gram.reshape(self.n_z, self.n_z, -1).transpose(2, 0, 1))
+
+    def _spectrum(self, image: Array) -> Array:
+        padded = np.zeros(self._grid)
+        padded[: image.shape[0], : image.shape[1]] = image
+        return fft.rfft(padded)
+
+    def _around(self, correlation: Floats, half: tuple[int, int]) -> Floats:
+        rows, columns = (np.arange(-h, h + 1) for h in half)
+        return correlation[np.ix_(rows, columns)]

@@ -1,0 +1,385 @@
+"""What each choice goes by: camera model, field and pixels, background, when to stop, precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR, TOLERATED, Depths, ModelName, choose_model
+from recon.camera.varying_psfs import FieldOfPsfs, principal_psfs
+from recon.reconstruction.choice import ERROR_SCALE, Decision, Option, left_out_db, loss_db
+from recon.reconstruction.options import Overrides
+from recon.reconstruction.probe import ACCEPTED, CoarsePass, acceptance_px, psf_window, resolution_px
+from recon.verdict.cases import shipped_maps
+from recon.verdict.map import PRECISION
+
+VARYING_COST = 3.0
+"""Operator applications an iteration of conjugate gradients, relative to a convolution."""
+HIDDEN, HIDDEN_VARIATION = 4.0, 0.4
+"""Volumes by total variation: the PSFs' relative differences times the data's contrast in units of its
+noise, and the differences themselves, up to which one convolution serves. Below, in 16 dim volumes, the true
+camera was 0.1 dB worse in the mean (between 1.4 better and 1.6 worse), for four times the time; where PSFs
+differed by 0.7 it was up to 1.3 dB better however dim, as it was with l1 and in pictures at any light."""
+
+
+def candidates(depths: Depths) -> tuple[ModelName, ...]:
+    """Return the camera models that a calibration allows, the smallest first."""
+    return ("convolution", "lowrank", "local") if depths.varies else ("convolution",)
+
+
+def model_of(
+    depths: Depths, overrides: Overrides, contrast: float | None, pixels: Callable[[ModelName], int]
+) -> tuple[ModelName, str, float]:
+    """Return the camera model, why, and by how much PSFs vary over the field.
+
+    Parameters
+    ----------
+    depths : Depths
+    overrides : Overrides
+    contrast : float or None
+        Standard deviation of the data in units of its noise, of a volume with total variation; None: of
+        anything else.
+    pixels : callable
+        Pixels that a model transforms in one forward and adjoint: its cost.
+    """
+    variation = depths.field_error if depths.varies else 0.0
+    if overrides.model is not None:
+        return choose_model(depths, overrides.model)[0], "as asked", variation
+    model, why = choose_model(depths, "auto")
+    if model == "convolution":
+        return model, why, variation
+    differ = f"PSFs differ by {variation:.1%} over the field"
+    if contrast is not None and contrast * variation <= HIDDEN and variation <= HIDDEN_VARIATION:
+        return (
+            "convolution",
+            f"{differ}; in data whose contrast is {contrast:.1f} times the noise that is "
+            f"{contrast * variation:.1f} times the noise, and up to {HIDDEN:g} is hidden in that of a volume",
+            variation,
+        )
+    rank = len(principal_psfs(_densest(depths), error=LOW_RANK_ERROR).components)
+    components = f"{differ}; {rank} component{'s' if rank > 1 else ''} tell all but {LOW_RANK_ERROR:.0%}"
+    share = pixels("lowrank") / max(pixels("local"), 1)
+    if share < 1:
+        return "lowrank", f"{components}, at {share:.2f} of the local model's transforms", variation
+    return "local", f"{components}, at {share:.2f} times the local model's transforms", variation
+
+
+def _densest(depths: Depths) -> FieldOfPsfs:
+    return max(depths.fields, key=lambda f: len(f.points))
+
+
+def model_decision(
+    model: ModelName,
+    why: str,
+    variation: float,
+    depths: Depths,
+    times: Mapping[ModelName, float],
+    overrides: Overrides,
+) -> Decision:
+    """Add the neighbours on the scale convolution, low-rank, local, and what was not judged."""
+    scale = candidates(depths)
+    unjudged = [name for name, offered in CAMERAS.items() if offered.refuses(depths) is None]
+    if unjudged and overrides.model is None:
+        why += (
+            f"; left out: {', '.join(unjudged)}, of which nobody knows what it costs and gains "
+            f"(--model {unjudged[0]} takes it)"
+        )
+    numbers = {"psf_variation": variation, "tolerated": TOLERATED}
+    if len(scale) == 1 or model not in scale:
+        return Decision("model", model, why, numbers=numbers, overruled=overrides.model is not None)
+    low = principal_psfs(_densest(depths), error=LOW_RANK_ERROR)
+    numbers |= {"rank": float(len(low.components)), "rank_error": low.error}
+    loss = {"convolution": loss_db(variation), "lowrank": loss_db(low.error), "local": 0.0}
+
+    def cost(m: ModelName) -> float:
+        kind = "convolution" if m == "convolution" else "varying"
+        applications = 1.0 if m == "convolution" else VARYING_COST
+        return times[m] * applications * USUAL_ITERATIONS[kind]
+
+    def step(by: int) -> Option | None:
+        place = scale.index(model) + by
+        if not 0 <= place < len(scale):
+            return None
+        other = scale[place]
+        return Option(other, cost(other) / cost(model), loss[other] - loss[model])
+
+    return Decision("model", model, why, loss[model], step(1), step(-1), overrides.model is not None, numbers)
+
+
+LEAST_SIDE = 20
+"""Pixels along the longest side that binning leaves at least."""
+SAMPLES = 7.0
+"""Pixels over the full width of a PSF's autocorrelation at half its height. With 5 a soft picture lost 0.6
+dB: priors bring back more than the PSF's width says."""
+
+
+def binning_of(depths: Depths, overrides: Overrides, *, whole: bool) -> Decision:
+    """Decide how many pixels are averaged; ``whole``: none is erased."""
+    sharpest = min(resolution_px(p) for psfs in depths.central for p in psfs)
+    side = max(depths.central.shape[2:])
+    if not np.isfinite(sharpest):
+        sharpest = float(side)
+    fitting = min(max(1, int(sharpest / SAMPLES)), max(1, side // LEAST_SIDE))
+    asked = overrides.binning is not None
+    binning = overrides.binning or (fitting if whole else 1)
+    why = (
+        f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, and "
+        f"{SAMPLES:g} (binned) pixels over that width are enough"
+    )
+    if sharpest < SAMPLES:
+        why = (
+            f"the sharpest PSF's autocorrelation is {sharpest:.1f} pixels wide at half its height, less than "
+            f"the {SAMPLES:g} that would be enough: there is nothing to bin"
+        )
+    if not whole and not asked and fitting > 1:
+        why = f"erased pixels are not averaged with others; else {why}"
+    up = None if binning == 1 else Option(str(binning - 1), (binning / (binning - 1)) ** 2, 0.0)
+    down = None
+    if side // (binning + 1) >= 16:
+        down = Option(
+            str(binning + 1),
+            (binning / (binning + 1)) ** 2,
+            loss_db(max(SAMPLES * (binning + 1) / sharpest - 1, 0.0) * ERROR_SCALE),
+        )
+    numbers = {"binning": float(binning), "autocorrelation_px": sharpest}
+    return Decision("binning", f"{binning} x {binning}", why, 0.0, up, down, asked, numbers)
+
+
+def field_of(
+    depths: Depths, overrides: Overrides, model: ModelName, *, haze: bool
+) -> tuple[tuple[int, int], float | None, Decision]:
+    """Decide how far from the axis the object is modelled.
+
+    Parameters
+    ----------
+    depths : Depths
+    overrides : Overrides
+    model : str
+        One convolution takes the whole field at no more cost than a part of it.
+    haze : bool
+        Whether there may be smooth light that no background takes: the object beyond what the sensor accepts
+        then does, and shutting it out would bring it into the picture (1.4 dB in one scene of a microscope).
+
+    Returns
+    -------
+    (int, int)
+        Central part of the PSFs that holds their light.
+    float or None
+        Distance from the axis, pixels, beyond which the sensor accepts nothing; None: no limit in the field.
+    Decision
+    """
+    height, width = depths.central.shape[2:]
+    asked = overrides.field == "all"
+    window = (height, width) if asked else psf_window(depths)
+    reach = None if asked else acceptance_px(depths)
+    full = (2 * height - 1) * (2 * width - 1)
+    extent = (height + window[0] - 1, width + window[1] - 1)
+    why = f"the PSFs' light lies within {window[0]} x {window[1]} of {height} x {width} pixels"
+    if reach is not None and reach < 0.5 * float(np.hypot(*extent)):
+        why += f"; {reach:.0f} pixels off the axis PSFs are down to {ACCEPTED:.0%} of the central one's light"
+        if model == "convolution":
+            why += ", which is no limit to one convolution"
+            reach = None
+        elif haze:
+            why += ", but smooth light that nothing else takes may go beyond"
+            reach = None
+    else:
+        reach = None
+    modelled = extent[0] * extent[1] if reach is None else min(np.pi * reach**2, extent[0] * extent[1])
+    share = modelled / full
+    up = None if share > 0.99 else Option(f"{2 * height - 1} x {2 * width - 1}", 1 / share, 0.0)
+    down = None
+    if height * width < modelled:
+        down = Option(f"{height} x {width}", height * width / modelled, _beyond_db(depths, window))
+    numbers = {"share_of_largest": share}
+    value = f"{extent[0]} x {extent[1]} pixels" + ("" if reach is None else f", {reach:.0f} about the axis")
+    return window, reach, Decision("field", value, why, 0.0, up, down, asked, numbers)
+
+
+def _beyond_db(depths: Depths, window: tuple[int, int]) -> float:
+    """Return what is lost where only the object opposite to the sensor is modelled.
+
+    An even object beyond it throws as much light onto the sensor as the part of the PSFs that the sensor's
+    own object throws beside it: light in the wrong place.
+    """
+    height, width = depths.central.shape[2:]
+    lost = (window[0] / (2 * height) + window[1] / (2 * width)) / 2
+    return left_out_db(float(lost))
+
+
+STRAY_SHARE = 0.2
+"""Share of the data's light, in a coarse l1 pass's smooth background, from which on there may be stray light
+in a picture: sparse ones without any had up to 0.15 there, dense ones, which l1 does not explain, 0.75."""
+POINTS_SHARE = 0.11
+"""The same from which on points have a background estimated. Where there was stray light of 0.3 to 1.2 times
+the scene's one gained 1.6 to 12 dB, with few points and with many; without any it changed -3 to 0.9 dB."""
+OBJECTIVE_FALL = 0.15
+"""By how much of itself misfit and prior together must fall in a picture with total variation.
+
+What neither object nor noise explains is made up for by structure that costs more than a background's few
+numbers save: stray light, light from beyond the calibrated field. On the scenes it was tuned on a background
+gained 1.3 to 5.7 dB where the objective of twenty iterations fell by 0.17 or more (once by 0.09), and lost
+0.3 to 5 dB where it fell by less. Of volumes with total variation, which cannot tell a smooth object from a
+background and loses the hold that darkness gives it, it says nothing: there one lost up to 8, gained 1.6 dB.
+"""
+IDLE_BACKGROUND_DB = {"tv": 2.5, "l1": 0.3}
+"""What a background costs that the data do not ask for: the median of the scenes tuned on."""
+GAINED_DB = {"tv": 12.0, "l1": 15.0}
+"""What one gains for each unit of what decides on it: a rule of thumb of the same scenes."""
+SETTLED = {"convolution": 1e-3, "merged": 1e-3, "varying picture": 2e-3, "varying volume": 3e-3}
+"""Change an iteration at which pictures were seen to be within 0.2 dB of the end: the solver of varying PSFs,
+with its exact data term, goes further in one iteration. Merged colours have the light of all: less noise, and
+more to be gained at the end, in a third of the time."""
+USUAL_ITERATIONS = {"convolution": 100, "varying": 60}
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothLight:
+    """What quick passes say of smooth light.
+
+    Attributes
+    ----------
+    share : float
+        Of the data's light, in the background of a coarse l1 pass.
+    dark, lit : CoarsePass or None
+        Of a picture with total variation in which there may be stray light: passes by the model that is used,
+        without and with a background.
+    """
+
+    share: float
+    dark: CoarsePass | None = None
+    lit: CoarsePass | None = None
+
+    @property
+    def fall(self) -> float | None:
+        """By how much of itself the objective falls with a background; None where nobody looked."""
+        if self.dark is None or self.lit is None:
+            return None
+        return 1 - self.lit.objective / self.dark.objective if self.dark.objective > 0 else 0.0
+
+
+def is_stray(share: float) -> bool:
+    """Tell whether the smooth part of a coarse l1 pass may be stray light."""
+    return share >= STRAY_SHARE
+
+
+def background_of(
+    light: SmoothLight, kind: Literal["tv", "l1"], overrides: Overrides, *, given: bool
+) -> Decision:
+    """Decide whether a smooth background is estimated as well."""
+    fall = light.fall
+    numbers = {"smooth_share": light.share}
+    if light.dark is not None and light.lit is not None and fall is not None:
+        numbers |= {
+            "objective_falls": fall,
+            "misfit_without": light.dark.misfit,
+            "misfit_with": light.lit.misfit,
+        }
+    found = f"a coarse pass puts {light.share:.0%} of the light into a smooth background"
+    if given:
+        why, on = "a background was given", False
+    elif kind == "l1":
+        on = light.share >= POINTS_SHARE
+        why = f"{found} ({POINTS_SHARE:.0%} are asked of it)"
+    elif fall is not None:
+        on = fall >= OBJECTIVE_FALL
+        why = (
+            f"{found}; with one misfit and prior together {'fall' if fall >= 0 else 'rise'} by "
+            f"{abs(fall):.0%} (a fall of {OBJECTIVE_FALL:.0%} is asked of it)"
+        )
+    else:
+        on, why = False, f"{found}; total variation cannot tell a smooth background from a smooth object"
+    asked = overrides.background is not None
+    on = on if overrides.background is None else overrides.background
+    change = _change_db(light, kind)
+    # A few more numbers in the solver's equations: the time is the same.
+    if on:
+        down = Option("none", 1.0, -change)
+        return Decision("background", "estimated", why, 0.0, None, down, asked, numbers)
+    up = Option("estimated", 1.0, change)
+    return Decision("background", "none", why, 0.0, up, None, asked, numbers)
+
+
+def _change_db(light: SmoothLight, kind: Literal["tv", "l1"]) -> float:
+    """Return what a background changes: rules of thumb of the scenes tuned on."""
+    told, least = (light.share, POINTS_SHARE) if kind == "l1" else (light.fall, OBJECTIVE_FALL)
+    return -IDLE_BACKGROUND_DB[kind] if told is None or told < least else GAINED_DB[kind] * told
+
+
+def iterations_of(
+    model: ModelName, overrides: Overrides, *, picture: bool, merged: bool
+) -> tuple[float, Decision]:
+    """Say at what change an iteration to stop."""
+    kind = "convolution" if model == "convolution" else f"varying {'picture' if picture else 'volume'}"
+    if merged and kind == "varying picture":
+        kind = "merged"
+    tolerance = SETTLED[kind] if overrides.tolerance is None else overrides.tolerance
+    return tolerance, Decision(
+        "iterations",
+        f"until they change by less than {tolerance:g}",
+        "as asked"
+        if overrides.tolerance is not None
+        else "pictures were seen to be within 0.2 dB of the end there",
+        0.0,
+        *steps_of_tolerance(tolerance),
+        overrides.tolerance is not None,
+        {"tolerance": tolerance},
+    )
+
+
+def steps_of_tolerance(tolerance: float) -> tuple[Option, Option]:
+    """Return what stopping later and earlier would be: rules of thumb of the scenes tuned on."""
+    return Option(f"until {tolerance / 10:g}", 3.0, 0.2), Option(f"until {tolerance * 3:g}", 0.5, -0.5)
+
+
+METHOD = "admm tv"
+"""Of the map; it is ADMM that reconstructs what is chosen here. The map is of pictures; those of volumes are
+ADMM as well, with sums as long for each of their planes."""
+DOUBLE_COST = 2.0
+"""Time of float64 relative to float32: transforms move twice the bytes."""
+
+
+def drift(iterations: int, pixels: int) -> float:
+    """Return how far float32 is expected to differ from float64, relative to the solution.
+
+    From the shipped map over iterations and size of the picture, by powers of both that its points give;
+    never falling with either beyond what was measured.
+    """
+    found = shipped_maps()["precision"]
+    x, y = (np.asarray(found[axis]["values"], float) for axis in ("x", "y"))
+    error = np.asarray(found["methods"][METHOD]["error"], float)
+    rows, columns = np.meshgrid(np.log(y / y.mean()), np.log(x / x.mean()), indexing="ij")
+    table = np.stack([np.ones(error.size), rows.ravel(), columns.ravel()], axis=1)
+    _, by_size, by_count = np.linalg.lstsq(table, np.log(np.maximum(error, 1e-12)).ravel(), rcond=None)[0]
+    grown = max(by_size, 0.0) * np.log(max(pixels / y.max(), 1.0)) + max(by_count, 0.0) * np.log(
+        max(iterations / x.max(), 1.0)
+    )
+    return float(error.max() * np.exp(grown))
+
+
+def precision_of(overrides: Overrides, iterations: int, pixels: int) -> Decision:
+    """Decide in which precision to compute.
+
+    Parameters
+    ----------
+    overrides : Overrides
+    iterations, pixels : int
+        How many are usual, and the longest side.
+    """
+    expected = drift(iterations, pixels)
+    asked = overrides.precision is not None
+    why = (
+        f"by the stability map float32 differs from float64 by at most {expected:.0e} of the picture after "
+        f"{iterations} iterations on {pixels} pixels ({PRECISION:.0%} is a failure)"
+    )
+    loss = 0.0 - 10 * float(np.log10(1 + expected**2))
+    numbers = {"expected_difference": expected}
+    value = overrides.precision or ("float64" if expected > PRECISION else "float32")
+    if value == "float64":
+        down = Option("float32", 1 / DOUBLE_COST, loss)
+        return Decision("precision", value, why, 0.0, None, down, asked, numbers)
+    up = Option("float64", DOUBLE_COST, abs(loss))
+    return Decision("precision", value, why, loss, up, None, asked, numbers)

@@ -1,0 +1,75 @@
+"""Volumes as OME-Zarr, read back by zarr-python and held against the OME-Zarr model library."""
+
+import numpy as np
+import pytest
+import zarr
+from ome_zarr_models.v05 import Image
+
+from instrument.files.volumes import write_volume_zarr
+from instrument.reconstruction.result_file import Outputs
+from recon.reconstruction.result import Grid
+
+Z_UM = np.array([9000.0, 10000.0, 11500.0])
+GRID = Grid((3, 300, 200), (150, 100), Z_UM, 2e-3 * Z_UM)
+UNKNOWN = Grid((3, 300, 200), (150, 100), np.full(3, np.nan), np.full(3, np.nan))
+
+
+@pytest.fixture
+def volume():
+    return np.random.default_rng(0).random((3, 300, 200), np.float32)
+
+
+def test_levels_scales_and_every_planes_own_size(tmp_path, volume):
+    path = tmp_path / "v.ome.zarr"
+    write_volume_zarr(path, volume, GRID, {"simulated": True})
+    group = zarr.open_group(path, mode="r")
+    model = Image.from_zarr(group)
+    np.testing.assert_array_equal(group["0"][...], volume)
+    first, second, third = model.ome_attributes.multiscales[0].datasets
+    assert first.coordinateTransformations[0].scale == [1500.0, 20.0, 20.0]
+    assert second.coordinateTransformations[0].scale == [1500.0, 40.0, 40.0]
+    assert second.coordinateTransformations[1].translation == [0.0, 10.0, 10.0]
+    assert third.path == "2"
+    np.testing.assert_allclose(group["1"][1, 7, 9], volume[1, 14:16, 18:20].mean(), rtol=1e-6)
+    assert group["0"].chunks == (1, 300, 200)
+    assert group.attrs["diffuserbench"]["z_um"] == Z_UM.tolist()
+    assert group.attrs["diffuserbench"]["simulated"] is True
+
+
+def test_colour_goes_first_and_unknown_sizes_have_no_unit(tmp_path, volume):
+    path = tmp_path / "v.ome.zarr"
+    write_volume_zarr(path, np.stack([volume, 2 * volume, 3 * volume], -1), UNKNOWN, {})
+    group = zarr.open_group(path, mode="r")
+    axes = Image.from_zarr(group).ome_attributes.multiscales[0].axes
+    assert [a.name for a in axes] == ["c", "z", "y", "x"]
+    assert axes[1].unit is None
+    np.testing.assert_array_equal(group["0"][2], 3 * volume)
+    assert group.attrs["diffuserbench"]["pitch_um"] is None
+
+
+def test_a_volume_there_before_survives_a_failure(tmp_path, volume, monkeypatch):
+    path = tmp_path / "v.ome.zarr"
+    write_volume_zarr(path, volume, GRID, {})
+
+    def full(*_args, **_options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("instrument.files.atomic.sync_folder", full)
+    with pytest.raises(OSError, match="No space"):
+        write_volume_zarr(path, 2 * volume, GRID, {})
+    np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], volume)
+    assert [p.name for p in tmp_path.iterdir()] == ["v.ome.zarr"]
+    monkeypatch.undo()
+    write_volume_zarr(path, 2 * volume, GRID, {})
+    np.testing.assert_array_equal(zarr.open_group(path, mode="r")["0"][...], 2 * volume)
+    assert [p.name for p in tmp_path.iterdir()] == ["v.ome.zarr"]
+
+
+def test_a_folder_that_is_no_zarr_is_never_taken(tmp_path):
+    place = tmp_path / "v.ome.zarr"
+    place.mkdir()
+    (place / "thesis.tex").write_text("all of it")
+    outputs = Outputs.named(place, volume=True)
+    assert outputs.preview.name == "v.png"
+    with pytest.raises(Exception, match="is no Zarr folder"):
+        outputs.check(0, overwrite=True)

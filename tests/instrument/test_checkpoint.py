@@ -1,0 +1,169 @@
+"""Reconstructions that are kept in a folder and gone on with."""
+
+import json
+
+import numpy as np
+import pytest
+import tifffile
+
+from instrument.cli import main
+from instrument.files.errors import FileError
+from instrument.reconstruction.checkpointing import CheckpointFolder, digest
+from recon.camera.convolution import PadCropConvolution
+from recon.priors import NonNegativity, TotalVariation
+from recon.solvers import Fista, SensorAdmm, StoppingRules
+
+SIZE = 24
+
+
+@pytest.fixture
+def files(tmp_path):
+    rng = np.random.default_rng(0)
+    psf = np.where(rng.random((2, SIZE, SIZE)) > 0.97, 900, 0).astype(np.uint16)
+    scene = 3 * np.roll(psf[0], (3, -2), (0, 1)) + rng.integers(0, 20, (SIZE, SIZE))
+    for name, image in (("psf", psf[0]), ("psfs", psf), ("image", scene), ("other", scene[::-1])):
+        tifffile.imwrite(tmp_path / f"{name}.tif", image.astype(np.uint16))
+    return tmp_path
+
+
+@pytest.fixture
+def run(files, capsys):
+    def call(*arguments, image="image.tif"):
+        code = main(
+            [
+                "reconstruct",
+                "-i",
+                str(files / image),
+                "--dark",
+                "0",
+                "--tolerance",
+                "0",
+                "--force",
+                *map(str, arguments),
+            ]
+        )
+        output = capsys.readouterr()
+        return code, " ".join((output.out + output.err).split())
+
+    return call
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        ("--psf", "psf.tif"),
+        ("--psf", "psf.tif", "--method", "fista"),
+        # The model is named: what --model auto chooses besides it, it does not choose with --checkpoint.
+        ("--volume", "psfs.tif", "--prior", "l1", "--model", "convolution"),
+    ],
+    ids=["picture", "fista", "volume"],
+)
+def test_the_same_command_goes_on_to_the_same_end(files, run, what):
+    what = (what[0], files / what[1], *what[2:])
+    kept, out, whole = files / "kept", files / "a.tif", files / "b.tif"
+    code, said = run(*what, "-n", 8, "--checkpoint", kept, "-o", out)
+    assert code == 0, said
+    assert "goes on from it" in said
+    code, said = run(*what, "-n", 20, "--checkpoint", kept, "-o", out)
+    assert "from iteration 8" in said
+    run(*what, "-n", 20, "-o", whole)
+    # To rounding: sums of float32 depend on where in memory arrays happen to lie.
+    expected = tifffile.imread(whole)
+    assert tifffile.imread(out) == pytest.approx(expected, abs=1e-5 * float(expected.max()))
+    assert json.loads(out.with_suffix(".json").read_text())["stop_reason" if what[0] == "--psf" else "model"]
+
+
+def test_a_folder_kept_for_something_else_is_refused(files, run):
+    kept = files / "kept"
+    arguments = ("--psf", files / "psf.tif", "-n", 5, "--checkpoint", kept, "-o", files / "a.tif")
+    assert run(*arguments)[0] == 0
+    code, said = run(*arguments, image="other.tif")
+    assert code == 2
+    assert "keeps another reconstruction: its measurement is" in said
+    code, said = run(*arguments, "--tau", 0.1)
+    assert code == 2
+    assert "its tau is None, here it is 0.1" in said
+    code, said = run(*arguments, "--noise", 4)
+    assert code == 2
+    assert "its noise is 'None', here it is '4.0'" in said
+    code, said = run(*arguments[:-4], "--checkpoint", files, "-o", files / "a.tif")
+    assert code == 2
+    assert "holds something else" in said
+
+
+def test_it_is_removed_where_nothing_is_left_to_do(files, run):
+    kept = files / "kept"
+    code, said = run(
+        "--psf",
+        files / "psf.tif",
+        "--noise",
+        1e5,
+        "--stop-at-noise",
+        "--checkpoint",
+        kept,
+        "-o",
+        files / "a.tif",
+    )
+    assert code == 0, said
+    assert "removed: the work has come to its end" in said
+    assert not kept.exists()
+
+
+def solver(kind=SensorAdmm):
+    rng = np.random.default_rng(1)
+    camera = PadCropConvolution(rng.random((1, 5, 6)), (8, 9))
+    return kind(camera, rng.random((1, 8, 9)).astype(np.float32), TotalVariation(0.1) + NonNegativity())
+
+
+def test_what_is_kept_before_a_kill_is_whole(tmp_path):
+    keeper = CheckpointFolder(tmp_path / "kept", {"a": 1}, every_s=0.0)
+    seen = []
+
+    def watch(running, record):
+        if record.iteration == 4:
+            seen.append(running.solution.copy())
+        if record.iteration == 5:
+            raise KeyboardInterrupt  # as the second Ctrl-C, or worse
+
+    with pytest.raises(KeyboardInterrupt):
+        solver().run(StoppingRules(tolerance=0), keeper=keeper, callback=watch)
+    again = solver()
+    records = CheckpointFolder(tmp_path / "kept", {"a": 1}).resume("", again)
+    assert [r.iteration for r in records] == [1, 2, 3, 4]
+    assert np.array_equal(again.solution, seen[0])
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    keeper = CheckpointFolder(tmp_path / "kept", {})
+    solver().run(StoppingRules(iterations=2), keeper=keeper)
+    (tmp_path / "kept" / "picture.npz").write_bytes(b"PK nothing")
+    with pytest.raises(FileError, match=r"picture\.npz.*cannot be read as a checkpoint"):
+        keeper.resume("", solver())
+    solver(Fista).run(StoppingRules(iterations=2), keeper=CheckpointFolder(tmp_path / "other", {}))
+    with pytest.raises(FileError, match="cannot be read as a checkpoint"):
+        CheckpointFolder(tmp_path / "other", {}).resume("", solver())
+
+
+def test_a_digest_tells_arrays_apart():
+    a = np.arange(6.0).reshape(2, 3)
+    assert digest(a) == digest(a.copy())
+    assert len({digest(a), digest(a.T), digest(a + 1), digest(a.astype(np.float32)), digest(None)}) == 5
+
+
+def test_a_checkpoint_outlives_a_result_that_cannot_be_written(files, run, monkeypatch):
+    import instrument.cli.solving as module
+
+    def full(*_args, **_kwargs):
+        raise FileError(files / "a.tif", "cannot be written: the disk is full.", "Make room.")
+
+    kept = files / "kept"
+    what = ("--psf", files / "psf.tif", "--tolerance", "0.5", "--checkpoint", kept, "-o", files / "a.tif")
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "write_reconstruction", full)
+        code, said = run(*what)
+    assert code == 2
+    assert "disk is full" in said
+    assert list(kept.iterdir())
+    code, said = run(*what)
+    assert code == 0, said
+    assert "removed: the work has come to its end" in said
