@@ -6,7 +6,7 @@ import importlib.util
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,16 +16,11 @@ from drivers.errors import DeviceError, DeviceNotOpenError
 from drivers.second_display.outputs import Output, SecondDisplayOptions
 from drivers.slm import Slm, read_only
 
+if TYPE_CHECKING:
+    from drivers.second_display.in_process import WindowHere
+    from drivers.second_display.process import WindowProcess
+
 _INSTALL = 'Install it: pip install "diffuserbench[gui]".'
-
-
-class _Window(Protocol):
-    """What ``WindowProcess`` and ``WindowHere`` have in common."""
-
-    def outputs(self) -> tuple[Output, ...]: ...
-    def open(self, options: SecondDisplayOptions) -> tuple[Output, str]: ...
-    def show(self, levels: npt.NDArray[np.uint8]) -> None: ...
-    def close(self) -> None: ...
 
 
 class SecondDisplaySlm(Slm):
@@ -42,7 +37,7 @@ class SecondDisplaySlm(Slm):
         self.options = options = SecondDisplayOptions.of(options)
         self._lock = threading.RLock()
         self._closing = threading.Event()
-        self._window: _Window | None = None
+        self._window: WindowHere | WindowProcess | None = None
         self._output: Output | None = None
         self._inhibited_by = ""
         self._lost: DeviceError | None = None
@@ -185,7 +180,7 @@ class SecondDisplaySlm(Slm):
             window.close()
 
 
-def _window(device: str, on_lost: Callable[[DeviceError], None]) -> _Window:
+def _window(device: str, on_lost: Callable[[DeviceError], None]) -> WindowHere | WindowProcess:
     """Return where a window is drawn: by the Qt program in this process, or in a process of its own."""
     if importlib.util.find_spec("PySide6") is None:
         raise DeviceError(device, "needs PySide6 (Qt), which is not installed.", _INSTALL)

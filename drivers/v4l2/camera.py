@@ -18,10 +18,10 @@ from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
 from drivers.device import DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceLostError, LimitError
-from drivers.registry.buses import video_devices
+from drivers.registry.buses import lasting_name, video_devices
 from drivers.v4l2 import api
 from drivers.v4l2.controls import Control, Controls, Quantity
-from drivers.v4l2.device import FilledBuffer, VideoDevice, lasting_path
+from drivers.v4l2.device import FilledBuffer, VideoDevice
 from drivers.v4l2.formats import V4l2Format, decode
 from drivers.v4l2.images import Images, inside
 
@@ -114,7 +114,7 @@ class V4l2Camera(BufferedCamera):
                     device,
                     driver="v4l2",
                     kind="camera",
-                    options={"device": lasting_path(device.address)},
+                    options={"device": lasting_name(device.address)},
                     note="pixel_pitch_um = (micrometres, from the data sheet of its sensor)",
                 )
             )
