@@ -26,7 +26,7 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon.base.threads import get_threads, set_threads
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
@@ -90,7 +90,7 @@ def main() -> None:
         part = Part(Problem.of(raw, psf), slice(0, 1))
         prior = TotalVariation(1.0) + NonNegativity()
         ours = Admm(part.picture_operator, part.data, prior)
-        double = PadCropConvolution(np.asarray(psf, np.float64)[None], raw.shape, dtype=np.float64)
+        double = Convolution(np.asarray(psf, np.float64)[None], raw.shape, dtype=np.float64)
         plain = LiteralAdmm(double, part.data, prior)
         seconds(ours)
         seconds(plain)

@@ -40,7 +40,7 @@ import numpy as np
 from admm_hand import DATA, inputs, processor
 
 from recon.base.threads import get_threads, set_threads
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.reconstruction.problem import Problem as Scaled
 from recon.solvers import Admm, SensorAdmm, Solver
@@ -80,10 +80,10 @@ class Problem:
         # Our own grid may be a little smaller; on the same one both have the same object, pixel for pixel.
         self.judge = self.camera()
 
-    def camera(self) -> PadCropConvolution:
+    def camera(self) -> Convolution:
         """Return our operator on the grid of lensless."""
         height, width = self.data.shape[1:]
-        return PadCropConvolution(self.psfs, (height, width), grid_shape=fast_grid(height, width))
+        return Convolution(self.psfs, (height, width), grid_shape=fast_grid(height, width))
 
     def objective(self, x: np.ndarray) -> float:
         """Return the objective of an object on our grid."""

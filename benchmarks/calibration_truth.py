@@ -21,7 +21,7 @@ from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSe
 from drivers.simulated.led_microscope import LedMicroscopeWorld
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench
-from instrument.bench.config_file import led_microscope_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from recon.analysis.dpc import level, slopes_deg
 
 PCO = """
@@ -67,7 +67,7 @@ def angular(step_deg: float) -> None:
 def dpc(seeds: int) -> None:
     """Print the error of height and slope for some diffusers."""
     for seed in range(seeds):
-        text = led_microscope_text().replace("seed = 0", f"seed = {seed}")
+        text = template("led_microscope").replace("seed = 0", f"seed = {seed}")
         with open_bench(parse_config(text, None)) as bench, tempfile.TemporaryDirectory() as folder:
             surface = DpcProcedure(DpcSetup(0.1, 4.0)).carry_out(bench, Path(folder)).result
             assert isinstance(surface, DiffuserSurface)

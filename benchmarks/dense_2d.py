@@ -134,14 +134,14 @@ def main() -> None:
     args = parser.parse_args()
 
     from recon.base.metrics import psnr
-    from recon.camera.convolution import PadCropConvolution
+    from recon.camera.convolution import Convolution
     from recon.priors import NonNegativity, TotalVariation
     from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules
 
     measurement, psf, truth = photograph(args)
     noise = float(measurement.mean() / np.sqrt(args.photons))
     energy = float(np.linalg.norm(psf))
-    camera = PadCropConvolution((psf / energy)[None], measurement.shape)
+    camera = Convolution((psf / energy)[None], measurement.shape)
     data = (measurement / noise)[None].astype(np.float32)
     (row, column), (height, width) = camera.centre, camera.sensor_shape
     top, left = row - height // 2, column - width // 2

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lenslet_scene import Camera, expose
 
 from recon.base.threads import set_threads
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford
@@ -54,7 +54,7 @@ def main() -> None:
     counts = expose(camera.render(layers(camera, a.beads)), 3000.0)
     psfs = camera.psfs()
     psfs /= np.sqrt(np.mean(np.sum(psfs.astype(float) ** 2, axis=(1, 2, 3)))).astype(np.float32)
-    operator = Convolution3D(psfs, counts.shape)
+    operator = Convolution(psfs, counts.shape)
     weight = a.tau * max(float(p.max()) for p in operator.adjoint_planes(counts[None]))
     prior = L1(weight) + NonNegativity()
     SparseDouglasRachford(operator, counts[None], prior).step()  # compile

@@ -103,12 +103,13 @@ def measure(shape: tuple[int, int], rate: float, seconds: float) -> dict[str, An
         session.open()
         panel = window.panel("live")
         assert isinstance(panel, LivePanel)
-        until(lambda: panel._shown is not None)
+        until(lambda: panel.picture.frame is not None)
         panel.switch_light(LightState.SOURCE)
         until(lambda: session.bench.source_lit)
-        frame = panel._shown
+        frame = panel.picture.frame
         assert frame is not None
-        until(lambda: panel._shown is not None and panel._shown.image.max() > frame.image.max() * 2)
+        bright = 2 * frame.image.max()
+        until(lambda: panel.picture.frame is not None and panel.picture.frame.image.max() > bright)
         QTest.qWait(2500)
         shown = _Count(panel)
         before, acquired = _Clock(), session.live.status()
@@ -169,13 +170,13 @@ class _Count:
 
     def __init__(self, panel: LivePanel) -> None:
         self.count = 0
-        show = panel.view.show_image
+        show = panel.picture.view.show_image
 
         def counted(*arguments: Any) -> None:
             self.count += 1
             show(*arguments)
 
-        panel.view.show_image = counted  # type: ignore[method-assign]
+        panel.picture.view.show_image = counted  # type: ignore[method-assign]
 
 
 def until(done: Any, timeout_s: float = 300.0) -> None:

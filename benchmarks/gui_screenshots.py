@@ -216,7 +216,7 @@ def _half(window: MainWindow) -> None:
 
     panel = window.panel("led_array")
     assert isinstance(panel, LedPanel)
-    panel.pattern_buttons["left"].click()
+    panel.pattern_buttons["DPC left"].click()
     _wait(lambda: panel._drawn is not None and not panel._drawn.is_dark, "the LEDs")
 
 

@@ -139,7 +139,7 @@ class Soak:
         self.window.resize(1600, 980)
         self.session.open()
         self.live = self._panel("live", LivePanel)
-        until(lambda: self.live._shown is not None)
+        until(lambda: self.live.picture.frame is not None)
         self.preview = self._panel("live_reconstruction", LiveReconstructionPanel)
         self.stage = self._panel("stage", StagePanel)
         self.leds = self._panel("led_array", LedPanel)
@@ -154,13 +154,13 @@ class Soak:
         homing = self.session.device_job("home", lambda _: stage.home(), {"stage"})
         until(lambda: homing.is_over)
         self._n_shown = 0
-        show = self.live.view.show_image
+        show = self.live.picture.view.show_image
 
         def counted(*what: Any) -> None:
             self._n_shown += 1
             show(*what)
 
-        self.live.view.show_image = counted  # type: ignore[method-assign]
+        self.live.picture.view.show_image = counted  # type: ignore[method-assign]
 
     def run(self, seconds: float) -> None:
         """Do things and take samples until the time is over."""

@@ -3,7 +3,7 @@
     python benchmarks/local_convolution.py [--size 1024] [--supports 64 128 256 512] [--picture FILE]
 
 Processor time of a forward and an adjoint relative to one convolution of the same frame
-(``PadCropConvolution``, PSF as large as the sensor), taken in turns; accuracy is the error of the PSF at
+(``Convolution``, PSF as large as the sensor), taken in turns; accuracy is the error of the PSF at
 places between the calibration points, with angular fall-off of the two-part model (Kuo 2020, Eq. 5.1) and
 the pattern stretched by up to ``--aberration`` pixels. The local model is also compared with the same sum
 over whole frames.
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon.base.threads import set_threads
 from recon.camera.base import LinearOperator
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.varying_psfs import (
     FieldOfPsfs,
     interpolation_weights,
@@ -92,7 +92,7 @@ def over_whole_frames(field: FieldOfPsfs, sensor: tuple[int, int], x: np.ndarray
     total = np.zeros(sensor)
     weights = None
     for i, psf in enumerate(field.psfs):
-        camera = PadCropConvolution(psf, sensor)
+        camera = Convolution(psf, sensor)
         height, width = camera.field_shape
         rows, columns = (np.arange(n) - c for n, c in zip((height, width), camera.centre, strict=True))
         if weights is None:
@@ -140,7 +140,7 @@ def main() -> None:
         diffuser = Diffuser.random(size, support, a.aberration)
         field = FieldOfPsfs(np.stack([diffuser.psf(y, x)[None] for y, x in places]), places)
         operators: dict[str, LinearOperator] = {
-            "one convolution": PadCropConvolution(diffuser.psf(0, 0)[None], sensor),
+            "one convolution": Convolution(diffuser.psf(0, 0)[None], sensor),
             "local, 25 PSFs": local_convolution([field], sensor, support=support_mask),
         }
         for rank in (3, 5, 8):

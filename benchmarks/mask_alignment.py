@@ -26,7 +26,7 @@ from calibration_routines.display.hologram_photograph import HologramCamera
 from calibration_routines.display.mask_alignment import AlignmentFailedError, MaskAlignment
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import display_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from instrument.display.hologram import bench_display, prepare_target
 from instrument.files.sample_images import load_sample
 from recon.holography import DcTerm, Display, HologramModel, compute_hologram
@@ -74,7 +74,7 @@ def _draw(seed: int) -> dict[str, str]:
 
 def configuration(options: dict[str, str]) -> str:
     """Return bench.toml of the simulated display with some options of the last table replaced."""
-    head, tail = display_text().split("\n[simulated_display]")
+    head, tail = template("display").split("\n[simulated_display]")
     for key, value in options.items():
         tail, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", tail)
         assert count == 1, key

@@ -30,7 +30,7 @@ from lenslet_scene import Camera, beads, expose, tilted_bars
 from literal_fused import FusedLiteralAdmm
 
 from recon.base.threads import set_threads
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors import HaarTotalVariation, NonNegativity, TotalVariation
 from recon.solvers import Fista
 from recon.solvers.tv_admm_volume import LeanTotalVariation
@@ -42,7 +42,7 @@ class Scene:
     """A measurement in units of its noise, with the truth."""
 
     name: str
-    operator: Convolution3D
+    operator: Convolution
     data: np.ndarray
     truth: np.ndarray
     window: tuple[slice, slice, slice]
@@ -80,7 +80,7 @@ def scene(name: str, size: int, depths: int, photons: float = 3000) -> Scene:
     psfs = camera.psfs()
     deviation = np.float32(np.sqrt(counts.mean() + 4))
     energy = np.float32(np.sqrt(np.mean(np.sum(psfs**2, axis=(2, 3)))))
-    operator = Convolution3D(psfs / energy, (size, size))
+    operator = Convolution(psfs / energy, (size, size))
     truth = camera.grid(points, operator.domain_shape[1:], operator.centre)
     half, (row, column) = size // 2, operator.centre
     window = (slice(None), slice(row - half, row + half), slice(column - half, column + half))

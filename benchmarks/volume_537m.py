@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lenslet_scene import Camera, beads, expose
 
 from recon.base.threads import set_threads
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors import L1, NonNegativity
 from recon.solvers import StoppingRules
 from recon.solvers.douglas_rachford import SparseDouglasRachford
@@ -45,7 +45,7 @@ def main() -> None:
     set_threads(a.threads)
     camera = Camera(a.sensor, a.depths)
     points = beads(camera, a.beads)
-    operator = Convolution3D(camera.psfs(), (a.sensor, a.sensor))
+    operator = Convolution(camera.psfs(), (a.sensor, a.sensor))
     voxels = int(np.prod(operator.domain_shape))
     data = expose(camera.render(points), 2000)[None]
     # The prior's weight: three deviations of what noise alone correlates to with a PSF.

@@ -28,7 +28,7 @@ def problem(sensor: int, depths: int):
     """Return an operator with random microlens-like PSFs that grow with nearness, and a measurement."""
     import numpy as np
 
-    from recon.camera.convolution3d import Convolution3D
+    from recon.camera.convolution import Convolution
 
     rng = np.random.default_rng(0)
     lenses = rng.uniform(-0.36, 0.36, (400, 2)) * sensor
@@ -36,7 +36,7 @@ def problem(sensor: int, depths: int):
     for z in range(depths):
         rows, columns = np.round(lenses * (1 + 0.3 * z / depths) + sensor / 2).astype(int).T
         np.add.at(psfs[z, 0], (rows % sensor, columns % sensor), 0.05)
-    operator = Convolution3D(psfs, (sensor, sensor))
+    operator = Convolution(psfs, (sensor, sensor))
     data = rng.poisson(100, (1, sensor, sensor)).astype(np.float32)
     return operator, data
 

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
 from calibration_routines.display.hologram_photograph import (
-    CaptureOptions,
     Photographed,
     photograph_hologram,
     write_capture,
@@ -29,6 +28,7 @@ from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig
 from instrument.bench.safety import StepsFailedError
 from instrument.display.hologram import (
+    CaptureOptions,
     HologramResult,
     bench_display,
     compute_and_judge,
@@ -165,20 +165,20 @@ def compute(
     targets = order.targets(display)
     options = order.options
     history: list[HologramRecord] = []
-    told_s = 0.0
+    reported_s = 0.0
 
     def watch(record: HologramRecord, slm: Any) -> None:
-        nonlocal told_s
+        nonlocal reported_s
         history.append(record)
-        if time.monotonic() - told_s < _INTERVAL_S:
+        if time.monotonic() - reported_s < _INTERVAL_S:
             return
         share = record.iteration / max(options.iterations, 1)
         if options.time_s is not None:
             share = max(share, record.seconds / options.time_s)
         phase = np.mod(np.angle(np.asarray(slm).reshape(-1, *display.slm_shape)[0]), 2 * np.pi)
-        with contextlib.suppress(JobCancelledError):  # the optimiser hears of it by itself
+        with contextlib.suppress(JobCancelledError):  # the optimiser sees it by itself
             context.report(Progress(min(share, 1.0), tuple(history), phase.astype(np.float32)))
-        told_s = time.monotonic()
+        reported_s = time.monotonic()
 
     result = compute_and_judge(display, targets, options, callback=watch, cancel=context.cancel)
     if write:
@@ -219,7 +219,7 @@ def photograph(
     control = RunControl()
 
     def stop() -> None:
-        with contextlib.suppress(StepsFailedError):  # told by STOP, and by the procedure's own end
+        with contextlib.suppress(StepsFailedError):  # STOP says so, and the procedure's own end
             control.stop()
 
     def cancel() -> None:
@@ -231,18 +231,18 @@ def photograph(
         with _exposure_kept(bench.camera), control.procedure(bench):
             if computed.order.alignment is not None:
                 bring_mask(bench, load_alignment(computed.order.alignment).stage_position)
-            found = photograph_hologram(
+            seen = photograph_hologram(
                 _display_bench(bench, correction, control.check),
                 list(computed.result.hologram.slm),
                 computed.display,
                 computed.target,
                 CaptureOptions(average=average),
             )
-            bench.safe_state()
+            bench.stop()
     except EndedEarlyError as error:
         raise JobCancelledError from error
-    write_capture(out, found)
-    return found, out
+    write_capture(out, seen)
+    return seen, out
 
 
 @contextlib.contextmanager
@@ -251,7 +251,7 @@ def _exposure_kept(camera: Camera) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with contextlib.suppress(DeviceError):  # the error that ended it is the one to be told
+        with contextlib.suppress(DeviceError):  # the error that ended it is the one to be shown
             camera.set_exposure_ms(before_ms)
         raise
     camera.set_exposure_ms(before_ms)

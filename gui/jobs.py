@@ -63,7 +63,7 @@ class _Post(QObject):
 
 
 class JobContext:
-    """What the work of a job is called with: how it reports, and how it hears that it is cancelled."""
+    """What the work of a job is called with: how it reports, and how it sees that it is cancelled."""
 
     def __init__(self, number: int, post: _Post) -> None:
         self._number = number
@@ -120,7 +120,7 @@ class JobContext:
         return newest
 
     def _send(self, kind: str, value: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the window is gone: nobody is there to be told
+        with contextlib.suppress(RuntimeError):  # the window is gone
             self._post.arrived.emit(_Mail(self._number, kind, value))
 
 
@@ -150,13 +150,13 @@ class Job(QObject):
         self.lanes = lanes
         self.exclusive = exclusive
         self.quiet = False
-        """Whether it is too small to be told of: a value read back every few seconds."""
+        """Whether it is too small to be shown as running: a value read back every few seconds."""
         self.endless = False
         """Whether it goes on until it is cancelled."""
         self.state = JobState.WAITING
         self.error: BaseException | None = None
         self.became = "done"
-        """What is told of one that succeeded; set before it has ended."""
+        """What is said of one that succeeded; set before it has ended."""
         self._work: Work | None = work
         self._context = context
 
@@ -374,7 +374,7 @@ class JobRunner(QObject):
 
 
 def words_for(error: BaseException) -> str:
-    """Return an error as the user is told: a sentence where it is known, else its traceback."""
+    """Return an error as the user reads it: a sentence where it is known, else its traceback."""
     text = in_words(error)
     if text is None:
         text = "An error in the program itself; please report it.\n" + "".join(
@@ -391,7 +391,7 @@ def _do(work: Work, context: JobContext) -> None:
         result = work(context)
     except (KeyboardInterrupt, SystemExit) as error:
         context._send("cancelled", error)
-    except BaseException as error:  # noqa: BLE001 - whatever it is, the window tells it
+    except BaseException as error:  # noqa: BLE001 - whatever it is, the window shows it
         stopped = context.cancel.is_set() and isinstance(error, StoppedError)
         context._send("cancelled" if stopped else "failed", error)
     else:

@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
+from pyqtgraph import PlotWidget
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
 from PySide6.QtWidgets import (
     QApplication,
     QDockWidget,
-    QLabel,
     QMainWindow,
+    QMenu,
     QMessageBox,
-    QPlainTextEdit,
     QProgressBar,
     QPushButton,
     QSizePolicy,
-    QTabWidget,
     QToolBar,
+    QToolButton,
     QWidget,
 )
 
 from gui.jobs import Job, words_for
 from gui.panel import Panel
-from gui.panels import PANELS, PanelEntry
+from gui.panels import PANELS
 from gui.session import BenchSession
-from gui.session_news import OperatorRequest
-from gui.theme import THEMES, apply_theme
-from gui.widgets.dialogues import Question
+from gui.session_news import OperatorRequest, name_of
+from gui.theme import THEMES, apply_theme, colours
+from gui.widgets.building import PanelPlace, button, fill, label, tabs, text_view
+from gui.widgets.dialogues import Question, TextWindow
+from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
-from gui.widgets.number_edit import NumberEdit
-from gui.widgets.window_parts import DeviceChips, PanelPlace
+from gui.widgets.plots import restyle
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -45,6 +47,44 @@ _ROOMY = QSize(1500, 860)
 
 _COMPACT_PX = 480
 """Width of the panels at the right of a small screen."""
+_BY_HAND, _BREAKS_OFF = QMessageBox.Icon.Information, QMessageBox.Icon.Warning
+
+
+class DeviceChips(QWidget):
+    """One chip a device; a click shows all about it, "Reconnect" appears where one has failed."""
+
+    def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._session = session
+        self.chips: dict[str, QToolButton] = {}
+        self.reconnect_buttons: dict[str, QPushButton] = {}
+        for kind in session.kinds:
+            chip = QToolButton()
+            chip.setAutoRaise(True)
+            chip.clicked.connect(partial(self._show_all, kind))
+            again = button("Reconnect", f"Open the {name_of(kind)} again", partial(session.reconnect, kind))
+            self.chips[kind], self.reconnect_buttons[kind] = chip, again
+            self.show_state(kind)
+        pairs = zip(self.chips.values(), self.reconnect_buttons.values(), strict=True)
+        shown: list[QWidget] = [widget for pair in pairs for widget in pair]
+        fill(self, *(shown or [label("no devices")]), across=True, spacing=4)
+        session.device_changed.connect(self.show_state)
+
+    def show_state(self, kind: str) -> None:
+        """Show how a device is doing now."""
+        state = self._session.state(kind)
+        now = colours()
+        colour = {"open": now.ok, "failed": now.error, "opening": now.warning}.get(state.condition, now.dim)
+        chip = self.chips[kind]
+        word = {"open": "", "opening": " …", "failed": " failed", "closed": " closed"}[state.condition]
+        chip.setText(f"● {name_of(kind)}{word}")
+        chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
+        chip.setToolTip(state.text or state.condition)
+        self.reconnect_buttons[kind].setVisible(state.condition == "failed")
+
+    def _show_all(self, kind: str) -> None:
+        state = self._session.state(kind)
+        TextWindow(name_of(kind), state.text or state.condition, self).show()
 
 
 class MainWindow(QMainWindow):
@@ -79,8 +119,7 @@ class MainWindow(QMainWindow):
             | QMainWindow.DockOption.AllowNestedDocks
             | QMainWindow.DockOption.AnimatedDocks
         )
-        self.tabs = QTabWidget()
-        self.tabs.setDocumentMode(True)
+        self.tabs = tabs({})
         self.tabs.currentChanged.connect(self._fill_current)
         self.setCentralWidget(self.tabs)
         self._make_top_bar()
@@ -173,9 +212,7 @@ class MainWindow(QMainWindow):
             text = words_for(error)
             self.session.log("error", f"{PANELS[name].title}: {text}")
             if self._places[name].content is None:
-                view = QPlainTextEdit(text)
-                view.setReadOnly(True)
-                self._places[name].hold(view)
+                self._places[name].hold(text_view(text))
 
     # Bars and menus ------------------------------------------------------------------------------
     def _make_top_bar(self) -> None:
@@ -183,7 +220,7 @@ class MainWindow(QMainWindow):
         bar.setObjectName("bench-bar")
         bar.setMovable(False)
         bar.toggleViewAction().setEnabled(False)  # STOP stays in reach
-        self.simulated = QLabel("SIMULATED")
+        self.simulated = label("SIMULATED")
         self.simulated.setObjectName("simulated")
         self.simulated.setToolTip("Some or all devices of this bench have no hardware behind them")
         self._simulated_action = bar.addWidget(self.simulated)
@@ -192,17 +229,16 @@ class MainWindow(QMainWindow):
         stretch = QWidget()
         stretch.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
         bar.addWidget(stretch)
-        self.stop_button = QPushButton("STOP")
+        tip = "Halt all motion, turn the light off, end what runs (Esc)"
+        self.stop_button = button("STOP", tip, self.session.stop)
         self.stop_button.setObjectName("stop")
-        self.stop_button.setToolTip("Halt all motion, turn the light off, end what runs (Esc)")
         self.stop_button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
-        self.stop_button.clicked.connect(self.session.stop)
         bar.addWidget(self.stop_button)
         bar.setContextMenuPolicy(Qt.ContextMenuPolicy.PreventContextMenu)
         self.addToolBar(Qt.ToolBarArea.TopToolBarArea, bar)
 
     def _make_status_bar(self) -> None:
-        self.job_label = QLabel("Ready")
+        self.job_label = label("Ready")
         self.job_progress = QProgressBar()
         self.job_progress.setRange(0, 0)
         self.job_progress.setFixedWidth(140)
@@ -214,34 +250,31 @@ class MainWindow(QMainWindow):
     def _make_menus(self) -> None:
         view = self.menuBar().addMenu("&View")
         for name, entry in PANELS.items():
-            view.addAction(self._panel_action(name, entry))
-        view.addSeparator()
+            action = self._add_action(view, entry.title, entry.shortcut, partial(self.show_panel, name))
+            action.setToolTip(entry.tip)
         theme = self.menuBar().addMenu("&Theme")
         for number, (name, words) in enumerate((("dark", "&Dark"), ("red", "&Red, for the dark room"))):
-            action = QAction(words, self)
-            action.setShortcut(QKeySequence(f"Ctrl+Shift+{number + 1}"))
-            action.triggered.connect(partial(self.set_theme, name))
-            theme.addAction(action)
+            self._add_action(theme, words, f"Ctrl+Shift+{number + 1}", partial(self.set_theme, name))
         camera = self.menuBar().addMenu("&Camera")
         for words, keys, what in (
             ("&Live view, or hold the last frame", "Ctrl+L", "toggle_live"),
             ("Take a &photograph", "Ctrl+K", "snap"),
             ("&Record, or end the recording", "Ctrl+R", "record"),
         ):
-            action = QAction(words, self)
-            action.setShortcut(QKeySequence(keys))
-            action.triggered.connect(partial(self._on_live_panel, what))
-            camera.addAction(action)
+            self._add_action(camera, words, keys, partial(self._on_live_panel, what))
         bench = self.menuBar().addMenu("&Bench")
         for kind in self.session.kinds:
-            action = QAction(f"Reconnect the {kind.replace('_', ' ')}", self)
-            action.triggered.connect(partial(self.session.reconnect, kind))
-            bench.addAction(action)
+            reconnect = partial(self.session.reconnect, kind)
+            self._add_action(bench, f"Reconnect the {name_of(kind)}", "", reconnect)
         bench.addSeparator()
-        leave = QAction("&Quit", self)
-        leave.setShortcut(QKeySequence("Ctrl+Q"))
-        leave.triggered.connect(self.close)
-        bench.addAction(leave)
+        self._add_action(bench, "&Quit", "Ctrl+Q", self.close)
+
+    def _add_action(self, menu: QMenu, words: str, keys: str, call: Callable[[], object]) -> QAction:
+        action = QAction(words, self)
+        action.setShortcut(QKeySequence(keys))
+        action.triggered.connect(lambda: call())
+        menu.addAction(action)
+        return action
 
     def _on_live_panel(self, what: str) -> None:
         """Do what the live view offers, whatever panel is in front, with what is being typed there."""
@@ -250,13 +283,6 @@ class MainWindow(QMainWindow):
         if not ends and isinstance(typed, NumberEdit) and panel.isAncestorOf(typed) and not typed.submit():
             return  # refused where it stands
         getattr(panel, what)()
-
-    def _panel_action(self, name: str, entry: PanelEntry) -> QAction:
-        action = QAction(entry.title, self)
-        action.setShortcut(QKeySequence(entry.shortcut))
-        action.setToolTip(entry.tip)
-        action.triggered.connect(lambda: self.show_panel(name))
-        return action
 
     def set_theme(self, name: str) -> None:
         """Change the looks of the whole program and remember it."""
@@ -268,6 +294,8 @@ class MainWindow(QMainWindow):
             self.chips.show_state(kind)
         for view in self.findChildren(ImageView):  # of every panel: one white picture spoils a dark room
             view.restyle()
+        for plot in self.findChildren(PlotWidget):
+            restyle(plot)
         for panel in self._panels.values():
             panel.theme_changed()
 
@@ -298,7 +326,7 @@ class MainWindow(QMainWindow):
 
     # What runs -----------------------------------------------------------------------------------
     def _show_simulated(self, _kind: str = "") -> None:
-        simulated = [k.replace("_", " ") for k in self.session.kinds if self.session.state(k).simulated]
+        simulated = [name_of(k) for k in self.session.kinds if self.session.state(k).simulated]
         self._simulated_action.setVisible(bool(simulated))
         everything = len(simulated) == len(self.session.kinds)
         self.simulated.setText("SIMULATED" if everything else f"SIMULATED: {', '.join(simulated)}")
@@ -313,14 +341,14 @@ class MainWindow(QMainWindow):
     def _job_ended(self, job: Job) -> None:
         if job.quiet:
             return
-        running = self._told_jobs()
+        running = self._shown_jobs()
         self.job_progress.setVisible(any(j.exclusive or not j.lanes for j in running))
         if running:
             self.job_label.setText(f"{running[0].title} …")
         elif job.state.value == "succeeded":
             self.job_label.setText(f"{job.title}: {job.became}")
 
-    def _told_jobs(self) -> list[Job]:
+    def _shown_jobs(self) -> list[Job]:
         """Return what runs and would be missed: runs, moves, photographs, computations."""
         return [job for job in self.session.jobs.jobs if not job.quiet]
 
@@ -329,17 +357,24 @@ class MainWindow(QMainWindow):
             self.job_label.setText(text.splitlines()[0][:200])
 
     def _ask_operator(self, request: OperatorRequest) -> None:
-        box = Question(QMessageBox.Icon.Information, "To be done by hand", request.text, self)
-        done = box.addButton("Done", QMessageBox.ButtonRole.AcceptRole)
-        box.addButton("Stop", QMessageBox.ButtonRole.RejectRole)
-        box.finished.connect(lambda _: request.confirm() if box.clickedButton() is done else request.refuse())
-        request.withdrawn = box.reject
-        self._open(box)
+        def answered(done: bool) -> None:
+            (request.confirm if done else request.refuse)()
 
-    def _open(self, box: Question) -> None:
-        self.question = box
+        box = self._ask(_BY_HAND, "To be done by hand", request.text, ("Done", "Stop"), answered)
+        request.withdrawn = box.reject
+
+    def _ask(
+        self,
+        icon: QMessageBox.Icon,
+        title: str,
+        text: str,
+        answers: tuple[str, str],
+        answered: Callable[[bool], object],
+    ) -> Question:
+        self.question = box = Question(self, title, text, answers, answered, icon)
         box.finished.connect(lambda _: self._answered(box))
         box.ask()
+        return box
 
     def _answered(self, box: Question) -> None:
         if self.question is box:  # not where another was asked meanwhile
@@ -353,26 +388,17 @@ class MainWindow(QMainWindow):
             event.accept()
             return
         event.ignore()
-        running = [job.title for job in self._told_jobs()]
+        running = [job.title for job in self._shown_jobs()]
         if running and self._closing_question is not None:
             self._closing_question.ask()
         elif running:
-            box = Question(
-                QMessageBox.Icon.Warning,
-                "Close?",
-                f"{', '.join(running)} is running. Stop it and close?\nWhat was acquired is kept.",
-                self,
-            )
-            stop = box.addButton("Stop and close", QMessageBox.ButtonRole.DestructiveRole)
-            stay = box.addButton("Go on", QMessageBox.ButtonRole.RejectRole)
-            box.setDefaultButton(stay)
-            box.finished.connect(lambda _: self._close_answered(agreed=box.clickedButton() is stop))
-            self._closing_question = box
-            self._open(box)
+            text = f"{', '.join(running)} is running. Stop it and close?\nWhat was acquired is kept."
+            answers = ("Stop and close", "Go on")
+            self._closing_question = self._ask(_BREAKS_OFF, "Close?", text, answers, self._close_answered)
         else:
             self._end()
 
-    def _close_answered(self, *, agreed: bool) -> None:
+    def _close_answered(self, agreed: bool) -> None:
         self._closing_question = None
         if agreed:
             self._end()

@@ -1,17 +1,20 @@
-"""What every panel has: its session, "Copy as Python", a line for what was refused."""
+"""What every panel has: its session, "Copy as Python", a line for what was refused; panels of one device."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar
 
-from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QSizePolicy, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
-from gui.jobs import Job, JobRunner
+from gui.jobs import BusyError, Job, JobRunner
 from gui.session import BenchSession
+from gui.session_news import name_of
+from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
+from recon.base.declare import Imports
 
 _REFUSAL_MS = 12_000
 
@@ -33,27 +36,14 @@ class Panel(QWidget):
         self.body = QWidget()
         """Where the panel's own widgets go: give it a layout."""
         self.body.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
-        self._note = QLabel()
+        self._note = label(selectable=True, wraps=True, yields=True)
         self._note.setObjectName("refusal")
-        self._note.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self._note.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self._note.setWordWrap(True)
-        self.copy_button = QPushButton("Copy as Python")
+        tip = "Copy the lines of Python that do what this panel is set to"
+        self.copy_button = button("Copy as Python", tip, self.copy_as_python)
         self.copy_button.setObjectName("copy-as-python")
         self.copy_button.setFlat(True)
-        self.copy_button.setToolTip("Copy the lines of Python that do what this panel is set to")
-        self.copy_button.clicked.connect(self.copy_as_python)
-        self._fade = QTimer(self)
-        self._fade.setSingleShot(True)
-        self._fade.timeout.connect(self.accepted)
-        foot = QHBoxLayout()
-        foot.addWidget(self._note, 1)
-        foot.addWidget(self.copy_button)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(8, 8, 8, 4)
-        layout.setSpacing(4)
-        layout.addWidget(self.body, 1)
-        layout.addLayout(foot)
+        self._fade = after_rest(self, _REFUSAL_MS, self.accepted)
+        fill(self, (self.body, 1), in_row((self._note, 1), self.copy_button), margins=(8, 8, 8, 4), spacing=4)
 
     @property
     def jobs(self) -> JobRunner:
@@ -83,27 +73,93 @@ class Panel(QWidget):
     def refused(self, field: QWidget | None, why: str) -> None:
         """Show why something was refused: at the field, and in the panel's last line."""
         if field is not None:
-            field.setProperty("refused", True)
+            mark(field, "refused", True)
             field.setToolTip(why)
-            _restyle(field)
         elided(self._note, why)
-        self._fade.start(_REFUSAL_MS)
+        self._fade.start()
 
     def accepted(self, field: QWidget | None = None) -> None:
         """Clear what ``refused`` showed."""
         if field is not None:
-            field.setProperty("refused", False)
-            _restyle(field)
+            mark(field, "refused", False)
         self._note.clear()
         self._note.setToolTip("")
 
-    def tells(self, job: Job) -> Job:
-        """Have a job's failure shown in this panel's last line; returns the job."""
-        job.failed.connect(lambda why: self.refused(None, why))
+    def follow(self, job: Job, field: QWidget | None = None) -> Job:
+        """Have a job's failure shown at a field and in this panel's last line; returns the job."""
+        job.failed.connect(lambda why: self.refused(field, why))
         return job
 
+    def begin(self, start: Callable[[], Job], field: QWidget | None = None) -> Job | None:
+        """Start a job, or show why not (None): the devices may be too busy. Its failure is shown, too."""
+        try:
+            return self.follow(start(), field)
+        except BusyError as error:
+            self.refused(field, str(error))
+            return None
 
-def _restyle(widget: QWidget) -> None:
-    """Apply the style sheet again after a property has changed."""
-    widget.style().unpolish(widget)
-    widget.style().polish(widget)
+
+class DevicePanel(Panel):
+    """A panel of one kind of device, which looks at it again and again while it is seen.
+
+    Subclasses set ``kind`` and ``look_ms``, call ``watch_device`` when they are made, and have ``look`` and
+    ``show_device``.
+    """
+
+    kind: ClassVar[str]
+    look_ms: ClassVar[int]
+
+    def watch_device(self, state: QLabel) -> None:
+        """Begin to look at the device; while it is not open, ``state`` has why."""
+        self._state_label = state
+        self.session.device_changed.connect(self._device_changed)
+        self._timer = every(self, self.look_ms, self.look)
+        self._device_changed(self.kind)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the panel is seen and the device is open."""
+        return self.isVisible() and self.session.is_open(self.kind)
+
+    def look(self) -> None:
+        """Show how the device is now."""
+        raise NotImplementedError
+
+    def show_device(self, is_open: bool) -> None:
+        """Let it be used, or not."""
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        """End the timer."""
+        self._timer.stop()
+
+    def _device_changed(self, kind: str) -> None:
+        if kind != self.kind:
+            return
+        is_open = self.session.is_open(kind)
+        self.show_device(is_open)
+        if not is_open:
+            state, name = self.session.state(kind), name_of(kind)
+            has_one = kind in self.session.kinds
+            elided(
+                self._state_label, state.text or state.condition if has_one else f"This bench has no {name}."
+            )
+
+
+def on_bench(bench: Path | None, lines: Sequence[str], imports: Imports, before: Sequence[str] = ()) -> str:
+    """Return Python lines that are done with a bench open: ``bench``.
+
+    Parameters
+    ----------
+    bench : Path, optional
+        Its bench.toml; None: the built-in simulated bench.
+    lines : sequence of str
+        What is done with it.
+    imports : Imports
+        Of what ``lines`` and ``before`` need.
+    before : sequence of str
+        What is done before.
+    """
+    imports.names.add(("instrument.bench.bench", "open_bench"))
+    opened = "with open_bench() as bench:" if bench is None else f"with open_bench({str(bench)!r}) as bench:"
+    return "\n".join([*imports.lines(), "", *before, opened, *(f"    {line}" for line in lines), ""])

@@ -1,4 +1,4 @@
-"""A panel that fills in a form, checks it as it is typed, and carries the procedure out."""
+"""What panels of procedures share: forms checked as they are typed, a run that is started, paused, ended."""
 
 from __future__ import annotations
 
@@ -7,26 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from PySide6.QtCore import Qt, QTimer
-from PySide6.QtWidgets import (
-    QComboBox,
-    QLabel,
-    QPlainTextEdit,
-    QPushButton,
-    QSplitter,
-    QStackedWidget,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QStackedWidget, QWidget
 
-from calibration_routines.procedure import Outcome, Outlook, Procedure
-from gui.forms.options_form import OptionsForm, scrolled
-from gui.forms.routines import Form
+from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine
+from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun, Situation, script
+from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
-from gui.widgets.run_bar import RunBar
+from gui.session_news import name_of
+from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
@@ -43,7 +34,8 @@ class ProcedurePanel(Panel):
     Parameters
     ----------
     session : BenchSession
-    forms : sequence of Form
+    routines : sequence of Routine
+        What can be carried out: each has a form of its options.
     words : str
         On the start button.
     parent : QWidget, optional
@@ -54,83 +46,62 @@ class ProcedurePanel(Panel):
     use_words: ClassVar[str] = "Reconstruct with it…"
 
     def __init__(
-        self, session: BenchSession, forms: Sequence[Form], words: str, parent: QWidget | None = None
+        self, session: BenchSession, routines: Sequence[Routine], words: str, parent: QWidget | None = None
     ) -> None:
         super().__init__(session, parent)
-        self.forms = tuple(forms)
+        self.routines = tuple(routines)
         self.run = ProcedureRun(session, self)
         self.outlook: Outlook | None = None
         """Of the form as it stands, once it was checked."""
-        self.views = {form.name: OptionsForm(form.fields) for form in self.forms}
-        self.choice = QComboBox()
-        self.choice.setToolTip("What to do")
+        self.views = {routine.name: OptionsForm([routine.options]) for routine in self.routines}
+        self.choice = choice([routine.title for routine in self.routines], "What to do")
         self.choice.setAccessibleName("Routine")
         self.stack = QStackedWidget()
-        for form in self.forms:
-            self.choice.addItem(form.title)
-            self.choice.setItemData(self.choice.count() - 1, form.tip, Qt.ItemDataRole.ToolTipRole)
-            self.stack.addWidget(scrolled(self.views[form.name]))
-            self.views[form.name].changed.connect(self._typed)
-        self.about = QLabel()
-        self.about.setObjectName("dim")
-        self.about.setWordWrap(True)
-        self.verdict = QPlainTextEdit()
-        self.verdict.setReadOnly(True)
-        self.verdict.setToolTip("What will be done and why, or what stands against it; can be copied")
+        for number, routine in enumerate(self.routines):
+            self.choice.setItemData(number, routine.help, Qt.ItemDataRole.ToolTipRole)
+            self.stack.addWidget(scrolled(self.views[routine.name]))
+            self.views[routine.name].changed.connect(self._typed)
+        if len(self.routines) == 1:
+            self.choice.hide()
+        self.about = label(role="dim", wraps=True)
+        tip = "What will be done and why, or what stands against it; can be copied"
+        self.verdict = text_view(tip=tip)
         self.verdict.setMaximumHeight(150)
-        self.run_bar = RunBar(words)
-        self.use_button = QPushButton(self.use_words)
-        self.use_button.setToolTip("Take what was measured to where it is used")
-        self.use_button.hide()
-        self.use_button.clicked.connect(self._use)
+        self.run_bar = RunBar(self.run, words)
+        tip = "Take what was measured to where it is used"
+        self.use_button = button(self.use_words, tip, self._use)
+        tip = "Open the run that ended early among the runs, where it is resumed"
+        self.go_on_button = button("Go on with it…", tip, self._go_on)
+        for after in (self.use_button, self.go_on_button):
+            after.hide()
         self._result: Path | None = None
-        self.go_on_button = QPushButton("Go on with it…")
-        self.go_on_button.setToolTip("Open the run that ended early among the runs, where it is resumed")
-        self.go_on_button.hide()
-        self.go_on_button.clicked.connect(self._go_on)
         self._unfinished: Path | None = None
-        left = QWidget()
-        column = QVBoxLayout(left)
-        column.setContentsMargins(0, 0, 6, 0)
-        if len(self.forms) > 1:
-            column.addWidget(self.choice)
-        column.addWidget(self.about)
-        column.addWidget(self.stack, 1)
-        column.addWidget(self.verdict)
-        column.addWidget(self.run_bar)
-        column.addWidget(self.use_button)
-        column.addWidget(self.go_on_button)
+        left = fill(
+            QWidget(),
+            self.choice,
+            self.about,
+            (self.stack, 1),
+            self.verdict,
+            self.run_bar,
+            self.use_button,
+            self.go_on_button,
+            margins=(0, 0, 6, 0),
+        )
         self.right = QWidget()
         """For the subclass."""
-        split = QSplitter()
-        split.addWidget(left)
-        split.addWidget(self.right)
-        split.setSizes([_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX])
-        split.setStretchFactor(1, 1)
-        split.setChildrenCollapsible(False)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(split)
+        sizes = [_FORM_WIDTH_PX, 3 * _FORM_WIDTH_PX]
+        fill(self.body, split(left, self.right, sizes=sizes, stretch=1, firm=True))
 
         self._started: set[str] = set()
         self._check_job: Job | None = None
         self._again = False
         self._unchecked = False
         """Whether the bench was busy when the form was to be checked."""
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
-        self._rest.setInterval(_CHECK_MS)
-        self._rest.timeout.connect(self.check)
-        self._slow = QTimer(self)
-        self._slow.setSingleShot(True)
-        self._slow.setInterval(_SLOW_MS)
-        self._slow.timeout.connect(lambda: self._say("This is being checked …", wrong=False))
+        self._rest = after_rest(self, _CHECK_MS, self.check)
+        self._slow = after_rest(self, _SLOW_MS, lambda: self._say("This is being checked …", wrong=False))
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)
-        self.run_bar.pause.connect(self.run.pause)
-        self.run_bar.resume.connect(self.run.resume)
-        self.run_bar.abort.connect(self.run.abort)
-        self.run.looked.connect(self._looked)
+        self.run.looked.connect(self.looked)
         self.run.said.connect(lambda line: self.session.log("info", line))
         self.run.succeeded.connect(self._succeeded)
         self.run.ended_early.connect(self._ended_early)
@@ -142,18 +113,14 @@ class ProcedurePanel(Panel):
 
     # The form ------------------------------------------------------------------------------------
     @property
-    def form(self) -> Form:
-        """The form that is shown."""
-        return self.forms[self.choice.currentIndex()]
+    def routine(self) -> Routine:
+        """The routine whose form is shown."""
+        return self.routines[self.choice.currentIndex()]
 
     @property
     def view(self) -> OptionsForm:
         """The form that is shown, as a widget."""
-        return self.views[self.form.name]
-
-    def choose(self, name: str) -> None:
-        """Show another form."""
-        self.choice.setCurrentIndex([form.name for form in self.forms].index(name))
+        return self.views[self.routine.name]
 
     def procedure(self) -> Procedure | None:
         """Return what the form asks for; None, and fields marked, where it makes no sense."""
@@ -161,7 +128,7 @@ class ProcedurePanel(Panel):
         if values is None:
             return None
         try:
-            return self.form.make(values)
+            return self.routine.procedure(self.routine.options(**values))
         except BenchError as error:
             self.show_problem(error)
             return None
@@ -181,14 +148,14 @@ class ProcedurePanel(Panel):
             self._again = True
             return
         self.outlook, self._unchecked = None, False
-        missing = [kind for kind in ("camera", *self.form.needs) if not self.session.is_open(kind)]
+        missing = [kind for kind in ("camera", *self.routine.needs) if not self.session.is_open(kind)]
         if missing:
-            names = " and ".join(kind.replace("_", " ") for kind in missing)
+            names = " and ".join(map(name_of, missing))
             self._say(f"The bench has no {names} that is open.", wrong=True)
             self.run_bar.set_startable("Not all devices are open.")
             return
-        bench, form = self.session.bench, self.form
-        first = form.start if form.name not in self._started else None
+        bench, routine = self.session.bench, self.routine
+        first = routine.start if routine.name not in self._started else None
         procedure = self.procedure() if first is None else None
         if procedure is None and first is None:
             self.run_bar.set_startable("The form has mistakes.")
@@ -196,10 +163,12 @@ class ProcedurePanel(Panel):
         self.run_bar.set_startable("It is being checked.")
 
         def work(_: JobContext) -> _Checked:
-            return _check(form.name, bench, procedure, first)
+            return _check(routine.name, bench, procedure, first)
 
         try:
-            self._check_job = self.session.device_job(f"Checking: {form.title}", work, {"stage"}, quiet=True)
+            self._check_job = self.session.jobs.device(
+                f"Checking: {routine.title}", work, {"stage"}, quiet=True
+            )
         except BusyError as error:
             self.run_bar.set_startable(str(error))
             self._unchecked = True
@@ -236,7 +205,7 @@ class ProcedurePanel(Panel):
         procedure = self.procedure()
         if procedure is None or self.run.is_running:
             return
-        self.carry_out(self.form.title, procedure)
+        self.carry_out(self.routine.title, procedure)
 
     def carry_out(self, title: str, procedure: Procedure) -> None:
         """Carry out a procedure."""
@@ -272,28 +241,28 @@ class ProcedurePanel(Panel):
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
         self.stack.setCurrentIndex(self.choice.currentIndex())
-        self.about.setText(f"{self.form.tip.removesuffix('.')}.")
+        self.about.setText(f"{self.routine.help.removesuffix('.')}.")
         self._typed()
 
     def _typed(self) -> None:
         self.run_bar.set_startable("It is being checked.")
         self._rest.start()
 
-    def _checked(self, found: _Checked) -> None:
-        if found.start is not None:
-            self._started.add(found.form)
-            self.views[found.form].begin_with(found.start)
+    def _checked(self, checked: _Checked) -> None:
+        if checked.start is not None:
+            self._started.add(checked.routine)
+            self.views[checked.routine].begin_with(checked.start)
             self._again = True
             return
-        if found.form != self.form.name:  # another one was chosen meanwhile, and waits for its check
+        if checked.routine != self.routine.name:  # another one was chosen meanwhile, and waits for its check
             return
-        if found.error is not None:
-            self.show_problem(found.error)
+        if checked.error is not None:
+            self.show_problem(checked.error)
             self.run_bar.set_startable("It cannot be done; see below the form.")
         else:
-            assert found.outlook is not None
-            self.outlook = found.outlook
-            self.show_outlook(found.outlook)
+            assert checked.outlook is not None
+            self.outlook = checked.outlook
+            self.show_outlook(checked.outlook)
             self.run_bar.set_startable()
 
     def _check_failed(self, why: str) -> None:
@@ -310,10 +279,6 @@ class ProcedurePanel(Panel):
     def _job_ended(self, job: Job) -> None:
         if self._unchecked and job.lanes:
             self._rest.start()
-
-    def _looked(self, now: Situation) -> None:
-        self.run_bar.show_situation(now)
-        self.looked(now)
 
     def _use(self) -> None:
         self.session.handed_on.emit(self.handed_to, self._result)
@@ -353,30 +318,28 @@ class ProcedurePanel(Panel):
 
     def _say(self, text: str, *, wrong: bool) -> None:
         self.verdict.setPlainText(text)
-        self.verdict.setProperty("refused", wrong)
-        self.verdict.style().unpolish(self.verdict)
-        self.verdict.style().polish(self.verdict)
+        mark(self.verdict, "refused", wrong)
 
 
 @dataclass(slots=True)
 class _Checked:
-    """What the check of a form found: values to begin with, an outlook, or what stands against it."""
+    """What the check of a form comes to: values to begin with, an outlook, or what stands against it."""
 
-    form: str
+    routine: str
     start: dict[str, Any] | None = None
     outlook: Outlook | None = None
     error: BenchError | None = None
 
 
 def _check(
-    form: str, bench: Bench, procedure: Procedure | None, start: Callable[[Bench], Any] | None
+    routine: str, bench: Bench, procedure: Procedure | None, start: Callable[[Bench], Any] | None
 ) -> _Checked:
-    found = _Checked(form)
+    checked = _Checked(routine)
     try:
         if start is not None:
-            found.start = dict(start(bench))
+            checked.start = dict(start(bench))
         elif procedure is not None:
-            found.outlook = procedure.outlook(bench)
+            checked.outlook = procedure.outlook(bench)
     except BenchError as error:
-        found.error = error
-    return found
+        checked.error = error
+    return checked

@@ -1,4 +1,4 @@
-"""A procedure that is carried out for a panel: started, paused, ended, and looked at by a timer."""
+"""A procedure that is carried out for a panel: started, paused, ended, looked at by a timer; its buttons."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from PySide6.QtCore import QObject, QTimer, Signal
+from PySide6.QtCore import QObject, Signal
+from PySide6.QtWidgets import QWidget
 
 from calibration_routines.display.display_io import SpotLook
 from calibration_routines.procedure import Listener, Outcome, Procedure, RunEndedError, place_of
@@ -16,8 +17,11 @@ from calibration_routines.psf.sweep_plan import SweepExposures
 from calibration_routines.psf.sweep_procedure import event_lines, exposure_lines
 from calibration_routines.psf.sweep_watch import SweepEvent
 from gui.jobs import Job, JobContext
+from gui.panel import on_bench
 from gui.session import BenchSession
+from gui.widgets.building import button, every, fill, in_row, label, share_bar
 from instrument.bench.photograph import Snapshot
+from instrument.files.errors import duration
 from instrument.plan import Plan
 from instrument.plan.model import plan_toml
 from instrument.runs.run_control import EndedEarlyError, RunControl
@@ -60,7 +64,7 @@ class Situation:
     place: Mapping[str, float] | None = None
 
 
-class _Heard(Listener):
+class _Mailbox(Listener):
     """Keeps the newest situation, in the job's thread, and what must not get lost until it is fetched."""
 
     def __init__(self) -> None:
@@ -89,9 +93,9 @@ class _Heard(Listener):
         with self._lock:
             self._lines.append(words)
 
-    def exposures(self, found: SweepExposures) -> None:
+    def exposures(self, exposures: SweepExposures) -> None:
         with self._lock:
-            self._lines += exposure_lines(found)
+            self._lines += exposure_lines(exposures)
 
     def frame(self, status: RunStatus) -> None:
         with self._lock:
@@ -149,7 +153,6 @@ class ProcedureRun(QObject):
 
     Signals
     -------
-    began
     looked : Situation
         Ten times a second while it goes on, and once at its end.
     said : str
@@ -164,7 +167,6 @@ class ProcedureRun(QObject):
         After one of these three.
     """
 
-    began = Signal()
     looked = Signal(object)
     said = Signal(str)
     judged = Signal(object)
@@ -179,20 +181,14 @@ class ProcedureRun(QObject):
         self._session = session
         self._job: Job | None = None
         self._control = RunControl()
-        self._heard = _Heard()
-        self._timer = QTimer(self)
-        self._timer.setInterval(_LOOK_MS)
-        self._timer.timeout.connect(self._look)
+        self._mailbox = _Mailbox()
+        self._timer = every(self, _LOOK_MS, self._look)
+        self._timer.stop()
 
     @property
     def is_running(self) -> bool:
         """Whether a procedure goes on."""
         return self._job is not None
-
-    @property
-    def is_pausing(self) -> bool:
-        """Whether it is paused or will be before its next step."""
-        return self._control.is_pausing
 
     def start(self, title: str, procedure: Procedure) -> None:
         """Carry out a procedure.
@@ -202,25 +198,24 @@ class ProcedureRun(QObject):
         BusyError
             When something else holds the bench.
         """
-        control, heard, bench = RunControl(), _Heard(), self._session.bench
+        control, mailbox, bench = RunControl(), _Mailbox(), self._session.bench
 
         def work(context: JobContext) -> Outcome | Ended:
             context.on_cancel(lambda: threading.Thread(target=control.stop, name="STOP").start())
             try:
-                return procedure.carry_out(bench, control=control, listener=heard)
+                return procedure.carry_out(bench, control=control, listener=mailbox)
             except RunEndedError as error:
                 return Ended(f"{error.words} It can go on: the panel Runs resumes it.", error.run.path)
             except EndedEarlyError as error:
                 return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
 
         self._job = self._session.exclusive_job(title, work)
-        self._control, self._heard = control, heard
+        self._control, self._mailbox = control, mailbox
         self._job.succeeded.connect(self._succeeded)
         self._job.failed.connect(self._failed)
         self._job.cancelled.connect(self._cancelled)
         self._job.ended.connect(self._over)
         self._timer.start()
-        self.began.emit()
 
     def pause(self) -> None:
         """Wait before the next step, light off."""
@@ -241,7 +236,7 @@ class ProcedureRun(QObject):
         self._timer.stop()
 
     def _look(self) -> None:
-        lines, events, looks = self._heard.fetch()
+        lines, events, looks = self._mailbox.fetch()
         for line in lines:
             self.said.emit(line)
         for event in events:
@@ -252,7 +247,7 @@ class ProcedureRun(QObject):
         if before:
             self.looked.emit(Situation(step=f"waiting for: {', '.join(job.title for job in before)}"))
         else:
-            self.looked.emit(self._heard.situation)
+            self.looked.emit(self._mailbox.situation)
 
     def _succeeded(self, result: Outcome | Ended) -> None:
         self._look()
@@ -281,29 +276,95 @@ class ProcedureRun(QObject):
         self.over.emit()
 
 
-def script(procedure: Procedure, bench: Path | None) -> str:
-    """Return lines that open the bench, say what the procedure will do, and carry it out.
+_STEPS = 1000
+
+
+class RunBar(QWidget):
+    """The buttons of a procedure and its progress.
+
+    Signals
+    -------
+    start
+        To be carried out.
 
     Parameters
     ----------
-    procedure : Procedure
-        A dataclass.
-    bench : Path, optional
-        Its bench.toml; None: the built-in simulated bench.
+    run : ProcedureRun
+        Is paused and aborted by the buttons, and shown.
+    words : str
+        On the start button.
     """
-    imports = Imports({("instrument.bench.bench", "open_bench")})
+
+    start = Signal()
+
+    def __init__(self, run: ProcedureRun, words: str) -> None:
+        super().__init__()
+        self.start_button = button(words, clicked=self.start, shortcut="Ctrl+Return", primary=True)
+        tip = "Wait before the next frame, light off; press again to go on"
+        self.pause_button = button("Pause", tip, checkable=True)
+        self.pause_button.clicked.connect(lambda on: run.pause() if on else run.resume())
+        tip = "End before the next frame; what was taken is kept and can be resumed"
+        self.abort_button = button("Abort", tip, run.abort)
+        self.bar = share_bar(_STEPS)
+        self.words = label(role="dim", wraps=True, yields=True)
+        buttons = in_row((self.start_button, 2), self.pause_button, self.abort_button)
+        fill(self, buttons, self.bar, self.words, margins=(0, 4, 0, 0))
+        run.looked.connect(self.show_situation)
+        self._why_not = ""
+        self.set_running(False)
+
+    def set_startable(self, why_not: str = "") -> None:
+        """Let the start button be pressed, or say why not."""
+        self._why_not = why_not
+        self._show_start(running=self.pause_button.isEnabled())
+
+    def set_running(self, running: bool) -> None:
+        """Show the buttons for a procedure that runs, or for none."""
+        self.pause_button.setEnabled(running)
+        self.abort_button.setEnabled(running)
+        self.pause_button.setChecked(False)
+        self._show_start(running=running)
+        if running:
+            self.bar.setValue(0)
+            self.words.setText("Beginning")
+
+    def show_situation(self, now: Situation) -> None:
+        """Show how far it is."""
+        self.bar.setRange(0, _STEPS if now.total else 0)
+        if now.total:
+            self.bar.setValue(round(_STEPS * now.done / now.total))
+        words = [now.step[:1].upper() + now.step[1:]]
+        if now.total > 1:
+            words.append(f"{now.done:.0f} of {'at most ' if now.at_most else ''}{now.total:.0f}")
+        elif now.total:
+            words.append(f"{now.done / now.total:.0%}")
+        if now.paused:
+            words.append("PAUSED, light off")
+        elif now.seconds_left is not None:
+            words.append(f"{'at most ' if now.at_most else ''}{duration(now.seconds_left)} left")
+        self.words.setText(", ".join(words))
+
+    def show_end(self, words: str, *, complete: bool) -> None:
+        """Show how it ended."""
+        self.bar.setRange(0, _STEPS)
+        self.bar.setValue(_STEPS if complete else self.bar.value())
+        self.words.setText(words)
+
+    def _show_start(self, *, running: bool) -> None:
+        self.start_button.setEnabled(not running and not self._why_not)
+        self.start_button.setToolTip(self._why_not or "Begin (Ctrl+Enter)")
+
+
+def script(procedure: Procedure, bench: Path | None) -> str:
+    """Return lines that open the bench, say what the procedure will do, and carry it out.
+
+    ``bench`` is its bench.toml; None: the built-in simulated bench.
+    """
+    imports = Imports()
     made = expression(procedure, imports, special={Plan: _plan_lines})
-    opened = f"open_bench({str(bench)!r})" if bench is not None else "open_bench()"
-    lines = [
-        *imports.lines(),
-        "",
-        f"procedure = {made}",
-        f"with {opened} as bench:",
-        "    print(*procedure.outlook(bench).reasons, sep='\\n')",
-        "    done = procedure.carry_out(bench)",
-        "print(*done.verdict, sep='\\n')",
-    ]
-    return "\n".join(lines) + "\n"
+    lines = ["print(*procedure.outlook(bench).reasons, sep='\\n')", "done = procedure.carry_out(bench)"]
+    opened = on_bench(bench, lines, imports, [f"procedure = {made}"])
+    return f"{opened}print(*done.verdict, sep='\\n')\n"
 
 
 def _plan_lines(plan: Plan, imports: Imports) -> str:

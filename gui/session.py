@@ -6,21 +6,18 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from drivers.camera import Camera
-from drivers.errors import (
-    DeviceError,
-    LimitError,
-    StoppedError,
-)
+from drivers.errors import DeviceError, LimitError, StoppedError
 from drivers.frame import Frame
 from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
-from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone
+from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
 from instrument.bench.photograph import LightState, switch_light
@@ -30,7 +27,7 @@ Level = Literal["debug", "info", "warning", "error"]
 
 _STOP_REPEAT_S = 0.05
 _STOP_WAIT_S = 10.0
-"""A job that has not ended by then is told of; STOP goes on, for the job may be about to start a move."""
+"""A job that has not ended by then is named; STOP goes on, for the job may be about to start a move."""
 _WATCH_MS = 500
 
 
@@ -71,7 +68,7 @@ class BenchSession(QObject):
     handed_on = Signal(str, object)
     opened = Signal()
     closed = Signal()
-    _from_thread = Signal(str, object)
+    _from_thread = Signal(object)
 
     def __init__(self, config: BenchConfig, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -89,8 +86,8 @@ class BenchSession(QObject):
         self._live_wanted = True
         self._live_job: Job | None = None
         self._requests: list[OperatorRequest] = []
-        self._from_thread.connect(self._receive, Qt.ConnectionType.QueuedConnection)
-        self._handler = LogBridge(lambda *told: self._from_thread.emit("log", told))
+        self._from_thread.connect(self._do, Qt.ConnectionType.QueuedConnection)
+        self._handler = LogBridge(lambda *line: self._in_window(self.log, *line))
         logging.getLogger().addHandler(self._handler)
         for room in ("instrument", "drivers", "calibration_routines"):
             logging.getLogger(room).setLevel(logging.INFO)
@@ -116,11 +113,6 @@ class BenchSession(QObject):
     def is_open(self, kind: str) -> bool:
         """Whether a device can be used."""
         return self.state(kind).condition == "open"
-
-    @property
-    def is_simulated(self) -> bool:
-        """Whether any device of the bench is simulated."""
-        return any(state.simulated for state in self._states.values())
 
     # Opening -------------------------------------------------------------------------------------
     def open(self) -> Job:
@@ -150,7 +142,7 @@ class BenchSession(QObject):
             self._open_one(kind)
 
         try:
-            job = self.jobs.device(f"Connecting the {kind.replace('_', ' ')}", work, {kind})
+            job = self.jobs.device(f"Connecting the {name_of(kind)}", work, {kind})
         except BusyError as error:
             self.log("warning", str(error))
             return
@@ -163,9 +155,14 @@ class BenchSession(QObject):
             device = self.bench.open_device(kind)
             identity = device.identity
         except DeviceError as error:
-            self._from_thread.emit("failed", (kind, words_for(error)))
+            self._in_window(self._not_opened, kind, words_for(error))
         else:
-            self._from_thread.emit("open", (kind, str(identity), identity.simulated))
+            state = DeviceState("open", str(identity), identity.simulated)
+            self._in_window(self._set_state, kind, state)
+
+    def _not_opened(self, kind: str, why: str) -> None:
+        self._set_state(kind, DeviceState("failed", why))
+        self.log("error", why)
 
     def _all_tried(self) -> None:
         for kind in self.kinds:
@@ -203,18 +200,6 @@ class BenchSession(QObject):
                 self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
 
     # Jobs ----------------------------------------------------------------------------------------
-    def device_job(
-        self,
-        title: str,
-        work: Work,
-        lanes: Collection[str],
-        *,
-        quiet: bool = False,
-        endless: bool = False,
-    ) -> Job:
-        """Run a job on devices; errors and flags as ``JobRunner.device``. ``quiet`` ones are not told of."""
-        return self.jobs.device(title, work, lanes, quiet=quiet, endless=endless)
-
     def camera_job(self, title: str, work: Callable[[Camera], Any], *, idle: bool = False) -> Job:
         """Run a short job on the camera; with ``idle`` the live view pauses for it (regions, formats ...)."""
 
@@ -320,7 +305,7 @@ class BenchSession(QObject):
         self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
 
     def _whatever_happens(self, step: Callable[[], object]) -> None:
-        """Take a step of STOP; one that fails is told and keeps the bench from nothing."""
+        """Take a step of STOP; one that fails is logged and keeps the bench from nothing."""
         try:
             step()
         except Exception as error:  # noqa: BLE001 - the bench is made safe all the same
@@ -329,20 +314,20 @@ class BenchSession(QObject):
     def _stop_all(self, running: tuple[Job, ...]) -> None:
         """Make the bench safe until a round began after the last job had ended: none can light anything."""
         deadline_s = time.monotonic() + _STOP_WAIT_S
-        told = False
+        named = False
         while True:
             late = tuple(job.title for job in running if not job.is_over)
             failure: Exception | None = None
             try:
                 self.bench.stop()
-            except Exception as error:  # noqa: BLE001 - whatever it is, STOP goes on and tells it
+            except Exception as error:  # noqa: BLE001 - whatever it is, STOP goes on and says so
                 failure = error
             if not late or self._all_closed.wait(_STOP_REPEAT_S):
                 break
-            if not told and time.monotonic() > deadline_s:
-                told = True
-                self._from_thread.emit("stop_late", (failure, late))
-        self._from_thread.emit("stopped", (failure, late))
+            if not named and time.monotonic() > deadline_s:
+                named = True
+                self._in_window(self._stop_late, failure, late)
+        self._in_window(self._stop_ended, failure, late)
 
     def _stop_late(self, failure: Exception | None, late: tuple[str, ...]) -> None:
         safe = "Light off, nothing moving;" if failure is None else f"{words_for(failure)}\nAnd"
@@ -400,7 +385,7 @@ class BenchSession(QObject):
         """Close everything; whatever a device does or does not, this ends and says so."""
         problems: list[str] = []
         try:
-            problems += _within(_STOP_WAIT_S, "making the bench safe", self.bench.safe_state)
+            problems += _within(_STOP_WAIT_S, "making the bench safe", self.bench.stop)
             deadline_s = time.monotonic() + _STOP_WAIT_S
             while not all(job.is_over for job in jobs) and time.monotonic() < deadline_s:
                 time.sleep(_STOP_REPEAT_S)
@@ -408,7 +393,7 @@ class BenchSession(QObject):
             problems += _within(_STOP_WAIT_S, "closing the bench", self.bench.close)
         finally:
             self._all_closed.set()
-            self._from_thread.emit("closed", "\n".join(problems))
+            self._in_window(self._ended, "\n".join(problems))
 
     def _ended(self, problem: str) -> None:
         if problem:
@@ -427,37 +412,28 @@ class BenchSession(QObject):
     def _ask(self, request: str) -> None:
         """Ask the operator, from a job's thread; returns when it is done."""
         asked = OperatorRequest(request)
-        self._from_thread.emit("ask", asked)
+        self._in_window(self._show_request, asked)
         asked.wait()
+
+    def _show_request(self, request: OperatorRequest) -> None:
+        if self._stopping or self._closing:
+            request.refuse()  # sent before STOP: nobody may wait for its answer
+            return
+        self._requests.append(request)
+        request.answered = lambda: self._requests.remove(request)
+        self.asked.emit(request)
 
     def _set_state(self, kind: str, state: DeviceState) -> None:
         if self._states[kind] != state:
             self._states[kind] = state
             self.device_changed.emit(kind)
 
-    def _receive(self, what: str, value: Any) -> None:
-        """Take a message from another thread."""
-        if what == "open":
-            kind, text, simulated = value
-            self._set_state(kind, DeviceState("open", text, simulated))
-        elif what == "failed":
-            kind, text = value
-            self._set_state(kind, DeviceState("failed", text))
-            self.log("error", text)
-        elif what == "stopped":
-            self._stop_ended(*value)
-        elif what == "stop_late":
-            self._stop_late(*value)
-        elif what == "closed":
-            self._ended(value)
-        elif what == "ask" and (self._stopping or self._closing):
-            value.refuse()  # sent before STOP was heard of: nobody may wait for its answer
-        elif what == "ask":
-            self._requests.append(value)
-            value.answered = lambda: self._requests.remove(value)
-            self.asked.emit(value)
-        else:
-            self.log(*value)
+    def _in_window(self, call: Callable[..., object], *arguments: object) -> None:
+        """Have something called in the window's thread, from another one."""
+        self._from_thread.emit(partial(call, *arguments))
+
+    def _do(self, call: Callable[[], object]) -> None:
+        call()
 
 
 def _within(seconds: float, title: str, work: Callable[[], object]) -> list[str]:

@@ -1,4 +1,4 @@
-"""What a session tells the window: how devices do, what is logged, what the operator is asked to do."""
+"""What a session has for the window: how devices do, what is logged, what the operator is asked to do."""
 
 from __future__ import annotations
 
@@ -72,6 +72,11 @@ class DeviceState:
     simulated: bool = False
 
 
+def name_of(kind: str) -> str:
+    """Return what people call a kind of device: ``"led_array"`` is an LED array."""
+    return kind.replace("_", " ").replace("led", "LED").replace("slm", "SLM")
+
+
 def is_gone(device: Device, error: DeviceError) -> bool:
     """Whether an error means that a device cannot be used any more."""
     if isinstance(error, DeviceLostError | DeviceNotOpenError | DeviceTimeoutError) or not device.is_open:
@@ -88,13 +93,13 @@ class LogBridge(logging.Handler):
 
     Parameters
     ----------
-    tell : callable
+    callback : callable
         Called with both, in the thread that logs.
     """
 
-    def __init__(self, tell: Callable[[str, str], object]) -> None:
+    def __init__(self, callback: Callable[[str, str], object]) -> None:
         super().__init__(logging.INFO)
-        self._tell = tell
+        self._callback = callback
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hand on a record."""
@@ -102,4 +107,4 @@ class LogBridge(logging.Handler):
             record.levelno, "info"
         )
         with contextlib.suppress(RuntimeError):  # the window is gone
-            self._tell(level, f"{record.name}: {record.getMessage()}")
+            self._callback(level, f"{record.name}: {record.getMessage()}")

@@ -35,7 +35,7 @@ class Colours:
     colour_map: str
     """The images' colour map to begin with: a name of ``gui.theme``."""
     red_light_only: bool = False
-    """Whether hues cannot tell things apart: brightness has to."""
+    """Whether hues cannot distinguish things: brightness has to."""
 
 
 DARK = Colours(

@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, find_camera
 from instrument.bench.config import BenchConfig
-from instrument.display.hologram import Alignment, bench_display
+from instrument.display.hologram import Alignment, CaptureOptions, bench_display
 from instrument.files.images import write_image
 from instrument.files.slm_image import phase_levels, write_slm_image
-from recon.base.declare import option
 from recon.holography import Display, HologramModel, Scores, Target, compute_hologram
 from recon.holography.camera_map import CameraMap
 from recon.holography.judge import compare, low_pass
@@ -26,8 +25,6 @@ from recon.holography.options import Envelope
 from recon.holography.target import make_band
 
 Array = npt.NDArray[Any]
-HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"
-"""What options of photographs are about, and their heading."""
 _GAIN = 0.8  # part of what a photograph lacked that is asked for beyond
 _ITERATIONS = 15  # between two photographs
 
@@ -70,20 +67,6 @@ class Refinement:
     first: Capture
     best: Capture
     psnr_db: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureOptions:
-    """How a hologram is photographed."""
-
-    average: int = option(4, least=1, help="Photographs a frame.", applies=(HOLOGRAM,), group=PHOTOGRAPHED)
-    refine: int = option(
-        0,
-        least=0,
-        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
-        applies=(HOLOGRAM,),
-        group=PHOTOGRAPHED,
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from recon.camera.base import LinearOperator
 from recon.camera.camera_model import Depths, OfferedCamera
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 
 Array = npt.NDArray[Any]
 
@@ -38,7 +38,7 @@ class Vignetting(LinearOperator):
         return float(self.gain.max()) * self.camera.norm_bound
 
 
-def make(central: Convolution3D, _depths: Depths) -> Vignetting:
+def make(central: Convolution, _depths: Depths) -> Vignetting:
     """Return the camera of one channel; the gain falls with the square of the distance from the middle."""
     y, x = (np.linspace(-1, 1, n) for n in central.range_shape[1:])
     return Vignetting(central, 1 - (1 - CORNER) * (y[:, None] ** 2 + x**2) / 2)

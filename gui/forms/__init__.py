@@ -1,1 +1,1 @@
-"""What the forms ask for: fields with units and reasons, and the procedures that they make; no widgets."""
+"""Declared options on the screen: a field each, one form for all, and the form of a reconstruction."""

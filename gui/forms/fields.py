@@ -13,9 +13,9 @@ from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
+from gui.widgets.building import narrow
 from gui.widgets.dialogues import Browse
-from gui.widgets.entry import Entry, PathEntry, existing_path, narrow
-from gui.widgets.number_edit import NumberEdit
+from gui.widgets.entry import Entry, NumberEdit, PathEntry, existing_path
 from instrument.files.errors import BenchError
 from recon.base.declare import Option
 from recon.base.option_text import default_shown, metavar, read, shown
@@ -69,8 +69,8 @@ class Behaviour:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """Whom a field tells of changes, of what it refused, and of what it took."""
+class FieldSignals:
+    """What a field calls when it is edited, refused (with the reason), or its value is taken."""
 
     edited: Callable[[], object]
     refused: Callable[[str], object]
@@ -136,15 +136,19 @@ class OptionField:
 
     def problem(self, value: Any) -> str:
         """Say why a value cannot be; empty where it can."""
-        found = self._spoken.mistake(value, typed=True) or ""
-        return found or ("" if self.behaviour.require is None else self.behaviour.require(value))
+        mistake = self._spoken.mistake(value, typed=True) or ""
+        return mistake or ("" if self.behaviour.require is None else self.behaviour.require(value))
 
     def read(self) -> tuple[Any, str]:
         """Return the value, in the option's own unit, and why it cannot be used; empty where it can."""
         raise NotImplementedError
 
     def show(self, value: Any) -> None:
-        """Show a value in the option's own unit; no change is told of."""
+        """Show a value in the option's own unit; no change is signalled."""
+        with QSignalBlocker(self.widget):
+            self._set(value)
+
+    def _set(self, value: Any) -> None:
         raise NotImplementedError
 
     @property
@@ -156,8 +160,8 @@ class OptionField:
         """Return what stands in the widget; equal as long as nothing was changed."""
         return self.read()
 
-    def listen(self, told: Told) -> None:
-        """Have changes, refusals and what is settled told."""
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
         raise NotImplementedError
 
 
@@ -205,18 +209,15 @@ class NumberField(OptionField):
         """Return the text without its unit."""
         return self.widget.text().strip().removesuffix(self.unit).strip()
 
-    def show(self, value: Any) -> None:
-        """Show a value."""
-        blocked = QSignalBlocker(self.widget)
+    def _set(self, value: Any) -> None:
         scaled = None if value is None else value / self.option.declaration.shown_factor
         self.widget.set_value(scaled, overwrite=True)
-        blocked.unblock()
 
-    def listen(self, told: Told) -> None:
-        """Have changes told."""
-        self.widget.textChanged.connect(lambda _: told.edited())
-        self.widget.refused.connect(told.refused)
-        self.widget.submitted.connect(lambda _: told.settled())
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
+        self.widget.textChanged.connect(lambda _: signals.edited())
+        self.widget.refused.connect(signals.refused)
+        self.widget.submitted.connect(lambda _: signals.settled())
 
 
 class SwitchField(OptionField):
@@ -232,16 +233,13 @@ class SwitchField(OptionField):
         """Return the value, and why it cannot be used."""
         return self.widget.isChecked(), ""
 
-    def show(self, value: Any) -> None:
-        """Show a value."""
-        blocked = QSignalBlocker(self.widget)
+    def _set(self, value: Any) -> None:
         self.widget.setChecked(bool(value))
-        blocked.unblock()
 
-    def listen(self, told: Told) -> None:
-        """Have changes told."""
-        self.widget.toggled.connect(lambda _: told.edited())
-        self.widget.toggled.connect(lambda _: told.settled())
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
+        self.widget.toggled.connect(lambda _: signals.edited())
+        self.widget.toggled.connect(lambda _: signals.settled())
 
 
 class ChoiceField(OptionField):
@@ -271,14 +269,13 @@ class ChoiceField(OptionField):
         """Offer these of its words; the default, else the first, where another was chosen."""
         if [self.widget.itemText(i) for i in range(self._words_from, self.widget.count())] == list(words):
             return
-        blocked = QSignalBlocker(self.widget)
-        chosen = self.widget.currentText()
-        while self.widget.count() > self._words_from:
-            self.widget.removeItem(self._words_from)
-        self._add(words)
-        left = next((word for word in (chosen, self.option.default) if word in words), "")
-        self.widget.setCurrentIndex(max(self.widget.findText(str(left)), 0))
-        blocked.unblock()
+        with QSignalBlocker(self.widget):
+            chosen = self.widget.currentText()
+            while self.widget.count() > self._words_from:
+                self.widget.removeItem(self._words_from)
+            self._add(words)
+            left = next((word for word in (chosen, self.option.default) if word in words), "")
+            self.widget.setCurrentIndex(max(self.widget.findText(str(left)), 0))
 
     def _add(self, words: Sequence[str]) -> None:
         for word in words:
@@ -291,17 +288,14 @@ class ChoiceField(OptionField):
         value = self.widget.currentData()
         return value, "" if value is None else self.problem(value)
 
-    def show(self, value: Any) -> None:
-        """Show a value."""
-        blocked = QSignalBlocker(self.widget)
+    def _set(self, value: Any) -> None:
         at = [self.widget.itemData(i) for i in range(self.widget.count())]
         self.widget.setCurrentIndex(at.index(value) if value in at else 0)
-        blocked.unblock()
 
-    def listen(self, told: Told) -> None:
-        """Have changes told."""
-        self.widget.currentIndexChanged.connect(lambda _: told.edited())
-        self.widget.currentIndexChanged.connect(lambda _: told.settled())
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
+        self.widget.currentIndexChanged.connect(lambda _: signals.edited())
+        self.widget.currentIndexChanged.connect(lambda _: signals.settled())
 
 
 class EntryField(OptionField):
@@ -363,17 +357,14 @@ class EntryField(OptionField):
         """Return the text: whether it names a file is not looked up at every key."""
         return self.widget.text()
 
-    def show(self, value: Any) -> None:
-        """Show a value."""
-        blocked = QSignalBlocker(self.widget)
+    def _set(self, value: Any) -> None:
         self.widget.setText("" if value is None else shown(self.option, value))
-        blocked.unblock()
 
-    def listen(self, told: Told) -> None:
-        """Have changes told."""
-        self.widget.textChanged.connect(lambda _: told.edited())
-        self.widget.refused.connect(told.refused)
-        self.widget.understood.connect(told.settled)
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
+        self.widget.textChanged.connect(lambda _: signals.edited())
+        self.widget.refused.connect(signals.refused)
+        self.widget.understood.connect(signals.settled)
 
 
 class LinesField(OptionField):
@@ -393,15 +384,12 @@ class LinesField(OptionField):
         """Return the text."""
         return self.widget.toPlainText(), ""
 
-    def show(self, value: Any) -> None:
-        """Show a text."""
-        blocked = QSignalBlocker(self.widget)
+    def _set(self, value: Any) -> None:
         self.widget.setPlainText(str(value or ""))
-        blocked.unblock()
 
-    def listen(self, told: Told) -> None:
-        """Have changes told."""
-        self.widget.textChanged.connect(told.edited)
+    def listen(self, signals: FieldSignals) -> None:
+        """Connect what is to be called."""
+        self.widget.textChanged.connect(signals.edited)
 
 
 def field_for(option: Option, behaviour: Behaviour) -> OptionField:

@@ -7,9 +7,18 @@ from functools import partial
 from typing import Any, TypeVar
 
 from PySide6.QtCore import Qt, QTimer, Signal
-from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QWidget
 
-from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, Told, field_for
+from gui.forms.fields import (
+    Behaviour,
+    ChoiceField,
+    FieldSignals,
+    LinesField,
+    OptionField,
+    SwitchField,
+    field_for,
+)
+from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, options_of
 from recon.errors import InputError
@@ -17,7 +26,6 @@ from recon.errors import InputError
 FOLDED = ("Rarely needed", "Advanced")
 """Groups that are folded away, wherever they are declared."""
 
-_MARGINS = (2, 6, 8, 2)
 _ABOVE_HEADING_PX = 6
 _T = TypeVar("_T")
 
@@ -75,12 +83,9 @@ class OptionsForm(QWidget):
         self._rows: dict[str, QFormLayout] = {}
         self._hidden: set[str] = set()
         self._disabled: dict[str, str] = {}
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(*_MARGINS)
         usual, seldom = QWidget(), QWidget()
         self._fill(usual, [f for f in self.fields.values() if not self._is_folded(f)])
         self._fill(seldom, [f for f in self.fields.values() if self._is_folded(f)])
-        layout.addWidget(usual)
         self.more = QToolButton()
         self.more.setText(FOLDED[0])
         self.more.setCheckable(True)
@@ -91,15 +96,14 @@ class OptionsForm(QWidget):
         self._seldom = seldom
         self.more.toggled.connect(self._fold)
         seldom.hide()
-        layout.addWidget(self.more, 0, Qt.AlignmentFlag.AlignLeft)
-        layout.addWidget(seldom)
+        fill(self, usual, in_row(self.more, None), seldom, None, margins=(2, 6, 8, 2))
         self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
-        layout.addStretch(1)
         for name, field in self.fields.items():
             field.show(field.default)
-            field.listen(
-                Told(self._edited, partial(self._refused_itself, name), partial(self.settled.emit, name))
+            signals = FieldSignals(
+                self._edited, partial(self._refused_itself, name), partial(self.settled.emit, name)
             )
+            field.listen(signals)
         self._state = self._raw()
         self._update_enabled()
 
@@ -110,18 +114,14 @@ class OptionsForm(QWidget):
         Of those that are not shown or do not apply, the default.
         """
         self.clear_reasons()
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         readable = True
         for name, field in self.fields.items():
-            if not self.applies(name):
-                found[name] = field.default
-                continue
-            value, problem = field.read()
+            values[name], problem = field.read() if self.applies(name) else (field.default, "")
             if problem:
                 self.refuse(name, problem)
                 readable = False
-            found[name] = value
-        return found if readable else None
+        return values if readable else None
 
     def value(self, name: str) -> Any:
         """Return one option's value.
@@ -207,7 +207,7 @@ class OptionsForm(QWidget):
 
     # Reasons -------------------------------------------------------------------------------------
     def check(self) -> bool:
-        """Tell whether all can be read; the first that cannot is brought into sight, with the reason."""
+        """Return whether all can be read; the first that cannot is brought into sight, with the reason."""
         if self.values() is not None:
             return True
         name = next(name for name, reason in self._reasons.items() if reason.text())
@@ -217,7 +217,7 @@ class OptionsForm(QWidget):
         return False
 
     def recheck(self, *names: str) -> bool:
-        """Look again at some fields, whose limits another one sets, and tell whether all of them can be."""
+        """Look again at some fields, whose limits another one sets, and return whether all of them can be."""
         good = True
         for name in names:
             problem = self.fields[name].read()[1] if self.applies(name) else ""
@@ -240,7 +240,7 @@ class OptionsForm(QWidget):
         reason.setText(text)
         reason.show()
         widget.setToolTip(text)
-        _mark(widget, refused=True)
+        mark(widget, "refused", True)
         return True
 
     def show_field(self, name: str) -> None:
@@ -274,8 +274,7 @@ class OptionsForm(QWidget):
         groups = list(dict.fromkeys(map(self._group, fields)))
         for group in groups:
             if group and (len(groups) > 1) and group not in FOLDED:
-                self._headings[group] = heading = QLabel(group)
-                heading.setProperty("role", "heading")
+                self._headings[group] = heading = label(group, "heading")
                 heading.setContentsMargins(0, _ABOVE_HEADING_PX if rows.rowCount() else 0, 0, 0)
                 rows.addRow(heading)
             for field in (f for f in fields if self._group(f) == group):
@@ -284,18 +283,17 @@ class OptionsForm(QWidget):
     def _add(self, rows: QFormLayout, field: OptionField) -> None:
         name = field.option.name
         self._rows[name] = rows
-        self._reasons[name] = reason = QLabel()
+        self._reasons[name] = reason = label(wraps=True)
         reason.setObjectName("reason")
-        reason.setWordWrap(True)
         reason.hide()
-        label = QLabel(field.label)
-        label.setToolTip(field.tip)
-        label.setBuddy(field.widget)
+        words = label(field.label)
+        words.setToolTip(field.tip)
+        words.setBuddy(field.widget)
         field.widget.setAccessibleName(field.bare_label)
         if isinstance(field, LinesField):
             rows.addRow(field.whole)
         else:
-            rows.addRow(label, field.whole)
+            rows.addRow(words, field.whole)
         rows.addRow(reason)
 
     def _fold(self, opened: bool) -> None:
@@ -355,20 +353,4 @@ class OptionsForm(QWidget):
             reason.clear()
             reason.hide()
             self.widgets[name].setToolTip(self.fields[name].tip)
-            _mark(self.widgets[name], refused=False)
-
-
-def _mark(widget: QWidget, *, refused: bool) -> None:
-    widget.setProperty("refused", refused)
-    widget.style().unpolish(widget)
-    widget.style().polish(widget)
-
-
-def scrolled(form: QWidget) -> QScrollArea:
-    """Return a frameless place for a form, which scrolls up and down."""
-    scroll = QScrollArea()
-    scroll.setWidgetResizable(True)
-    scroll.setFrameShape(QScrollArea.Shape.NoFrame)
-    scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-    scroll.setWidget(form)
-    return scroll
+            mark(self.widgets[name], "refused", False)

@@ -1,35 +1,34 @@
-"""The form of a reconstruction: declared options become a request, the same that the command line makes."""
+"""A reconstruction that is asked for: its form, what the form comes to, and the job that does it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import Signal
-from PySide6.QtWidgets import (
-    QCompleter,
-    QHBoxLayout,
-    QLabel,
-    QProgressBar,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QCompleter, QWidget
 
 from gui.forms.fields import Behaviour
-from gui.forms.options_form import FOLDED, OptionsForm, scrolled
-from gui.reconstruction_work import ReconstructionWork, lines_of
+from gui.forms.options_form import FOLDED, OptionsForm
+from gui.jobs import JobCancelledError, JobContext
+from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
-from instrument.reconstruction.checkpointing import require_kept
+from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
+from instrument.reconstruction.job import Job as Prepared
 from instrument.reconstruction.options import InputOptions, OutputOptions, SourceOptions
-from instrument.reconstruction.request import PictureRequest, VolumeRequest, request_of
-from instrument.reconstruction.result_file import Outputs
-from recon.base.declare import option, options_of
+from instrument.reconstruction.request import PictureRequest, VolumeRequest, done_share, request_of
+from instrument.reconstruction.result_file import Outputs, write_reconstruction, write_volume
+from recon.base.declare import Imports, expression, option, options_of
 from recon.priors import PRIORS
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.solvers import SOLVERS
+from recon.solvers.base import IterationRecord
 
 CALIBRATION, PSF, VOLUME = "Picture (calibration)", "Picture (PSF image)", "Volume (PSFs)"
 SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}
@@ -37,7 +36,7 @@ SOURCES = {CALIBRATION: "calibration", PSF: "psf", VOLUME: "volume"}
 _IMAGES = "Images (*.tif *.tiff *.png *.npy *.npz *.bmp *.jpg);;All files (*)"
 _OF_A_PSF_IMAGE = ("allow_saturated", "allow_mixed_depth")
 _MOST_DEPTHS = 8
-"""More of them are told as a range."""
+"""More of them are named as a range."""
 _FOLDED = (*FOLDED, "Computing")
 
 
@@ -99,36 +98,18 @@ class ReconstructForm(QWidget):
             folded=_FOLDED,
         )
         self.widgets = self.options.widgets
-        self.start = QPushButton("Reconstruct")
-        self.start.setObjectName("primary")
-        self.start.setToolTip("Reconstruct with these settings (Ctrl+Return)")
-        self.start.setShortcut("Ctrl+Return")
-        self.start.clicked.connect(lambda: self._ask(self.asked))
-        self.explain = QPushButton("Explain")
-        self.explain.setToolTip(
-            "Say what model auto would choose, why, and what one step up or down would cost"
+        tip = "Reconstruct with these settings (Ctrl+Return)"
+        self.start = button(
+            "Reconstruct", tip, lambda: self._ask(self.asked), shortcut="Ctrl+Return", primary=True
         )
-        self.explain.clicked.connect(lambda: self._ask(self.questioned))
-        self.stop = QPushButton("Stop and keep")
-        self.stop.setToolTip("End after the iteration in progress; what there is then is kept")
-        self.stop.setEnabled(False)
-        self.stop.clicked.connect(self.stopped)
-        self.progress = QProgressBar()
-        self.progress.setRange(0, 1000)
-        self.progress.setTextVisible(False)
-        self.note = QLabel()
-        self.note.setWordWrap(True)
-        self.note.setProperty("role", "dim")
-        buttons = QHBoxLayout()
-        buttons.addWidget(self.start, 1)
-        buttons.addWidget(self.explain)
-        buttons.addWidget(self.stop)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(scrolled(self.options), 1)
-        layout.addWidget(self.note)
-        layout.addWidget(self.progress)
-        layout.addLayout(buttons)
+        tip = "Say what model auto would choose, why, and what one step up or down would cost"
+        self.explain = button("Explain", tip, lambda: self._ask(self.questioned))
+        tip = "End after the iteration in progress; what there is then is kept"
+        self.stop = button("Stop and keep", tip, self.stopped, enabled=False)
+        self.progress = share_bar()
+        self.note = label(role="dim", wraps=True)
+        buttons = in_row((self.start, 1), self.explain, self.stop)
+        fill(self, (scrolled(self.options), 1), self.note, self.progress, buttons)
         self.options.refused.connect(self.refused)
         self.options.settled.connect(lambda name: self._show_kind() if name == "kind" else None)
         self._kind = CALIBRATION
@@ -245,7 +226,129 @@ class ReconstructForm(QWidget):
 
 
 def _one_shot(present: dict[str, Any]) -> str:
-    """Say why nothing tells it when to stop; empty where something does."""
+    """Say why what ends iterations does not apply; empty where it does."""
     solver = str(present.get("solver"))
     one_step = solver in SOLVERS and SOLVERS[solver].one_step
     return f"{solver} is one shot: it has no iterations." if one_step else ""
+
+
+_INTERVAL_S = 0.5
+"""What there is so far is shown this often, at most."""
+_SHARE = 0.1
+"""At most this part of the time goes into making pictures on the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class SoFar:
+    """How far a reconstruction is.
+
+    Attributes
+    ----------
+    share : float
+        Of the work that is done, 0 to 1.
+    note : str
+    prepared : Prepared
+        What went in, and what was chosen on the way, in words.
+    image : ndarray, float32, or None
+        The picture so far; of a volume the brightest over depth.
+    history : tuple of IterationRecord
+    """
+
+    share: float
+    note: str
+    prepared: Prepared
+    image: npt.NDArray[np.float32] | None = None
+    history: tuple[IterationRecord, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionWork:
+    """All that a reconstruction is asked for.
+
+    Attributes
+    ----------
+    request : PictureRequest or VolumeRequest
+    outputs : Outputs
+    kept_in : Path or None
+        The checkpoint's folder.
+    rotate_deg : int
+        A picture is turned by so much, counter-clockwise, when it is written.
+    """
+
+    request: PictureRequest | VolumeRequest
+    outputs: Outputs
+    kept_in: Path | None = None
+    rotate_deg: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The file that was written, and what became of the checkpoint, by headings."""
+
+    path: Path
+    checkpoint: dict[str, str]
+
+
+def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
+    """Do a reconstruction as the command line does; cancelled, what there is so far is written."""
+    request, outputs = work.request, work.outputs
+    outputs.check(0)
+    prepared = request.prepare()
+    n_planes = len(prepared.calibration.psfs) if isinstance(request, VolumeRequest) else 1
+    outputs.check(n_planes * prepared.measurement.size)
+    keeper = checkpoint_for(work.kept_in, prepared, request)
+    context.report(SoFar(0.0, "Solving …", prepared))
+    history: list[IterationRecord] = []
+    shown_s, cost_s = time.monotonic(), 0.0
+
+    def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
+        nonlocal shown_s, cost_s
+        history.append(record)
+        now_s = time.monotonic()
+        if now_s - shown_s < max(_INTERVAL_S, cost_s / _SHARE):
+            return
+        image = present()
+        if isinstance(request, VolumeRequest):
+            image = image.max(axis=0)
+        note = f"iteration {record.iteration}, change {record.change:.1e}"
+        with contextlib.suppress(JobCancelledError):  # the solver sees it by itself, and keeps what it has
+            context.report(
+                SoFar(done_share(request.options, record), note, prepared, np.array(image), tuple(history))
+            )
+        shown_s = time.monotonic()
+        cost_s = shown_s - now_s
+
+    if isinstance(request, VolumeRequest):
+        volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        write_volume(outputs, volume, prepared)
+        settled = settle_checkpoint(keeper, volume.stop_reasons)
+    else:
+        picture = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)
+        write_reconstruction(outputs, picture, prepared, rotate_deg=work.rotate_deg)
+        settled = settle_checkpoint(keeper, [picture.stop_reason])
+    return Written(outputs.image, settled)
+
+
+def lines_of(work: ReconstructionWork) -> str:
+    """Return the Python that does a reconstruction."""
+    volume = isinstance(work.request, VolumeRequest)
+    write = "write_volume" if volume else "write_reconstruction"
+    imports = Imports({("instrument.reconstruction.result_file", "Outputs")})
+    imports.names.add((f"instrument.reconstruction.{'volume_file' if volume else 'result_file'}", write))
+    lines = [f"request = {expression(work.request, imports)}", "job = request.prepare()"]
+    settled: list[str] = []
+    if work.kept_in is None:
+        lines.append("result = request.solve(job)")
+    else:
+        kept = "instrument.reconstruction.checkpointing"
+        imports.names |= {(kept, "checkpoint_for"), (kept, "settle_checkpoint")}
+        reasons = "result.stop_reasons" if volume else "[result.stop_reason]"
+        lines += [
+            f"keeper = checkpoint_for({expression(work.kept_in, imports)}, job, request)",
+            "result = request.solve(job, keeper=keeper)",
+        ]
+        settled.append(f"settle_checkpoint(keeper, {reasons})")
+    named = f"Outputs.named({expression(work.outputs.image, imports)}{', volume=True' if volume else ''})"
+    turned = f", rotate_deg={work.rotate_deg}" if work.rotate_deg and not volume else ""
+    lines.append(f"{write}({named}, result, job{turned})")
+    return "\n".join([*imports.lines(), "", *lines, *settled, ""])

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QTabWidget, QVBoxLayout, QWidget
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QSignalBlocker, Qt
+from PySide6.QtWidgets import QWidget
 
 from gui.jobs import Job
 from gui.panel import Panel
 from gui.session import BenchSession
-from gui.widgets.chart_view import ChartView
+from gui.theme import colours
+from gui.widgets.building import button, cell, choice, fill, in_row, label, offer, split, table, tabs
 from gui.widgets.dialogues import choose_path
+from gui.widgets.plots import curve_colour, curve_pen, dots, plot_widget
 from gui.widgets.stability_view import StabilityView
 from instrument.evaluation.chart import read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
-from recon.base.declare import expression
+from recon.base.declare import Imports, expression
+from recon.evaluation.scored import KINDS, Axis
 from recon.verdict.cases import SHIPPED
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
@@ -33,33 +42,22 @@ class ChartsPanel(Panel):
         self.chart_path: Path | None = None
         self.stability = StabilityView()
         self.chart = ChartView()
-        self.open_button = QPushButton("Open…")
-        self.open_button.setToolTip("A stability.json or chart.json, made by the commands of those names")
-        self.open_button.clicked.connect(self._choose)
-        self.shipped_button = QPushButton("Shipped maps")
-        self.shipped_button.setToolTip("The maps that come with the program, by which verdicts are made")
-        self.shipped_button.clicked.connect(lambda: self.open(SHIPPED))
-        self.heading = QLabel()
+        tip = "A stability.json or chart.json, made by the commands of those names"
+        self.open_button = button("Open…", tip, self._choose)
+        tip = "The maps that come with the program, by which verdicts are made"
+        self.shipped_button = button("Shipped maps", tip, lambda: self.open(SHIPPED))
+        self.heading = label()
         self.heading.setMinimumWidth(10)
         self._headings = {self.stability: ("", ""), self.chart: (_NO_CHART, "")}
-        self.tabs = QTabWidget()
-        self.tabs.setDocumentMode(True)
-        self.tabs.addTab(self.stability, "Where methods fail")
-        self.tabs.addTab(self.chart, "Speed against accuracy")
+        self.tabs = tabs({"Where methods fail": self.stability, "Speed against accuracy": self.chart})
         self.tabs.currentChanged.connect(lambda _: self._show_heading())
-        row = QHBoxLayout()
-        row.addWidget(self.heading, 1)
-        row.addWidget(self.open_button)
-        row.addWidget(self.shipped_button)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(row)
-        layout.addWidget(self.tabs, 1)
+        top = in_row((self.heading, 1), self.open_button, self.shipped_button)
+        fill(self.body, top, (self.tabs, 1))
         self.open(self.maps_path)
 
     def open(self, path: Path) -> Job:
         """Show the maps or the chart of a file, whichever it holds."""
-        job = self.tells(self.jobs.compute(f"Opening {path.name}", lambda _: _read(path)))
+        job = self.follow(self.jobs.compute(f"Opening {path.name}", lambda _: _read(path)))
         job.succeeded.connect(lambda record: self._opened(path, record))
         return job
 
@@ -102,31 +100,26 @@ class ChartsPanel(Panel):
     def as_python(self) -> str:
         """Return lines that draw the map that is shown, or read the chart."""
         if self.tabs.currentWidget() is self.chart and self.chart_path is not None:
+            imports = Imports({("instrument.evaluation.chart", "read_chart")})
+            key = repr(self.chart.key)
             lines = [
-                "from pathlib import Path",
-                "",
-                "from instrument.evaluation.chart import read_chart",
-                "",
-                f"points = read_chart({expression(self.chart_path)})['points']",
-                f"ranked = sorted((p for p in points if p[{self.chart.key!r}] is not None), "
-                f"key=lambda p: p[{self.chart.key!r}])",
-                "",
+                f"points = read_chart({expression(self.chart_path, imports)})['points']",
+                f"ranked = sorted((p for p in points if p[{key}] is not None), key=lambda p: p[{key}])",
             ]
-            return "\n".join(lines)
-        name = self.stability.map.currentData()
-        return "\n".join(
-            [
-                "from pathlib import Path",
-                "",
-                "from instrument.files.figures import save_figure",
-                "from instrument.evaluation.figures import map_figure",
-                "from instrument.files.stability_file import read_stability",
-                "",
-                f"maps = read_stability({expression(self.maps_path)})['maps']",
-                f"save_figure(map_figure(maps[{name!r}]), Path({f'{name}.png'!r}))",
-                "",
+        else:
+            imports = Imports(
+                {
+                    ("instrument.files.figures", "save_figure"),
+                    ("instrument.evaluation.figures", "map_figure"),
+                    ("instrument.files.stability_file", "read_stability"),
+                }
+            )
+            name = str(self.stability.map.currentData())
+            lines = [
+                f"maps = read_stability({expression(self.maps_path, imports)})['maps']",
+                f"save_figure(map_figure(maps[{name!r}]), {expression(Path(f'{name}.png'), imports)})",
             ]
-        )
+        return "\n".join([*imports.lines(), "", *lines, ""])
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -140,3 +133,200 @@ def _read(path: Path) -> dict[str, Any]:
             if "holds no stability maps" in no_maps.problem:
                 raise FileError(path, "holds neither stability maps nor a chart.", no_chart.remedy) from None
             raise no_maps from None
+
+
+ScoredPoint = Mapping[str, Any]
+_NEAR_PX = 12.0
+_SHORT = {"seconds": "seconds", "peak_mib": "MiB", "images": "photographs"}
+"""Costs as a column's heading."""
+
+
+class ChartView(QWidget):
+    """A plot of scored points and a table of settings; pointing at either names the other."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._points: Sequence[ScoredPoint] = ()
+        self._kind = KINDS["reconstruction"]
+        self.measure = choice((), "What is compared", lambda _: self._draw())
+        self.cost = choice((), "What it is compared against", lambda _: self._draw())
+        self.group = choice((), "Only these settings compete with each other", lambda _: self._draw())
+        self.plot: Any = plot_widget("")
+        self.plot.setLogMode(x=True)
+        self.plot.scene().sigMouseMoved.connect(self._moved)
+        tip = "Settings by their best score; one that is chosen is drawn bold"
+        self.table = table(["", "", ""], tip, wide=0, row_px=30)
+        self.table.verticalHeader().hide()
+        self.table.itemSelectionChanged.connect(self._setting_chosen)
+        words = "The bold line is the front: no setting is both cheaper and better."
+        self.place = label(words, "dim", selectable=True)
+        self.front: list[ScoredPoint] = []
+        chosen = in_row(label("Compare"), self.measure, label("against"), self.cost, self.group, None)
+        fill(self, chosen, (split(self.plot, self.table, sizes=[620, 330]), 1), self.place)
+
+    def show_points(self, points: Sequence[ScoredPoint], kind: str = "reconstruction") -> None:
+        """Show points of a chart of a kind (:data:`recon.evaluation.scored.KINDS`), as JSON has them."""
+        self._points, self._kind = points, KINDS[kind]
+
+        def known(axes: Sequence[Axis]) -> list[tuple[str, str]]:
+            return [(a.words, a.key) for a in axes if any(p.get(a.key) is not None for p in points)]
+
+        groups = [str(g) for g in dict.fromkeys(p.get("group") or "" for p in points)]
+        self.group.setVisible(len(groups) > 1)
+        offer(self.measure, known(self._kind.scores))
+        offer(self.cost, known(self._kind.costs))
+        offer(self.group, [(group, group) for group in groups])
+        self._draw()
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        self._draw_curves()
+
+    @property
+    def key(self) -> str:
+        """The name of the score that is shown."""
+        return str(self.measure.currentData())
+
+    @property
+    def cost_key(self) -> str:
+        """The name of the cost that it is drawn against."""
+        return str(self.cost.currentData())
+
+    # Inside --------------------------------------------------------------------------------------
+    def _known(self) -> list[ScoredPoint]:
+        """Return what can be drawn; costs stand on a logarithmic axis."""
+        group = self.group.currentData() or ""
+        return [
+            p
+            for p in self._points
+            if (p.get("group") or "") == group
+            and p.get(self.key) is not None
+            and (p.get(self.cost_key) or 0) > 0
+        ]
+
+    def _axes(self) -> tuple[Axis, Axis]:
+        """Return the cost and the score that are shown."""
+        cost = next(a for a in self._kind.costs if a.key == self.cost_key)
+        return cost, next(a for a in self._kind.scores if a.key == self.key)
+
+    def _draw(self) -> None:
+        if not (self.measure.count() and self.cost.count()):
+            self.front = []
+            self.table.setRowCount(0)
+            self.plot.clear()
+            return
+        cost, score = self._axes()
+        words, more = score.words, score.more_is_better
+        known = self._known()
+        self.front = front_of(known, self.key, more_is_better=more, cost=cost.key)
+        best: dict[str, ScoredPoint] = {}
+        for point in known:
+            held = best.get(point["setting"])
+            if held is None or _better(point[self.key], held[self.key], more):
+                best[point["setting"]] = point
+        ranked = sorted(best.values(), key=lambda p: p[self.key], reverse=more)
+        on_front = {p["setting"] for p in self.front}
+        with QSignalBlocker(self.table):
+            self.table.setHorizontalHeaderLabels(["setting", words.split(" (")[0], _SHORT[cost.key]])
+            self.table.setRowCount(len(ranked))
+            for number, point in enumerate(ranked):
+                name = point["setting"]
+                mark = "● " if name in on_front else ""
+                cells = (f"{mark}{name}", f"{point[self.key]:.4g}", f"{point[cost.key]:.3g}")
+                for place, text in enumerate(cells):
+                    self.table.setItem(number, place, cell(text, data=name))
+        self.plot.setLabel("left", words)
+        self.plot.setLabel("bottom", cost.words)
+        self._draw_curves()
+
+    def _setting_chosen(self) -> None:
+        """Draw the chosen setting bold, and describe its best point."""
+        self._draw_curves()
+        chosen = self.table.selectedItems()
+        if chosen:
+            name = chosen[0].data(Qt.ItemDataRole.UserRole)
+            mine = [p for p in self._known() if p["setting"] == name]
+            score = self._axes()[1]
+            best = (max if score.more_is_better else min)(mine, key=lambda p: p[score.key])
+            self.place.setText(describe(best, self._kind.name))
+
+    def _draw_curves(self) -> None:
+        self.plot.clear()
+        chosen = {item.data(Qt.ItemDataRole.UserRole) for item in self.table.selectedItems()}
+        known, at = self._known(), self.cost_key
+        for number, name in enumerate(dict.fromkeys(p["setting"] for p in known)):
+            mine = sorted((p for p in known if p["setting"] == name), key=lambda p: p[at])
+            x, y = np.array([(p[at], p[self.key]) for p in mine], float).T
+            bold = name in chosen
+            look = dots(curve_colour(number), 8 if bold else 4)
+            self.plot.plot(x, y, pen=curve_pen(number, 3.0 if bold else 1.0), **look)
+        if known:
+            self.plot.getAxis("bottom").setTicks([_ticks([p[at] for p in known])])
+        if self.front:
+            x, y = np.array(_steps([(p[at], p[self.key]) for p in self.front]), float).T
+            pen = pg.mkPen(colours().text, width=2.5)
+            self.plot.plot(x, y, pen=pen)
+            x, y = np.array([(p[at], p[self.key]) for p in self.front], float).T
+            self.plot.plot(x, y, pen=None, **(dots(None, 11) | {"symbolPen": pen}))
+
+    def _moved(self, place: Any) -> None:
+        nearest, distance = None, _NEAR_PX
+        box = self.plot.getPlotItem().vb
+        for point in self._known():
+            at = box.mapViewToScene(pg.Point(math.log10(point[self.cost_key]), point[self.key]))
+            away = math.hypot(at.x() - place.x(), at.y() - place.y())
+            if away < distance:
+                nearest, distance = point, away
+        if nearest is not None:
+            self.place.setText(describe(nearest, self._kind.name))
+
+
+def _steps(front: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the corners of a front: between two of its points the cheaper one is all there is."""
+    placed = list(front[:1])
+    for before, after in itertools.pairwise(front):
+        placed += [(after[0], before[1]), after]
+    return placed
+
+
+def _ticks(costs: Sequence[float]) -> list[tuple[float, str]]:
+    """Return places of 1, 2 and 5 times powers of ten on a logarithmic axis, with their words."""
+    first, last = math.floor(math.log10(min(costs))), math.ceil(math.log10(max(costs)))
+    values = [step * 10.0**power for power in range(first, last + 1) for step in (1, 2, 5)]
+    return [(math.log10(value), f"{value:g}") for value in values]
+
+
+def describe(point: ScoredPoint, kind: str = "reconstruction") -> str:
+    """Return a point in words."""
+    count = point["iterations"]
+    said = [
+        str(point["setting"]),
+        f"{point['seconds']:.3g} s",
+        f"{count} iterations" if count else "one shot",
+    ]
+    if point.get("images") is not None:
+        said.append(f"{point['images']:.0f} photographs")
+    for axis in KINDS[kind].scores:
+        if point.get(axis.key) is not None:
+            said.append(f"{axis.words} {point[axis.key]:.4g}")
+    if point.get("peak_mib") is not None:
+        said.append(f"memory {point['peak_mib']:.0f} MiB")
+    return ", ".join(said)
+
+
+def front_of(
+    points: Sequence[ScoredPoint], key: str, *, more_is_better: bool, cost: str = "seconds"
+) -> list[ScoredPoint]:
+    """Return the points that no other is both cheaper and better than, the cheapest first."""
+    sign = 1.0 if more_is_better else -1.0
+    front: list[ScoredPoint] = []
+    best = -math.inf
+    for point in sorted(points, key=lambda p: (p[cost], -sign * p[key])):
+        if sign * point[key] > best:
+            front.append(point)
+            best = sign * point[key]
+    return front
+
+
+def _better(value: float, than: float, more_is_better: bool) -> bool:
+    return value > than if more_is_better else value < than

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QHBoxLayout, QProgressBar, QPushButton, QSplitter, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
-from gui.background_reading import NewestOnly
+from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField
-from gui.forms.options_form import OptionsForm, scrolled
+from gui.forms.options_form import OptionsForm
 from gui.hologram_work import (
     Computed,
     HologramOrder,
@@ -22,11 +23,11 @@ from gui.hologram_work import (
     photograph,
     show_on_slm,
 )
-from gui.jobs import BusyError, Job
+from gui.jobs import Job
 from gui.panel import Panel
 from gui.session import BenchSession
-from gui.widgets.hologram_views import HologramViews
-from gui.widgets.weights_view import WEIGHTS_SHAPE, WeightsMode
+from gui.widgets.building import button, fill, in_row, scrolled, share_bar, split
+from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
@@ -86,45 +87,51 @@ class HologramsPanel(Panel):
         self.form = self._make_form()
         self.views = HologramViews()
         self.target = self.views.target
-        self.clear = QPushButton("Clear what was painted")
-        self.clear.setToolTip("Take off all that was painted (left button paints, right button rubs out)")
-        self.preview_button = QPushButton("Preview")
-        self.preview_button.setToolTip(f"{_PREVIEW_ITERATIONS} iterations, nothing is written")
-        self.compute_button = QPushButton("Compute")
-        self.compute_button.setObjectName("primary")
-        self.compute_button.setToolTip("Compute and write the pattern (Ctrl+Return)")
-        self.compute_button.setShortcut("Ctrl+Return")
-        self.stop_button = QPushButton("Stop and keep")
-        self.stop_button.setToolTip("End after the iteration in progress; what there is then is kept")
-        self.show_button = QPushButton("Show on SLM")
-        self.show_button.setToolTip("Put the pattern on the SLM, its look-up table and flatness applied")
-        self.capture_button = QPushButton("Show and photograph")
-        self.capture_button.setToolTip(
-            "Show it, register the camera by the mask's speckle, photograph, compare with the target"
+        tip = "Take off all that was painted (left button paints, right button rubs out)"
+        self.clear = button("Clear what was painted", tip, self.target.clear_strokes)
+        tip = f"{_PREVIEW_ITERATIONS} iterations, nothing is written"
+        self.preview_button = button("Preview", tip, lambda: self.compute(preview=True))
+        self.compute_button = button(
+            "Compute",
+            "Compute and write the pattern (Ctrl+Return)",
+            lambda: self.compute(),
+            shortcut="Ctrl+Return",
+            primary=True,
         )
-        self.progress = QProgressBar()
-        self.progress.setRange(0, 1000)
-        self.progress.setTextVisible(False)
-        self._arrange()
-        self._connect()
+        tip = "End after the iteration in progress; what there is then is kept"
+        self.stop_button = button("Stop and keep", tip, self.stop)
+        tip = "Put the pattern on the SLM, its look-up table and flatness applied"
+        self.show_button = button("Show on SLM", tip, self.show_on_slm)
+        tip = "Show it, register the camera by the mask's speckle, photograph, compare with the target"
+        self.capture_button = button("Show and photograph", tip, self.photograph)
+        self.progress = share_bar()
+        left = fill(
+            QWidget(),
+            (scrolled(self.form), 1),
+            self.clear,
+            self.views.plane,
+            self.progress,
+            in_row(self.preview_button, self.compute_button, self.stop_button),
+            in_row(self.show_button, self.capture_button),
+        )
+        fill(self.body, split(left, self.views, sizes=[330, 850], stretch=1))
+        self.form.refused.connect(self.refused)
+        self.form.settled.connect(self._settled)
         self._show_mode()
         self._set_running(False)
 
     def _make_form(self) -> OptionsForm:
         own, order = ({o.name: o for o in options_of(cls)} for cls in (_PanelOptions, HologramOrder))
-        how = [o for o in options_of(HologramOptions) if o.name not in _BY_MOUSE]
+        how = {o.name: o for o in options_of(HologramOptions) if o.name not in _BY_MOUSE}
         bench = f"{self.session.config.display.expansion}: the bench's"
-        how = [
-            replace(o, declaration=replace(o.declaration, default_words=bench))
-            if o.name == "expansion"
-            else o
-            for o in how
-        ]
+        expansion = how["expansion"]
+        said = replace(expansion.declaration, default_words=bench)
+        how["expansion"] = replace(expansion, declaration=said)
         return OptionsForm(
             [
                 *(order[name] for name in ("picture", "z_mm", "further")),
                 *(own[name] for name in ("counts", "brush")),
-                *how,
+                *how.values(),
                 order["alignment"],
                 own["correction"],
                 order["out"],
@@ -140,41 +147,6 @@ class HologramsPanel(Panel):
                 "out": Behaviour(browse="save", filters="Patterns (*.png)"),
             },
         )
-
-    def _arrange(self) -> None:
-        left = QWidget()
-        column = QVBoxLayout(left)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(scrolled(self.form), 1)
-        column.addWidget(self.clear)
-        column.addWidget(self.views.plane)
-        column.addWidget(self.progress)
-        for buttons in (
-            (self.preview_button, self.compute_button, self.stop_button),
-            (self.show_button, self.capture_button),
-        ):
-            row = QHBoxLayout()
-            for button in buttons:
-                row.addWidget(button)
-            column.addLayout(row)
-        whole = QSplitter(Qt.Orientation.Horizontal)
-        whole.addWidget(left)
-        whole.addWidget(self.views)
-        whole.setStretchFactor(1, 1)
-        whole.setSizes([330, 850])
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(whole)
-
-    def _connect(self) -> None:
-        self.form.refused.connect(self.refused)
-        self.form.settled.connect(self._settled)
-        self.clear.clicked.connect(self.target.clear_strokes)
-        self.preview_button.clicked.connect(lambda: self.compute(preview=True))
-        self.compute_button.clicked.connect(lambda: self.compute())
-        self.stop_button.clicked.connect(self.stop)
-        self.show_button.clicked.connect(self.show_on_slm)
-        self.capture_button.clicked.connect(self.photograph)
 
     # What is asked for ---------------------------------------------------------------------------
     def order(self, *, preview: bool = False) -> HologramOrder:
@@ -257,14 +229,10 @@ class HologramsPanel(Panel):
             order.out.parent.mkdir(parents=True, exist_ok=True)
         config, size = self.session.config, (slm.shape, slm.pixel_pitch_um)
         title = "Previewing a hologram" if preview else f"Computing {order.out.name}"
-        job = self.tells(
-            self.jobs.compute(title, lambda context: compute(order, config, size, context, write=not preview))
-        )
-        self.job = job
-        self._set_running(True)
+        work = partial(compute, order, config, size, write=not preview)
+        job = self._started(self.follow(self.jobs.compute(title, work)))
         job.progressed.connect(self._progressed)
         job.succeeded.connect(self._computed)
-        job.ended.connect(lambda: self._set_running(False))
         return job
 
     def stop(self) -> None:
@@ -279,7 +247,7 @@ class HologramsPanel(Panel):
             return None
         correction, bench = self.form.value("correction"), self.session.bench
         return self._device_job(
-            lambda: self.session.device_job(
+            lambda: self.jobs.device(
                 f"Showing {computed.order.out.stem}",
                 lambda context: show_on_slm(bench, computed, correction, context),
                 {"slm"},
@@ -306,13 +274,13 @@ class HologramsPanel(Panel):
             job.succeeded.connect(self._photographed)
         return job
 
-    def _device_job(self, start: Any) -> Job | None:
-        try:
-            job: Job = start()
-        except BusyError as error:
-            self.refused(None, str(error))
-            return None
-        self.job = self.tells(job)
+    def _device_job(self, start: Callable[[], Job]) -> Job | None:
+        job = self.begin(start)
+        return None if job is None else self._started(job)
+
+    def _started(self, job: Job) -> Job:
+        """Show that a job runs which the stop button ends."""
+        self.job = job
         self._set_running(True)
         job.ended.connect(lambda: self._set_running(False))
         return job
@@ -332,8 +300,8 @@ class HologramsPanel(Panel):
         self._set_running(False)
 
     def _photographed(self, outcome: Any) -> None:
-        found, path = outcome
-        self.views.show_photographed(found, str(path))
+        photographed, path = outcome
+        self.views.show_photographed(photographed, str(path))
         self.session.log("info", f"Wrote {path}")
 
     def _picture_changed(self) -> None:
@@ -354,17 +322,17 @@ class HologramsPanel(Panel):
             except (BenchError, InputError) as error:
                 return str(error)
 
-        self._reader.ask(read, lambda found: self._target_read(wanted, found))
+        self._reader.ask(read, lambda target: self._target_read(wanted, target))
 
-    def _target_read(self, wanted: object, found: npt.NDArray[Any] | str) -> None:
+    def _target_read(self, wanted: object, target: npt.NDArray[Any] | str) -> None:
         if wanted != self._target_asked:
             return  # another picture is on its way
-        if isinstance(found, str):
+        if isinstance(target, str):
             self._target_asked = None
-            self.form.refuse("picture", found)
-            self.refused(None, found)
+            self.form.refuse("picture", target)
+            self.refused(None, target)
         else:
-            self.target.show_target(found)
+            self.target.show_target(target)
 
     @property
     def _suggestions(self) -> Path:
@@ -391,10 +359,10 @@ class HologramsPanel(Panel):
         self.target.set_mode(mode)
 
     def _set_running(self, running: bool) -> None:
-        for button in (self.preview_button, self.compute_button):
-            button.setEnabled(not running)
-        for button in (self.show_button, self.capture_button):
-            button.setEnabled(not running and self.computed is not None)
+        for start in (self.preview_button, self.compute_button):
+            start.setEnabled(not running)
+        for use in (self.show_button, self.capture_button):
+            use.setEnabled(not running and self.computed is not None)
         self.stop_button.setEnabled(running)
         if not running:
             self.progress.setValue(0)
@@ -404,7 +372,7 @@ class HologramsPanel(Panel):
         self.form.set_values({"alignment": path})
 
     def theme_changed(self) -> None:
-        """Take over the theme's colours and colour map."""
+        """Take over the theme's colours."""
         self.views.restyle()
 
     def shutdown(self) -> None:

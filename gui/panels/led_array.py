@@ -6,30 +6,21 @@ from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import Qt, QTimer
-from PySide6.QtWidgets import (
-    QComboBox,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
-    QPushButton,
-    QSlider,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QGridLayout, QPushButton, QSlider, QWidget
 
 from drivers.led_array import LedPattern, Rgb
-from gui.jobs import BusyError
-from gui.panel import Panel
+from gui.forms.fields import Behaviour, NumberField
+from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.theme import colours
+from gui.widgets.building import after_rest, button, choice, fill, in_row, label
 from gui.widgets.dialogues import elided
-from gui.widgets.number_edit import NumberEdit
-from gui.widgets.plot import plot_widget, restyle
+from gui.widgets.entry import NumberEdit
+from gui.widgets.plots import plot_widget
 from instrument.plan.patterns import shape_buttons
-from recon.base.declare import with_overrides
+from recon.base.declare import Imports, expression, options_of, with_overrides
 
-_LOOK_MS = 300
 _REST_MS = 150
 """Rest of the brightness before it is sent: a slider that is pulled must not fill a queue."""
 _COLOURS: dict[str, Rgb] = {"white": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
@@ -37,10 +28,12 @@ _DIMMEST = 70
 """Grey level of the faintest lit LED as drawn, so that it is seen to be lit."""
 
 
-class LedPanel(Panel):
+class LedPanel(DevicePanel):
     """Draws the array with its LEDs as they are lit, and lights them."""
 
     title = "LED array"
+    kind = "led_array"
+    look_ms = 300
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
@@ -58,98 +51,66 @@ class LedPanel(Panel):
         self._dimmed: tuple[LedPattern, LedPattern] | None = None
         """The pattern that was dimmed last, and the one whose hues it has: faint levels keep no hue."""
         self._positions: Any = None
-        self.now = QLabel("–")
-        self.now.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.colour = QComboBox()
-        self.colour.addItems(list(_COLOURS))
-        self.colour.setToolTip("Colour of the LEDs that are lit next")
+        self.now = label("–", selectable=True)
+        self.colour = choice(_COLOURS, "Colour of the LEDs that are lit next")
         self.brightness = QSlider(Qt.Orientation.Horizontal)
         self.brightness.setRange(1, 255)
         self.brightness.setValue(255)
         self.brightness.setToolTip("Brightness of the LEDs that are lit, and of those lit next: 1 to 255")
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
-        self._rest.setInterval(_REST_MS)
-        self._rest.timeout.connect(self.dim)
+        self._rest = after_rest(self, _REST_MS, self.dim)
         session.stop_pressed.connect(self._rest.stop)  # what was pulled before STOP lights nothing after it
         self.brightness.valueChanged.connect(lambda _: self._rest.start())
-        self.level = QLabel("255")
+        self.level = label("255")
         self.level.setMinimumWidth(28)
         self.brightness.valueChanged.connect(lambda value: self.level.setText(str(value)))
-        self.na = NumberEdit("", 0.25, minimum=0.001, maximum=1.0, tip="Numerical aperture of the patterns")
-        self.na.setFixedWidth(80)
+        self._shapes = shape_buttons()
+        declared = next(o for shape in self._shapes.values() for o in options_of(shape) if o.name == "na")
+        na = NumberField(declared, Behaviour())
+        na.show(na.default)
+        self.na = na.widget
         self.index = NumberEdit("", 0, minimum=0, integer=True, tip="Number of the LED to toggle")
-        self.index.setFixedWidth(80)
         self.index.returnPressed.connect(self._toggle_typed)
-        self.toggle_button = QPushButton("Toggle LED")
-        self.toggle_button.setToolTip("Light or darken the LED of this number")
-        self.toggle_button.clicked.connect(self._toggle_typed)
         for field in (self.na, self.index):
+            field.setFixedWidth(80)
             field.refused.connect(lambda why: self.refused(None, why))
+        tip = "Light or darken the LED of this number"
+        self.toggle_button = button("Toggle LED", tip, self._toggle_typed)
         self.pattern_buttons: dict[str, QPushButton] = {}
         grid = QGridLayout()
         grid.setSpacing(4)
-        self._shapes = shape_buttons()
         tips = {
             "Off": "Every LED dark",
             "Source": "The LEDs of the point source ([source] in bench.toml)",
             **{words: shape.help for words, shape in self._shapes.items()},
         }
         for number, (words, tip) in enumerate(tips.items()):
-            button = QPushButton(words)
-            button.setToolTip(tip)
-            button.clicked.connect(lambda _=False, words=words: self.show_pattern(words))
-            self.pattern_buttons[words] = button
-            grid.addWidget(button, number // 4, number % 4)
-        top = QHBoxLayout()
-        top.addWidget(self.colour)
-        top.addWidget(self.brightness, 1)
-        top.addWidget(self.level)
-        top.addWidget(QLabel("NA"))
-        top.addWidget(self.na)
-        one = QHBoxLayout()
-        one.addWidget(QLabel("LED"))
-        one.addWidget(self.index)
-        one.addWidget(self.toggle_button)
-        one.addStretch(1)
-        self._controls = QWidget()
-        controls = QVBoxLayout(self._controls)
-        controls.setContentsMargins(0, 0, 0, 0)
-        controls.addLayout(top)
-        controls.addLayout(grid)
-        controls.addLayout(one)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.now)
-        layout.addWidget(self.plot, 1)
-        layout.addWidget(self._controls)
-        session.device_changed.connect(self._device_changed)
-        self._timer = QTimer(self)
-        self._timer.timeout.connect(self.look)
-        self._timer.start(_LOOK_MS)
-        self._device_changed("led_array")
+            made = button(words, tip, lambda _=False, words=words: self.show_pattern(words))
+            self.pattern_buttons[words] = made
+            grid.addWidget(made, number // 4, number % 4)
+        self._controls = fill(
+            QWidget(),
+            in_row(self.colour, (self.brightness, 1), self.level, label(na.label), self.na),
+            grid,
+            in_row(label("LED"), self.index, self.toggle_button, None),
+        )
+        fill(self.body, self.now, (self.plot, 1), self._controls)
+        self.watch_device(self.now)
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
         """Return lines that light the LEDs that are lit now."""
-        path = self.session.config.path
-        pattern = self._drawn or LedPattern("off")
-        return (
-            "from drivers.led_array import LedPattern\n"
-            "from instrument.bench.bench import open_bench\n\n"
-            f"with open_bench({str(path) if path else None!r}) as bench:\n"
-            f"    bench.led_array.set_pattern({pattern!r})\n"
-            '    input("Enter ends, and turns the light off. ")\n'
-        )
+        imports = Imports()
+        lit = expression(self._drawn or LedPattern("off"), imports, indent="    ")
+        lines = [f"bench.led_array.set_pattern({lit})", 'input("Enter ends, and turns the light off. ")']
+        return on_bench(self.session.config.path, lines, imports)
 
     def shutdown(self) -> None:
         """End the timers."""
-        self._timer.stop()
+        super().shutdown()
         self._rest.stop()
 
     def theme_changed(self) -> None:
         """Take over the theme's colours."""
-        restyle(self.plot)
         self._drawn = None
 
     @property
@@ -162,7 +123,7 @@ class LedPanel(Panel):
     def look(self) -> None:
         """Draw the pattern that the array confirmed last, whoever asked for it."""
         leds = self.session.bench.led_array
-        if not self.isVisible() or leds is None or not self.session.is_open("led_array"):
+        if leds is None or not self.is_ready:
             return
         pattern = leds.pattern
         if pattern is self._drawn or pattern == self._drawn:
@@ -194,16 +155,11 @@ class LedPanel(Panel):
         elided(self.now, f"{pattern.description}  ({n} of {len(places)} LEDs lit)")
         self.index.set_limits(0, len(places) - 1)
 
-    def _device_changed(self, kind: str) -> None:
-        if kind != "led_array":
-            return
-        is_open = self.session.is_open("led_array")
+    def show_device(self, is_open: bool) -> None:
+        """Let LEDs be lit, or not."""
         self._controls.setEnabled(is_open)
         if not is_open:
             self._drawn = None
-            state = self.session.state("led_array")
-            has_one = "led_array" in self.session.kinds
-            elided(self.now, state.text or state.condition if has_one else "This bench has no LED array.")
 
     # Lighting ------------------------------------------------------------------------------------
     def show_pattern(self, name: str) -> None:
@@ -264,12 +220,9 @@ class LedPanel(Panel):
         self._start(f"LED {led}", work)
 
     def _start(self, title: str, work: Any) -> None:
-        try:
-            job = self.tells(self.session.device_job(title, work, {"led_array"}))
-        except BusyError as error:
-            self.refused(None, str(error))
-            return
-        job.succeeded.connect(self._shown)
+        job = self.begin(lambda: self.jobs.device(title, work, {"led_array"}))
+        if job is not None:
+            job.succeeded.connect(self._shown)
 
     def _shown(self, _result: object) -> None:
         self.accepted()

@@ -21,13 +21,13 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from gui.background import LiveFollower
 from gui.jobs import Job, JobContext
-from gui.live_follower import LiveFollower
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.widgets.dialogues import choose_path, elided
+from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
-from gui.widgets.number_edit import NumberEdit
 from instrument.bench.photograph import LightState, light_of
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
 from instrument.files.errors import duration

@@ -7,19 +7,12 @@ from datetime import datetime
 from typing import NamedTuple
 
 from PySide6.QtGui import QColor, QTextCharFormat, QTextCursor
-from PySide6.QtWidgets import (
-    QComboBox,
-    QHBoxLayout,
-    QLineEdit,
-    QPlainTextEdit,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QLineEdit, QPlainTextEdit, QWidget
 
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.theme import colours
+from gui.widgets.building import button, choice, fill, in_row, text_view
 
 LEVELS = ("debug", "info", "warning", "error")
 MOST_LINES = 2000
@@ -40,31 +33,19 @@ class LogPanel(Panel):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self._lines: deque[_Line] = deque(maxlen=MOST_LINES)
-        self.level = QComboBox()
-        self.level.addItems(["everything", "info and above", "warnings and errors", "errors"])
-        self.level.setCurrentIndex(1)
-        self.level.setToolTip("Which lines are shown")
-        self.level.currentIndexChanged.connect(self._show_all)
+        words = ["everything", "info and above", "warnings and errors", "errors"]
+        self.level = choice(words, "Which lines are shown", self._show_all)
         self.words = QLineEdit()
         self.words.setPlaceholderText("only lines with …")
         self.words.setClearButtonEnabled(True)
         self.words.setToolTip("Show only lines that contain this text")
         self.words.textChanged.connect(self._show_all)
-        self.clear_button = QPushButton("Clear")
-        self.clear_button.setToolTip("Empty the log")
-        self.clear_button.clicked.connect(self._clear)
-        self.view = QPlainTextEdit()
-        self.view.setReadOnly(True)
+        self.clear_button = button("Clear", "Empty the log", self._clear)
+        self.view = text_view()
         self.view.setMaximumBlockCount(MOST_LINES)
         self.view.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
-        bar = QHBoxLayout()
-        bar.addWidget(self.level)
-        bar.addWidget(self.words, 1)
-        bar.addWidget(self.clear_button)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(bar)
-        layout.addWidget(self.view, 1)
+        self.level.setCurrentIndex(1)
+        fill(self.body, in_row(self.level, (self.words, 1), self.clear_button), (self.view, 1))
         session.logged.connect(self.add)
 
     def add(self, level: str, text: str) -> None:
@@ -90,7 +71,7 @@ class LogPanel(Panel):
         level = LEVELS.index(line.level) if line.level in LEVELS else 1
         return level >= self.level.currentIndex() and self.words.text().lower() in line.text.lower()
 
-    def _show_all(self) -> None:
+    def _show_all(self, *_: object) -> None:
         self.view.clear()
         for line in self._lines:
             if self._is_shown(line):

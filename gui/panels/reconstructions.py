@@ -9,27 +9,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import (
-    QHBoxLayout,
-    QLabel,
-    QListWidget,
-    QListWidgetItem,
-    QMessageBox,
-    QPushButton,
-    QSplitter,
-    QStackedWidget,
-    QTabWidget,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QWidget
 
-from gui.background_reading import NewestOnly
-from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm
+from gui.background import NewestOnly
+from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
-from gui.reconstruction_work import SoFar, Written, reconstruct_job
 from gui.session import BenchSession
 from gui.theme import as_shown
+from gui.widgets.building import button, fill, in_row, label, split, tabs
 from gui.widgets.dialogues import Question, choose_path
 from gui.widgets.result_views import ConvergenceView, FactsView, PictureView
 from gui.widgets.volume_view import VolumeView
@@ -46,7 +34,7 @@ from instrument.reconstruction.stored_result import (
     free_result,
     open_result,
 )
-from recon.base.declare import expression
+from recon.base.declare import Imports, expression
 from recon.reconstruction.choice import Choice
 
 Views = dict[Path, npt.NDArray[np.uint8]]
@@ -71,16 +59,11 @@ class ReconstructionsPanel(Panel):
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open_item)
         self.list.itemClicked.connect(self._open_item)
-        self.open_button = QPushButton("Open…")
-        self.open_button.setToolTip("Open any picture or volume: TIFF, OME-Zarr, .npy, or a record")
-        self.open_button.clicked.connect(self._choose)
-        self.refresh_button = QPushButton("Refresh")
-        self.refresh_button.setToolTip("Look into the data folder again")
-        self.refresh_button.clicked.connect(self.refresh)
-        self.export_button = QPushButton("Export…")
-        self.export_button.setToolTip("Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)")
-        self.export_button.clicked.connect(self._choose_export)
-        self.export_button.setEnabled(False)
+        tip = "Open any picture or volume: TIFF, OME-Zarr, .npy, or a record"
+        self.open_button = button("Open…", tip, self._choose)
+        self.refresh_button = button("Refresh", "Look into the data folder again", self.refresh)
+        tip = "Write all values (.tif, .npy, .ome.zarr), or what is shown (.png)"
+        self.export_button = button("Export…", tip, self._choose_export, enabled=False)
         self.form = ReconstructForm()
         self.form.asked.connect(self.reconstruct)
         self.form.questioned.connect(self.explain)
@@ -91,19 +74,16 @@ class ReconstructionsPanel(Panel):
         self.volume.failed.connect(lambda why: self.refused(None, why))
         self.facts = FactsView()
         self.convergence = ConvergenceView()
-        self.heading = QLabel()
-        self.heading.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.place = QLabel()
-        self.place.setProperty("role", "dim")
+        self.heading = label(selectable=True)
+        self.place = label(role="dim")
         self.place.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.place.setMinimumWidth(10)
         for hovered in (self.picture.hovered, self.volume.hovered):
             hovered.connect(self.place.setText)
-        self._empty = QLabel("Open a result on the left, or reconstruct one.")
-        self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self._empty.setProperty("role", "dim")
+        empty = label("Open a result on the left, or reconstruct one.", "dim")
+        empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self.viewers = QStackedWidget()
-        for widget in (self._empty, self.picture, self.volume):
+        for widget in (empty, self.picture, self.volume):
             self.viewers.addWidget(widget)
         self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
@@ -113,53 +93,21 @@ class ReconstructionsPanel(Panel):
         self.refresh()
 
     def _arrange(self) -> None:
-        results = QWidget()
-        box = QVBoxLayout(results)
-        box.setContentsMargins(0, 6, 0, 0)
-        box.addWidget(self.list, 1)
-        row = QHBoxLayout()
-        for button in (self.open_button, self.refresh_button, self.export_button):
-            row.addWidget(button)
-        box.addLayout(row)
-        self.tabs = QTabWidget()
-        self.tabs.setDocumentMode(True)
-        self.tabs.addTab(results, "Results")
-        self.tabs.addTab(self.form, "Reconstruct")
-        below = QSplitter(Qt.Orientation.Horizontal)
-        below.addWidget(self.facts)
-        below.addWidget(self.convergence)
-        right = QSplitter(Qt.Orientation.Vertical)
-        top = QWidget()
-        column = QVBoxLayout(top)
-        column.setContentsMargins(0, 0, 0, 0)
-        line = QHBoxLayout()
-        line.addWidget(self.heading)
-        line.addWidget(self.place, 1)
-        column.addLayout(line)
-        column.addWidget(self.viewers, 1)
-        right.addWidget(top)
-        right.addWidget(below)
+        buttons = in_row(self.open_button, self.refresh_button, self.export_button)
+        results = fill(QWidget(), (self.list, 1), buttons, margins=(0, 6, 0, 0))
+        self.tabs = tabs({"Results": results, "Reconstruct": self.form})
+        below = split(self.facts, self.convergence, sizes=[330, 330])
+        top = fill(QWidget(), in_row(self.heading, (self.place, 1)), (self.viewers, 1))
+        right = split(top, below, sizes=[520, 170], down=True, stretch=1)
         right.setStretchFactor(0, 3)
-        right.setStretchFactor(1, 1)
-        right.setSizes([520, 170])
-        below.setSizes([330, 330])
-        whole = QSplitter(Qt.Orientation.Horizontal)
-        whole.addWidget(self.tabs)
-        whole.addWidget(right)
-        whole.setStretchFactor(1, 1)
-        whole.setSizes([330, 840])
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(whole)
+        fill(self.body, split(self.tabs, right, sizes=[330, 840], stretch=1))
 
     # Results -------------------------------------------------------------------------------------
     def refresh(self) -> None:
         """List the results in the data folder."""
         folder = self.session.runs_folder
-        job = self.tells(
-            self.jobs.watch("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
-        )
-        job.succeeded.connect(self._list)
+        look = self.jobs.watch("Looking for results", lambda _: [(p, _age(p)) for p in find_results(folder)])
+        self.follow(look).succeeded.connect(self._list)
 
     def _list(self, records: list[tuple[Path, str]]) -> None:
         self.list.clear()
@@ -178,7 +126,7 @@ class ReconstructionsPanel(Panel):
 
     def open(self, path: Path) -> Job:
         """Open a result, in a job; it is shown when it is there, or the last line says why not."""
-        job = self.tells(self.jobs.compute(f"Opening {path.name}", lambda _: open_result(path)))
+        job = self.follow(self.jobs.compute(f"Opening {path.name}", lambda _: open_result(path)))
         self._opening = job
         job.succeeded.connect(lambda result: self._opened(job, result))
         return job
@@ -231,16 +179,13 @@ class ReconstructionsPanel(Panel):
             self.export_to(target, views=views)
             return
         names = ", ".join(path.name for path in present)
-        box = Question(QMessageBox.Icon.Question, "Replace?", f"{names}: exists already. Replace it?", self)
-        replace = box.addButton("Replace", QMessageBox.ButtonRole.DestructiveRole)
-        box.setDefaultButton(box.addButton("Keep", QMessageBox.ButtonRole.RejectRole))
 
-        def answered() -> None:
-            if box.clickedButton() is replace and self._still_shown(result):
+        def answered(agreed: bool) -> None:
+            if agreed and self._still_shown(result):
                 self.export_to(target, overwrite=True, views=views)
 
-        box.finished.connect(answered)
-        box.ask()
+        text = f"{names}: exists already. Replace it?"
+        Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
 
     def _still_shown(self, result: StoredResult) -> bool:
         """Whether a result is still open; says so where another was opened while the operator was asked."""
@@ -267,41 +212,32 @@ class ReconstructionsPanel(Panel):
         if result is None:
             return None
         views = self._views_for(target) if views is None else views
-        if views is not None:
-            if not views:
-                self.refused(
-                    None, "The volume's views are still being read. Export them when they are shown."
-                )
-                return None
+        if views is not None and not views:
+            self.refused(None, "The volume's views are still being read. Export them when they are shown.")
+            return None
+        turned = self.picture.turned_deg
 
-            def draw(_context: JobContext) -> list[Path]:
-                for path, pixels in views.items():
-                    if path.exists() and not overwrite:
-                        raise BenchError(f"{path}: exists already and was left as it is.")
-                    write_image(path, pixels)
-                return list(views)
-
-            job = self.jobs.compute(f"Exporting {target.name}", draw)
-        else:
-            turned = self.picture.turned_deg
-
-            def write(context: JobContext) -> list[Path]:
-                def advance(done: int, total: int) -> None:
-                    context.report(done / total)
-
+        def write(context: JobContext) -> list[Path]:
+            if views is None:
+                advance = partial(_report_share, context)
                 export_result(result, target, rotate_deg=turned, overwrite=overwrite, advance=advance)
                 return [target]
+            for path, pixels in views.items():
+                if path.exists() and not overwrite:
+                    raise BenchError(f"{path}: exists already and was left as it is.")
+                write_image(path, pixels)
+            return list(views)
 
-            job = self.jobs.compute(f"Exporting {target.name}", write)
+        job = self.follow(self.jobs.compute(f"Exporting {target.name}", write))
         planes_um = None if views is not None or target.suffix.lower() == ".npy" else result.planes_um
         steps = "" if planes_um is None else uneven_steps(planes_um[0])
 
-        def told(files: list[Path]) -> None:
+        def written(files: list[Path]) -> None:
             self.session.log("info", f"Wrote {', '.join(map(str, files))}")
             if steps:
                 self.session.log("warning", f"{target.name}: {steps}")
 
-        self.tells(job).succeeded.connect(told)
+        job.succeeded.connect(written)
         return job
 
     def _shown(self) -> dict[str, npt.NDArray[np.uint8]]:
@@ -345,22 +281,14 @@ class ReconstructionsPanel(Panel):
         if outputs.image == self._suggested:
             outputs.image.parent.mkdir(parents=True, exist_ok=True)
         volume = isinstance(request, VolumeRequest)
-        job = self.tells(
-            self.jobs.compute(
-                f"Reconstructing {request.image.name}",
-                lambda context: reconstruct_job(work, context),
-            )
-        )
-        self.job = job
-        self.form.set_running(True)
-        self.form.show_progress(0.0, "Reading …")
+        title = f"Reconstructing {request.image.name}"
+        self.job = job = self.jobs.compute(title, lambda context: reconstruct_job(work, context))
+        self._begun(job, "Reading …")
         self._close_result()
         self._opening, self._first_picture = None, True
         self.heading.setText(f"<b>{request.image.name}</b>: in the making")
         job.progressed.connect(lambda so_far: self._progressed(so_far, volume=volume))
         job.succeeded.connect(self._reconstructed)
-        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
-        job.ended.connect(lambda: self.form.set_running(False))
         return job
 
     def explain(self) -> Job | None:
@@ -379,16 +307,21 @@ class ReconstructionsPanel(Panel):
             context.check()
             return choice
 
-        job = self.tells(self.jobs.compute(f"Explaining {request.image.name}", work))
+        job = self.jobs.compute(f"Explaining {request.image.name}", work)
         self._explaining = job
-        self.form.set_running(True)
-        self.form.show_progress(0.0, "Looking at PSFs and photograph …")
+        self._begun(job, "Looking at PSFs and photograph …")
         job.succeeded.connect(self._explained)
-        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
         job.cancelled.connect(lambda _: self.form.show_progress(0.0, "Stopped."))
         job.ended.connect(lambda: setattr(self, "_explaining", None))
-        job.ended.connect(lambda: self.form.set_running(False))
         return job
+
+    def _begun(self, job: Job, words: str) -> None:
+        """Show in the form that a job of it runs, and how it ends."""
+        self.follow(job)
+        self.form.set_running(True)
+        self.form.show_progress(0.0, words)
+        job.failed.connect(lambda why: self.form.show_progress(0.0, why.splitlines()[0]))
+        job.ended.connect(lambda: self.form.set_running(False))
 
     def _explained(self, choice: Choice) -> None:
         facts: list[tuple[str, str]] = []
@@ -429,7 +362,7 @@ class ReconstructionsPanel(Panel):
     def _reconstructed(self, written: Written) -> None:
         path = written.path
         self.form.show_progress(1.0, f"Wrote {path.name}")
-        for name, text in written.told.items():
+        for name, text in written.checkpoint.items():
             self.session.log("info", f"{name} {text}")
         self.session.log("info", f"Reconstructed: {path}")
         self._suggest_out()
@@ -469,18 +402,12 @@ class ReconstructionsPanel(Panel):
             except BenchError as error:
                 return f"# The form is not complete: {' '.join(str(error).split())}\n"
         path = self.result.path if self.result is not None else Path("RESULT.tif")
-        lines = [
-            "from pathlib import Path",
-            "",
-            "from instrument.reconstruction.stored_result import open_result",
-            "",
-            f"result = open_result({expression(path)})",
-            "print(result.facts(), result.warnings)",
-        ]
-        return "\n".join([*lines, ""])
+        imports = Imports({("instrument.reconstruction.stored_result", "open_result")})
+        opened = f"result = open_result({expression(path, imports)})"
+        return "\n".join([*imports.lines(), "", opened, "print(result.facts(), result.warnings)", ""])
 
     def theme_changed(self) -> None:
-        """Take over the theme's colours and colour map."""
+        """Take over the theme's colours."""
         for view in (self.picture, self.volume, self.convergence, self.facts):
             view.restyle()
 
@@ -490,6 +417,10 @@ class ReconstructionsPanel(Panel):
             self.job.cancel()
         self._depths.forget()
         self._close_result()
+
+
+def _report_share(context: JobContext, done: int, total: int) -> None:
+    context.report(done / total)
 
 
 def _age(record: Path) -> str:

@@ -10,36 +10,34 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QFileSystemWatcher, Qt, QTimer, QUrl
-from PySide6.QtGui import QColor, QDesktopServices
-from PySide6.QtWidgets import (
-    QHBoxLayout,
-    QHeaderView,
-    QLabel,
-    QPlainTextEdit,
-    QPushButton,
-    QSizePolicy,
-    QSlider,
-    QSplitter,
-    QTableWidget,
-    QTableWidgetItem,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
+from PySide6.QtGui import QDesktopServices
+from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.procedure import Outcome
 from calibration_routines.psf.sweep_plan import SWEEP
-from gui.background_reading import NewestOnly
+from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun, script
+from gui.procedure_run import Ended, ProcedureRun, RunBar, script
 from gui.session import BenchSession
-from gui.theme import colours
+from gui.widgets.building import (
+    after_rest,
+    button,
+    cell,
+    fill,
+    in_column,
+    in_row,
+    label,
+    split,
+    table,
+    text_view,
+)
 from gui.widgets.image_view import ImageView
-from gui.widgets.run_bar import RunBar
 from instrument.runs.inspection import RunSummary, run_paths, summary
 from instrument.runs.run import Run, RunCondition
+from recon.base.declare import Imports, expression
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
 _LEVELS = (0.1, 99.9)
@@ -48,7 +46,7 @@ _REST_MS = 500
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _Opened:
     """A run that was read."""
 
     run: Run
@@ -73,17 +71,6 @@ class RunsPanel(Panel):
     """A list of runs, the newest first; a click opens one."""
 
     title = "Runs"
-    table: QTableWidget
-    where: QLabel
-    view: ImageView
-    slider: QSlider
-    frame_words: QLabel
-    about: QPlainTextEdit
-    bar: RunBar
-    folder_button: QPushButton
-    use_button: QPushButton
-    _left: QWidget
-    _right: QSplitter
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
@@ -92,28 +79,23 @@ class RunsPanel(Panel):
         self.opened: Run | None = None
         self._opening: Path | None = None
         self._stored: list[int] = []
+        self._can_resume = False
         self._reader = NewestOnly(session.jobs, "Reading a run")
         self._listing: Job | None = None
         self._again = False
         self._wanted: Path | None = None
         self._make_list()
         self._make_details()
-        split = QSplitter()
-        split.addWidget(self._left)
-        split.addWidget(self._right)
-        split.setSizes([560, 640])
-        split.setChildrenCollapsible(False)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(split)
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
-        self._rest.setInterval(_REST_MS)
-        self._rest.timeout.connect(self.read_folder)
+        left = fill(QWidget(), self.where, (self.table, 1), margins=(0, 0, 6, 0))
+        foot = in_row((self.bar, 1), in_column(self.use_button, self.folder_button, None))
+        top = fill(QWidget(), (self.view, 1), self.slider, self.frame_words, margins=(6, 0, 0, 0))
+        below = fill(QWidget(), (self.about, 1), foot, margins=(6, 0, 0, 0))
+        right = split(top, below, sizes=[480, 260], down=True)
+        fill(self.body, split(left, right, sizes=[560, 640], firm=True))
+        self._rest = after_rest(self, _REST_MS, self.read_folder)
         self._watcher = QFileSystemWatcher(self)
         self._watcher.directoryChanged.connect(lambda _: self._rest.start())
-        session.run_finished.connect(self._run_finished)
-        self.run.looked.connect(self.bar.show_situation)
+        session.run_finished.connect(lambda _: self._rest.start())
         self.run.said.connect(lambda line: self.session.log("info", line))
         self.run.succeeded.connect(self._succeeded)
         self.run.ended_early.connect(self._ended_early)
@@ -132,11 +114,11 @@ class RunsPanel(Panel):
             self._watcher.addPath(str(folder))
 
         def work(context: JobContext) -> list[RunSummary]:
-            found = []
+            summaries = []
             for path in reversed(run_paths(folder)):
                 context.check()
-                found.append(summary(path))
-            return found
+                summaries.append(summary(path))
+            return summaries
 
         self._listing = self.jobs.watch("Reading the list of runs", work)
         self._listing.succeeded.connect(self._show_list)
@@ -148,42 +130,43 @@ class RunsPanel(Panel):
         self._opening = path
         self._reader.ask(lambda: _look_into(path), self._show_run)
 
-    def _show_run(self, found: _Found | str) -> None:
+    def _show_run(self, opened: _Opened | str) -> None:
         self._opening = None
-        if isinstance(found, str):
-            self._close_run(found)
+        if isinstance(opened, str):
+            self._close_run(opened)
             return
-        run = self.opened = found.run
-        blocked = self.slider.blockSignals(True)
-        self.slider.setEnabled(len(found.stored) > 1)
-        self.slider.setRange(0, max(0, len(found.stored) - 1))
-        middle = len(found.stored) // 2  # the first ones are dark
-        self.slider.setValue(middle)
-        self.slider.blockSignals(blocked)
-        self._stored = found.stored
-        self.about.setPlainText("\n".join(found.about))
-        self._can_resume = found.can_resume and run.condition is not RunCondition.RUNNING
+        run = self.opened = opened.run
+        middle = len(opened.stored) // 2  # the first ones are dark
+        with QSignalBlocker(self.slider):
+            self.slider.setEnabled(len(opened.stored) > 1)
+            self.slider.setRange(0, max(0, len(opened.stored) - 1))
+            self.slider.setValue(middle)
+        self._stored = opened.stored
+        self.about.setPlainText("\n".join(opened.about))
+        self._can_resume = opened.can_resume and run.condition is not RunCondition.RUNNING
         self.bar.set_startable("" if self._can_resume else "There is nothing to go on with.")
         self.folder_button.setEnabled(True)
-        self.use_button.setEnabled(found.is_usable)
+        self.use_button.setEnabled(opened.is_usable)
         self._show_frame(middle)
 
     def as_python(self) -> str:
         """Return lines that read the run, or go on with it where it did not end."""
-        if self.opened is None:
-            return (
-                "from pathlib import Path\n\nfrom instrument.runs.inspection import run_paths, summary\n\n"
-                f"for path in run_paths(Path({str(self.session.runs_folder)!r})):\n    print(summary(path))\n"
-            )
-        if self._can_resume:
-            return script(ResumeProcedure(self.opened.path), self.session.config.path)
-        return (
-            "from instrument.runs.run import Run\n\n"
-            f"run = Run.open({str(self.opened.path)!r})\n"
-            "print(run)\n"
-            "for index in sorted(run.records):\n"
-            "    frame, metadata = run.frame(index), run.metadata(index)\n"
-        )
+        opened, imports = self.opened, Imports()
+        if opened is not None and self._can_resume:
+            return script(ResumeProcedure(opened.path), self.session.config.path)
+        if opened is not None:
+            imports.names.add(("instrument.runs.run", "Run"))
+            lines = [
+                f"run = Run.open({expression(opened.path, imports)})",
+                "print(run)",
+                "for index in sorted(run.records):",
+                "    frame, metadata = run.frame(index), run.metadata(index)",
+            ]
+        else:
+            imports.names |= {("instrument.runs.inspection", name) for name in ("run_paths", "summary")}
+            folder = expression(self.session.runs_folder, imports)
+            lines = [f"for path in run_paths({folder}):", "    print(summary(path))"]
+        return "\n".join([*imports.lines(), "", *lines, ""])
 
     def resume(self) -> None:
         """Go on with the run that is shown."""
@@ -210,108 +193,52 @@ class RunsPanel(Panel):
 
     # Making --------------------------------------------------------------------------------------
     def _make_list(self) -> None:
-        self.table = QTableWidget(0, len(_COLUMNS))
-        self.table.setHorizontalHeaderLabels(_COLUMNS)
-        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
-        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
+        self.table = table(_COLUMNS, "Click a run to open it", wide=0, row_px=26)
         self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
-        self.table.setTabKeyNavigation(False)
-        # What tells runs of a day apart stands at the end of their names.
+        # What distinguishes runs of a day stands at the end of their names.
         self.table.setTextElideMode(Qt.TextElideMode.ElideMiddle)
-        self.table.setToolTip("Click a run to open it")
         self.table.verticalHeader().hide()
-        self.table.verticalHeader().setDefaultSectionSize(26)
-        header = self.table.horizontalHeader()
-        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
         self.table.currentCellChanged.connect(lambda row, *_: self._row_chosen(row))
-        self.where = QLabel()
-        self.where.setObjectName("dim")
-        self.where.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.where.setWordWrap(True)
-        self._left = QWidget()
-        column = QVBoxLayout(self._left)
-        column.setContentsMargins(0, 0, 6, 0)
-        column.addWidget(self.where)
-        column.addWidget(self.table, 1)
+        self.where = label(role="dim", selectable=True, wraps=True)
 
     def _make_details(self) -> None:
-        self._can_resume = False
         self.view = ImageView()
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Frame of the run (arrow keys)")
         self.slider.setAccessibleName("Frame of the run")
         self.slider.valueChanged.connect(self._show_frame)
-        self.frame_words = QLabel()
-        self.frame_words.setObjectName("dim")
-        self.frame_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self.about = QPlainTextEdit()
-        self.about.setReadOnly(True)
-        self.about.setPlainText("Click a run to open it.")
-        self.bar = RunBar("Resume")
+        self.frame_words = label(role="dim", yields=True)
+        self.about = text_view("Click a run to open it.")
+        self.bar = RunBar(self.run, "Resume")
         self.bar.set_startable("No run is open.")
         self.bar.start.connect(self.resume)
-        self.bar.pause.connect(self.run.pause)
-        self.bar.resume.connect(self.run.resume)
-        self.bar.abort.connect(self.run.abort)
-        self.folder_button = QPushButton("Open folder")
-        self.folder_button.setToolTip("Show the run's files in the file manager")
-        self.folder_button.setEnabled(False)
-        self.folder_button.clicked.connect(self._open_folder)
-        self.use_button = QPushButton("Reconstruct with it…")
-        self.use_button.setToolTip("Reconstruct photographs with this run's calibration")
-        self.use_button.setEnabled(False)
-        self.use_button.clicked.connect(self._use)
-        foot = QHBoxLayout()
-        foot.addWidget(self.bar, 1)
-        aside = QVBoxLayout()
-        aside.addWidget(self.use_button)
-        aside.addWidget(self.folder_button)
-        aside.addStretch(1)
-        foot.addLayout(aside)
-        self._right = QSplitter(Qt.Orientation.Vertical)
-        top = QWidget()
-        column = QVBoxLayout(top)
-        column.setContentsMargins(6, 0, 0, 0)
-        column.addWidget(self.view, 1)
-        column.addWidget(self.slider)
-        column.addWidget(self.frame_words)
-        below = QWidget()
-        column = QVBoxLayout(below)
-        column.setContentsMargins(6, 0, 0, 0)
-        column.addWidget(self.about, 1)
-        column.addLayout(foot)
-        self._right.addWidget(top)
-        self._right.addWidget(below)
-        self._right.setSizes([480, 260])
+        tip = "Show the run's files in the file manager"
+        self.folder_button = button("Open folder", tip, self._open_folder, enabled=False)
+        tip = "Reconstruct photographs with this run's calibration"
+        self.use_button = button("Reconstruct with it…", tip, self._use, enabled=False)
 
     # Inside --------------------------------------------------------------------------------------
     def _show_list(self, summaries: list[RunSummary]) -> None:
-        wanted = self._wanted or self._opening or (self.opened.path if self.opened is not None else None)
+        wanted = self._wanted or self._opening or (self.opened and self.opened.path)
         self.summaries = summaries
         self.where.setText(f"{self.session.runs_folder}: {len(summaries)} runs")
-        blocked = self.table.blockSignals(True)
-        self.table.setRowCount(len(summaries))
-        chosen = -1
-        for row, found in enumerate(summaries):
-            became = found.condition.value if found.condition is not None else "UNREADABLE"
-            texts = (
-                found.path.name,
-                became,
-                f"{found.stored} of {found.frames}",
-                "recording" if found.is_recording else "plan",
-                "SIMULATED" if found.is_simulated else "",
-            )
-            for column, text in enumerate(texts):
-                item = QTableWidgetItem(text)
-                if found.condition is not RunCondition.COMPLETED and column == 1:
-                    item.setForeground(QColor(colours().warning))
-                item.setToolTip(found.problem or (str(found.path) if column == 0 else text))
-                self.table.setItem(row, column, item)
-            if found.path == wanted:
-                chosen = row
-        self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
-        self.table.blockSignals(blocked)
+        paths = [listed.path for listed in summaries]
+        chosen = paths.index(wanted) if wanted in paths else -1
+        with QSignalBlocker(self.table):
+            self.table.setRowCount(len(summaries))
+            for number, listed in enumerate(summaries):
+                texts = (
+                    listed.path.name,
+                    listed.condition.value if listed.condition is not None else "UNREADABLE",
+                    f"{listed.stored} of {listed.frames}",
+                    "recording" if listed.is_recording else "plan",
+                    "SIMULATED" if listed.is_simulated else "",
+                )
+                for place, text in enumerate(texts):
+                    tip = listed.problem or (str(listed.path) if place == 0 else text)
+                    warns = place == 1 and listed.condition is not RunCondition.COMPLETED
+                    self.table.setItem(number, place, cell(text, tip, warns=warns))
+            self.table.setCurrentCell(chosen, 0) if chosen >= 0 else self.table.clearSelection()
         if chosen >= 0 and self._wanted is not None:
             self._wanted = None
             self.open_run(summaries[chosen].path)
@@ -322,16 +249,13 @@ class RunsPanel(Panel):
             self._again = False
             self.read_folder()
 
-    def _run_finished(self, _path: Path) -> None:
-        self._rest.start()
-
     def _row_chosen(self, row: int) -> None:
         if 0 <= row < len(self.summaries) and not self.run.is_running:
-            found = self.summaries[row]
-            if found.condition is None:
-                self._close_run(f"{found.path}: {found.problem}")
+            listed = self.summaries[row]
+            if listed.condition is None:
+                self._close_run(f"{listed.path}: {listed.problem}")
             else:
-                self.open_run(found.path)
+                self.open_run(listed.path)
 
     def _close_run(self, why: str) -> None:
         self._reader.forget()
@@ -354,12 +278,12 @@ class RunsPanel(Panel):
         index = self._stored[min(number, len(self._stored) - 1)]
         self._reader.ask(lambda: _read_frame(run, index), self._frame_read)
 
-    def _frame_read(self, found: _Picture | str) -> None:
-        if isinstance(found, str):
-            self.frame_words.setText(found)
+    def _frame_read(self, frame: _Picture | str) -> None:
+        if isinstance(frame, str):
+            self.frame_words.setText(frame)
         else:
-            self.view.show_image(found.image, found.low, found.high, found.full_scale)
-            self.frame_words.setText(found.words)
+            self.view.show_image(frame.image, frame.low, frame.high, frame.full_scale)
+            self.frame_words.setText(frame.words)
 
     def _use(self) -> None:
         if self.opened is not None:
@@ -385,14 +309,14 @@ class RunsPanel(Panel):
         self.read_folder()
 
 
-def _look_into(path: Path) -> _Found | str:
+def _look_into(path: Path) -> _Opened | str:
     """Read a run; the reason where it cannot be read."""
     try:
         run = Run.open(path)
         whole = run.condition is RunCondition.COMPLETED and not run.missing()
         can_resume = run.plan is not None and (not whole or lacks_result(run.path))
-        return _Found(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
-    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is told
+        return _Opened(run, sorted(run.records), _about(run), can_resume, (path / SWEEP.result).is_dir())
+    except Exception as error:  # noqa: BLE001 - whatever a damaged folder raises is shown
         return str(error)
 
 
@@ -400,7 +324,7 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
     """Read a frame; the reason where it cannot be read."""
     try:
         image, metadata = run.frame(index), run.metadata(index)
-    except Exception as error:  # noqa: BLE001 - a damaged file is told, whatever it raises
+    except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
     low, high = np.percentile(image[::4, ::4], _LEVELS)
     words = [
@@ -450,8 +374,8 @@ def _calibration_lines(run: Path) -> list[str]:
     try:
         quality: dict[str, Any] = json.loads(file.read_text("utf-8"))["quality"]
         psfs = quality["psfs"]
-        found = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
+        findings = [f"z = {q['z_um'] / 1e3:.4g} mm: {text}" for q in psfs for text in q["findings"]]
         verdict = "good" if quality["good"] else "with findings"
     except (OSError, ValueError, KeyError, TypeError) as error:
         return [f"Calibration {file.parent} cannot be read: {error!r}"]
-    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *found]
+    return [f"Calibration {file.parent}: {len(psfs)} PSFs, {verdict}", *findings]

@@ -2,65 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QHBoxLayout,
-    QLabel,
-    QLineEdit,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QLineEdit, QPushButton, QWidget
 
-from gui.jobs import BusyError
-from gui.panel import Panel
+from gui.jobs import Job
+from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
+from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.image_view import ImageView
-from gui.widgets.plot import curve_pen, plot_widget, restyle
-from instrument.files.errors import BenchError
+from gui.widgets.plots import curve_pen, plot_widget
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, read_slm_image, show_levels
+from recon.base.declare import Imports, expression
 
-_LOOK_MS = 500
 _IMAGES = "Phase pictures (*.png *.tif *.tiff *.bmp *.npy)"
 
 
-class SlmPanel(Panel):
+class SlmPanel(DevicePanel):
     """Shows what the SLM shows; loads 8-bit phase pictures through the look-up table."""
 
     title = "SLM"
+    kind = "slm"
+    look_ms = 500
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.view = ImageView("grey")
         self.view.setToolTip("Grey levels on the SLM now, 0 to 255")
-        self.now = QLabel("–")
-        self.file = QLineEdit()
-        self.file.setPlaceholderText("phase picture, 8 bit, 256 levels a turn")
-        self.file.setToolTip("A picture of the SLM's own size; Enter shows it")
-        self.file.returnPressed.connect(self.load)
-        self.browse_button = QPushButton("…")
-        self.browse_button.setToolTip("Choose a picture")
-        self.browse_button.clicked.connect(self._browse)
-        self.load_button = QPushButton("Show")
-        self.load_button.setToolTip("Put the picture on the SLM, through the look-up table")
-        self.load_button.clicked.connect(self.load)
-        self.blank_button = QPushButton("Blank")
-        self.blank_button.setToolTip("All pixels to grey level 0")
-        self.blank_button.clicked.connect(self.blank)
-        self.table_file = QLineEdit()
-        self.table_file.setPlaceholderText("look-up table: calibration.json from calibrate slm")
-        self.table_file.setToolTip("What calibrate slm wrote; Enter reads it")
-        self.table_file.returnPressed.connect(self.load_table)
-        self.table_button = QPushButton("…")
-        self.table_button.setToolTip("Choose an SLM calibration")
-        self.table_button.clicked.connect(self._browse_table)
+        self.now = label("–")
+        self.file, self.browse_button = self._path_field(
+            "phase picture, 8 bit, 256 levels a turn", "A picture of the SLM's own size", self.load, _IMAGES
+        )
+        tip = "Put the picture on the SLM, through the look-up table"
+        self.load_button = button("Show", tip, self.load)
+        self.blank_button = button("Blank", "All pixels to grey level 0", self.blank)
+        self.table_file, self.table_button = self._path_field(
+            "look-up table: calibration.json from calibrate slm",
+            "What calibrate slm wrote",
+            self.load_table,
+            "Calibration (*.json)",
+        )
         self.use_table = QCheckBox("apply look-up table and flatness")
         self.use_table.setToolTip("What is shown next goes through the SLM's calibration")
         self.use_table.setEnabled(False)
@@ -70,58 +56,57 @@ class SlmPanel(Panel):
         self.table_plot.hide()
         self._shown: npt.NDArray[np.uint8] | None = None
         self._what = ""
-        first = QHBoxLayout()
-        first.addWidget(self.file, 1)
-        first.addWidget(self.browse_button)
-        first.addWidget(self.load_button)
-        first.addWidget(self.blank_button)
-        second = QHBoxLayout()
-        second.addWidget(self.table_file, 1)
-        second.addWidget(self.table_button)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.now)
-        layout.addWidget(self.view, 1)
-        layout.addLayout(first)
-        layout.addLayout(second)
-        layout.addWidget(self.use_table)
-        layout.addWidget(self.table_plot)
-        session.device_changed.connect(self._device_changed)
-        self._timer = QTimer(self)
-        self._timer.timeout.connect(self.look)
-        self._timer.start(_LOOK_MS)
-        self._device_changed("slm")
+        self._reading: Job | None = None
+        """The newest job that reads a look-up table."""
+        fill(
+            self.body,
+            self.now,
+            (self.view, 1),
+            in_row((self.file, 1), self.browse_button, self.load_button, self.blank_button),
+            in_row((self.table_file, 1), self.table_button),
+            self.use_table,
+            self.table_plot,
+        )
+        self.watch_device(self.now)
+
+    def _path_field(
+        self, empty: str, tip: str, load: Callable[[], object], filters: str
+    ) -> tuple[QLineEdit, QPushButton]:
+        """Return a field for a path, and the button that lets one be chosen; both load it."""
+        field = QLineEdit()
+        field.setPlaceholderText(empty)
+        field.setToolTip(f"{tip}; Enter loads it")
+        field.returnPressed.connect(load)
+
+        def chosen(path: Path) -> None:
+            field.setText(str(path))
+            load()
+
+        return field, button(
+            "…", "Choose a file", lambda: choose_path(field, "open", tip, field.text(), chosen, filters)
+        )
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
         """Return lines that show the picture in the field."""
-        path = self.session.config.path
-        table = self.table_file.text() if self.use_table.isChecked() else ""
-        return (
-            "from pathlib import Path\n\n"
-            "from instrument.bench.bench import open_bench\n"
-            "from instrument.files.slm_image import load_slm_correction, show_levels\n"
-            "from instrument.files.slm_image import read_slm_image\n\n"
-            f"correction = {f'load_slm_correction(Path({table!r}))' if table else None}\n"
-            f"with open_bench({str(path) if path else None!r}) as bench:\n"
-            f"    levels, _ = read_slm_image({self.file.text() or 'phase.png'!r})\n"
-            "    show_levels(bench.slm, levels, correction)\n"
-            '    input("Enter ends. ")\n'
+        module = "instrument.files.slm_image"
+        imports = Imports(
+            {(module, "load_slm_correction"), (module, "read_slm_image"), (module, "show_levels")}
         )
-
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
-
-    def theme_changed(self) -> None:
-        """Take over the theme's colours."""
-        restyle(self.table_plot)
+        table = Path(self.table_file.text()) if self.use_table.isChecked() else None
+        loaded = "None" if table is None else f"load_slm_correction({expression(table, imports)})"
+        lines = [
+            f"levels, _ = read_slm_image({self.file.text() or 'phase.png'!r})",
+            "show_levels(bench.slm, levels, correction)",
+            'input("Enter ends. ")',
+        ]
+        return on_bench(self.session.config.path, lines, imports, [f"correction = {loaded}"])
 
     # What is on it -------------------------------------------------------------------------------
     def look(self) -> None:
         """Show what is on the SLM, whoever put it there."""
         slm = self.session.bench.slm
-        if not self.isVisible() or slm is None or not self.session.is_open("slm"):
+        if slm is None or not self.is_ready:
             return
         levels = slm.displayed
         if self._shown is not None and np.array_equal(levels, self._shown):
@@ -132,18 +117,13 @@ class SlmPanel(Panel):
         what = "blank" if not levels.any() else self._what or "a picture"
         elided(self.now, f"{what}   {width} × {height}, levels {levels.min()} to {levels.max()}")
 
-    def _device_changed(self, kind: str) -> None:
-        if kind != "slm":
-            return
-        is_open = self.session.is_open("slm")
+    def show_device(self, is_open: bool) -> None:
+        """Let it be used, or not."""
         for widget in (self.load_button, self.blank_button):
             widget.setEnabled(is_open)
         self._shown = None
         if not is_open:
             self.view.clear()
-            state = self.session.state("slm")
-            has_one = "slm" in self.session.kinds
-            elided(self.now, state.text or state.condition if has_one else "This bench has no SLM.")
 
     # What the operator does ----------------------------------------------------------------------
     def load(self) -> None:
@@ -151,6 +131,9 @@ class SlmPanel(Panel):
         slm, path = self.session.bench.slm, Path(self.file.text().strip()).expanduser()
         correction = self.correction if self.use_table.isChecked() else None
         if slm is None:
+            return
+        if self._reading is not None and not self._reading.is_over:
+            self.refused(self.table_file, "The look-up table is still being read.")
             return
 
         def work(_: object) -> str:
@@ -174,47 +157,30 @@ class SlmPanel(Panel):
 
     def load_table(self) -> None:
         """Read the look-up table in the field, show it, and use it from now on."""
-        try:
-            self.correction = load_slm_correction(Path(self.table_file.text().strip()).expanduser())
-        except BenchError as error:
-            self.correction = None
-            self.use_table.setChecked(False)
-            self.use_table.setEnabled(False)
-            self.table_plot.hide()
-            self.refused(self.table_file, str(error))
-            return
-        self.accepted(self.table_file)
-        self.use_table.setEnabled(True)
-        self.use_table.setChecked(True)
-        self.table_plot.clear()
-        self.table_plot.plot(np.arange(256), self.correction.phase_of_level_rad, pen=curve_pen(0))
-        self.table_plot.show()
+        path = Path(self.table_file.text().strip()).expanduser()
+        self._use_table(None)
+        job = self.jobs.watch("Reading the look-up table", lambda _: load_slm_correction(path))
+        self._reading = self.follow(job, self.table_file)
+        job.succeeded.connect(
+            lambda correction: self._use_table(correction) if job is self._reading else None
+        )
 
-    def _start(self, title: str, work: object, field: QWidget | None) -> None:
-        try:
-            job = self.session.device_job(title, work, {"slm"})  # type: ignore[arg-type]
-        except BusyError as error:
-            self.refused(field, str(error))
-            return
-        job.failed.connect(lambda why: self.refused(field, why))
-        job.succeeded.connect(lambda what: self._done(cast(str, what), field))
+    def _use_table(self, correction: SlmCorrection | None) -> None:
+        self.correction = correction
+        self.use_table.setEnabled(correction is not None)
+        self.use_table.setChecked(correction is not None)
+        self.table_plot.setVisible(correction is not None)
+        if correction is not None:
+            self.accepted(self.table_file)
+            self.table_plot.clear()
+            self.table_plot.plot(np.arange(256), correction.phase_of_level_rad, pen=curve_pen(0))
+
+    def _start(self, title: str, work: Callable[[Any], str], field: QWidget | None) -> None:
+        job = self.begin(lambda: self.session.jobs.device(title, work, {"slm"}), field)
+        if job is not None:
+            job.succeeded.connect(lambda what: self._done(what, field))
 
     def _done(self, what: str, field: QWidget | None) -> None:
         self._what, self._shown = what, None
         self.accepted(field)
         self.look()
-
-    def _browse(self) -> None:
-        def chosen(path: Path) -> None:
-            self.file.setText(str(path))
-            self.load()
-
-        choose_path(self.file, "open", "Phase picture", self.file.text(), chosen, _IMAGES)
-
-    def _browse_table(self) -> None:
-        def chosen(path: Path) -> None:
-            self.table_file.setText(str(path))
-            self.load_table()
-
-        filters = "Calibration (*.json)"
-        choose_path(self.table_file, "open", "SLM calibration", self.table_file.text(), chosen, filters)

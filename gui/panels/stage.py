@@ -6,28 +6,19 @@ from dataclasses import dataclass
 from functools import partial
 from typing import cast
 
-from PySide6.QtCore import Qt, QTimer
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QFocusEvent, QKeyEvent
-from PySide6.QtWidgets import (
-    QFrame,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
-    QMessageBox,
-    QProgressBar,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
 from drivers.stage import StageAxis
-from gui.jobs import BusyError, Job
-from gui.panel import Panel
+from gui.jobs import Job
+from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
+from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
-from gui.widgets.number_edit import NumberEdit
+from gui.widgets.entry import NumberEdit
+from recon.base.declare import Imports
 
-_READ_MS = 200
 _FINE, _COARSE = 0.1, 10.0
 """Factors of the step with Ctrl and with Shift."""
 _STEPS = {"um": 100.0, "mrad": 1.0}
@@ -70,12 +61,10 @@ class JogPad(QFrame):
         self.setToolTip(
             "With this in focus: arrow keys move x and y, PgUp and PgDn z;\nShift: ten steps, Ctrl: a tenth"
         )
-        self.words = QLabel("Click here, then  ← → ↑ ↓  PgUp PgDn\nShift × 10    Ctrl × 0.1")
+        self.words = label("Click here, then  ← → ↑ ↓  PgUp PgDn\nShift × 10    Ctrl × 0.1", "dim")
         self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self.words.setObjectName("dim")
-        layout = QVBoxLayout(self)
-        layout.addWidget(self.words)
-        self._mark(active=False)
+        QVBoxLayout(self).addWidget(self.words)
+        mark(self, "active", False)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
         """Jog."""
@@ -94,23 +83,20 @@ class JogPad(QFrame):
     def focusInEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
         """Show that keys go here."""
         super().focusInEvent(event)
-        self._mark(active=True)
+        mark(self, "active", True)
 
     def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
         """Show that they do not any more."""
         super().focusOutEvent(event)
-        self._mark(active=False)
-
-    def _mark(self, *, active: bool) -> None:
-        self.setProperty("active", active)
-        self.style().unpolish(self)
-        self.style().polish(self)
+        mark(self, "active", False)
 
 
-class StagePanel(Panel):
+class StagePanel(DevicePanel):
     """Position, targets and limits of every axis; jogging; home, which asks first."""
 
     title = "Stage"
+    kind = "stage"
+    look_ms = 200
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
@@ -118,81 +104,42 @@ class StagePanel(Panel):
         self.steps: dict[str, NumberEdit] = {}
         self.question: Question | None = None
         self._reading: Job | None = None
-        self.state = QLabel()
-        self.state.setWordWrap(True)
+        self.state = label(wraps=True)
         self.pad = JogPad(self)
         self.setFocusProxy(self.pad)
-        self.home_button = QPushButton("Home …")
-        self.home_button.setToolTip("Find the reference of every axis: the stage moves; asks first")
-        self.home_button.clicked.connect(self.ask_home)
+        tip = "Find the reference of every axis: the stage moves; asks first"
+        self.home_button = button("Home …", tip, self.ask_home)
         self._grid = QGridLayout()
         self._grid.setHorizontalSpacing(6)
         self._grid.setColumnStretch(2, 1)
-        self._step_row = QHBoxLayout()
-        bottom = QHBoxLayout()
-        bottom.addWidget(self.pad, 1)
-        bottom.addWidget(self.home_button)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.state)
-        layout.addLayout(self._grid)
-        layout.addLayout(self._step_row)
-        layout.addLayout(bottom)
-        layout.addStretch(1)
-        session.device_changed.connect(self._device_changed)
-        self._timer = QTimer(self)
-        self._timer.timeout.connect(self.read)
-        self._timer.start(_READ_MS)
-        self._device_changed("stage")
+        self._step_row = in_row()
+        fill(self.body, self.state, self._grid, self._step_row, in_row((self.pad, 1), self.home_button), None)
+        self.watch_device(self.state)
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
         """Return lines that bring the stage to where it is now."""
-        path = self.session.config.path
         here = {name: row.target.value for name, row in self.rows.items()}
-        return (
-            "from instrument.bench.bench import open_bench\n\n"
-            f"with open_bench({str(path) if path else None!r}) as bench:\n"
-            "    if not bench.stage.is_homed:\n"
-            "        bench.stage.home()\n"
-            f"    bench.stage.move_to({here!r})\n"
-        )
-
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
+        lines = ["if not bench.stage.is_homed:", "    bench.stage.home()", f"bench.stage.move_to({here!r})"]
+        return on_bench(self.session.config.path, lines, Imports())
 
     # Rows ----------------------------------------------------------------------------------------
-    def _device_changed(self, kind: str) -> None:
-        if kind != "stage":
-            return
-        is_open = self.session.is_open("stage")
-        for widget in (self.pad, self.home_button):
+    def show_device(self, is_open: bool) -> None:
+        """Let the stage be moved, or not; its axes have rows from when it is first open."""
+        edited = [widget for row in self.rows.values() for widget in (row.target, *row.buttons)]
+        for widget in (self.pad, self.home_button, *edited):
             widget.setEnabled(is_open)
-        for row in self.rows.values():
-            row.target.setEnabled(is_open)
-            for button in row.buttons:
-                button.setEnabled(is_open)
         if is_open and not self.rows and self.session.bench.stage is not None:
             self._make_rows(self.session.bench.stage.axes)
-        if not is_open:
-            state = self.session.state("stage")
-            has_one = "stage" in self.session.kinds
-            self.state.setText(state.text or state.condition if has_one else "This bench has no stage.")
 
     def _make_rows(self, axes: tuple[StageAxis, ...]) -> None:
         for number, axis in enumerate(axes):
             letter, unit = axis.name.rsplit("_", 1)[0], _words(axis.unit)
-            name = QLabel(letter)
-            name.setProperty("role", "value")
-            position = QLabel("–")
-            position.setProperty("role", "value")
+            position = label("–", "value")
             position.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
             position.setMinimumWidth(110)
             position.setToolTip(f"Where the stage says that {letter} is")
-            gauge = QProgressBar()
-            gauge.setRange(0, _GAUGE)
-            gauge.setTextVisible(False)
+            gauge = share_bar(_GAUGE)
             gauge.setFixedHeight(6)
             limits = f"{axis.lower_limit:g} to {axis.upper_limit:g} {unit}"
             gauge.setToolTip(f"Place between the soft limits: {limits}")
@@ -205,22 +152,18 @@ class StagePanel(Panel):
             target.setFixedWidth(120)
             target.submitted.connect(partial(self._move_to, axis.name))
             target.refused.connect(lambda why: self.refused(None, why))
-            minus, plus = (_jog_button(text) for text in ("−", "+"))
-            minus.clicked.connect(partial(self._jog_clicked, letter, -1))
-            plus.clicked.connect(partial(self._jog_clicked, letter, 1))
-            limit = QLabel(f"{axis.lower_limit:g} … {axis.upper_limit:g}")
-            limit.setProperty("role", "dim")
+            minus, plus = (
+                button(text, "Jog by one step", partial(self._jog_clicked, letter, sign))
+                for text, sign in (("−", -1), ("+", 1))
+            )
+            minus.setFixedWidth(34)
+            plus.setFixedWidth(34)
+            limit = label(f"{axis.lower_limit:g} … {axis.upper_limit:g}", "dim")
             limit.setToolTip(f"Soft limits, {unit}")
-            travel = QVBoxLayout()
-            travel.setSpacing(1)
-            travel.addWidget(gauge)
-            travel.addWidget(limit)
-            self._grid.addWidget(name, number, 0)
-            self._grid.addWidget(position, number, 1)
-            self._grid.addLayout(travel, number, 2)
-            self._grid.addWidget(minus, number, 3)
-            self._grid.addWidget(target, number, 4)
-            self._grid.addWidget(plus, number, 5)
+            self._grid.addWidget(label(letter, "value"), number, 0)
+            self._grid.addLayout(in_column(gauge, limit, spacing=1), number, 2)
+            for place, widget in {1: position, 3: minus, 4: target, 5: plus}.items():
+                self._grid.addWidget(widget, number, place)
             self.rows[axis.name] = _Row(axis, position, gauge, target, (minus, plus))
         for unit in dict.fromkeys(axis.unit for axis in axes):
             step = NumberEdit(
@@ -229,25 +172,23 @@ class StagePanel(Panel):
             step.setFixedWidth(110)
             step.refused.connect(lambda why: self.refused(None, why))
             self.steps[unit] = step
-            self._step_row.addWidget(QLabel("Step"))
+            self._step_row.addWidget(label("Step"))
             self._step_row.addWidget(step)
         self._step_row.addStretch(1)
 
     # Reading -------------------------------------------------------------------------------------
-    def read(self) -> None:
+    def look(self) -> None:
         """Ask the stage where it is, whatever else is going on."""
         stage = self.session.bench.stage
-        if not self.isVisible() or stage is None or not self.session.is_open("stage"):
+        if stage is None or not self.is_ready or self._reading is not None:
             return
-        if self._reading is not None:
-            return
-        self._reading = self.session.jobs.watch(
+        self._reading = self.jobs.watch(
             "Reading the stage", lambda _: _Reading(stage.position(), stage.is_homed, stage.is_moving)
         )
         self._reading.succeeded.connect(self._show)
-        self._reading.ended.connect(self._read)
+        self._reading.ended.connect(self._looked)
 
-    def _read(self) -> None:
+    def _looked(self) -> None:
         self._reading = None
 
     def _show(self, value: object) -> None:
@@ -301,55 +242,34 @@ class StagePanel(Panel):
         stage = self.session.bench.stage
         assert stage is not None
         move = stage.move_by if relative else stage.move_to
-        try:
-            job = self.session.device_job(title, lambda _: move(where), {"stage"})
-        except BusyError as error:
-            self.refused(None, str(error))
-            return None
-        job.succeeded.connect(lambda _: self.accepted())
-        return self.tells(job)
+        job = self.begin(lambda: self.session.jobs.device(title, lambda _: move(where), {"stage"}))
+        if job is not None:
+            job.succeeded.connect(lambda _: self.accepted())
+        return job
 
     def ask_home(self) -> None:
         """Ask whether the stage may be homed, then do it."""
         if self.question is not None:
             self.question.ask()
             return
-        box = Question(
-            QMessageBox.Icon.Question,
+        self.question = box = Question(
+            self,
             "Home the stage?",
             "Every axis moves to its reference and then to its home position. Is its way free?",
-            self,
+            ("Home", "Stay"),
+            self._home_answered,
         )
-        go = box.addButton("Home", QMessageBox.ButtonRole.AcceptRole)
-        stay = box.addButton("Stay", QMessageBox.ButtonRole.RejectRole)
-        box.setDefaultButton(stay)
-        self.question = box
-        box.finished.connect(lambda _: self._home_answered(agreed=box.clickedButton() is go))
         self.session.stop_pressed.connect(box.reject)
         box.ask()
 
-    def _home_answered(self, *, agreed: bool) -> None:
+    def _home_answered(self, agreed: bool) -> None:
         self.question = None
-        if agreed:
-            self._home()
-
-    def _home(self) -> None:
         stage = self.session.bench.stage
-        if stage is None:
-            return
-        try:
-            self.tells(self.session.device_job("Homing the stage", lambda _: stage.home(), {"stage"}))
-        except BusyError as error:
-            self.refused(None, str(error))
+        if agreed and stage is not None:
+            self.begin(
+                lambda: self.session.jobs.device("Homing the stage", lambda _: stage.home(), {"stage"})
+            )
 
 
 def _words(unit: str) -> str:
     return {"um": "µm"}.get(unit, unit)
-
-
-def _jog_button(text: str) -> QPushButton:
-    button = QPushButton(text)
-    button.setFixedWidth(34)
-    button.setAutoRepeat(False)
-    button.setToolTip("Jog by one step")
-    return button

@@ -2,32 +2,71 @@
 
 from __future__ import annotations
 
+import tomllib
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import Qt
-from PySide6.QtGui import QPixmap
-from PySide6.QtWidgets import QLabel, QSizePolicy, QSplitter, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtGui import QImage, QPixmap
+from PySide6.QtWidgets import QWidget
 
 from calibration_routines import Photograph, SweepCalibration
-from calibration_routines.procedure import Outcome, Outlook
+from calibration_routines.plan_procedures import PlanProcedure
+from calibration_routines.procedure import Outcome, Outlook, Routine, routines
 from calibration_routines.psf.sweep_watch import PointTaken
-from gui.forms.routines import PLAN, forms
+from gui.background import NewestOnly
 from gui.procedure_panel import ProcedurePanel
 from gui.procedure_run import Situation
 from gui.session import BenchSession
+from gui.widgets.building import fill, label, split, tabs
 from gui.widgets.dialogues import elided
 from gui.widgets.image_view import ImageView
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
-from instrument.files.errors import BenchError, FileError, count
+from instrument.files.errors import BenchError, FileError, SettingsError, count
+from instrument.plan import Plan
 from instrument.plan.model import load_plan, plan_toml
+from recon.base.declare import option
 
 Image = npt.NDArray[Any]
 _LEVELS = (0.1, 99.9)
 """Percentiles that frames are stretched to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PlanOptions:
+    file: Path | None = option(
+        None,
+        help="A plan to read (.toml); relative paths are seen from its folder.",
+        default_words="none: what stands below",
+    )
+    text: str = option(
+        (files("instrument.plan") / "example.toml").read_text(),
+        label="Plan",
+        help="TOML; diffuserbench plan new writes the same example.",
+        default_words="the example",
+    )
+
+
+def _plan(options: _PlanOptions) -> PlanProcedure:
+    try:
+        data = tomllib.loads(options.text)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError([("text", str(error))]) from None
+    base = options.file.parent if options.file else Path()
+    return PlanProcedure(Plan.checked(data, "plan").with_slm_images(lambda image: base / image))
+
+
+PLAN = Routine(
+    name="plan",
+    title="Plan",
+    help="Any acquisition, as a plan in TOML: positions, light, SLM images, exposures",
+    options=_PlanOptions,
+    procedure=_plan,
+)
 
 
 class SweepsPanel(ProcedurePanel):
@@ -38,39 +77,21 @@ class SweepsPanel(ProcedurePanel):
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         self.path = PathPlot()
         self.frame = ImageView()
-        self.frame_words = QLabel("No frame yet.")
-        self.frame_words.setObjectName("dim")
-        self.frame_words.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        self.frame_words = label("No frame yet.", "dim", yields=True)
         self.psfs = PsfTable()
         self.picture = Picture()
-        super().__init__(session, [*forms(), PLAN], "Start", parent)
-        shown = QWidget()
-        column = QVBoxLayout(shown)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(self.frame, 1)
-        column.addWidget(self.frame_words)
-        self.tabs = QTabWidget()
-        self.tabs.setDocumentMode(True)
-        self.tabs.addTab(self.psfs, "Quality of PSFs")
-        self.tabs.addTab(self.picture, "Result")
-        above = QSplitter()
-        above.addWidget(self.path)
-        above.addWidget(shown)
-        above.setSizes([560, 420])
-        above.setChildrenCollapsible(False)
-        split = QSplitter(Qt.Orientation.Vertical)
-        split.addWidget(above)
-        split.addWidget(self.tabs)
-        split.setSizes([360, 400])
-        split.setChildrenCollapsible(False)
-        layout = QVBoxLayout(self.right)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(split)
+        own = [routine for routine in routines.values() if routine.command == "calibrate"]
+        super().__init__(session, [*own, PLAN], "Start", parent)
+        shown = fill(QWidget(), (self.frame, 1), self.frame_words)
+        self.tabs = tabs({"Quality of PSFs": self.psfs, "Result": self.picture})
+        above = split(self.path, shown, sizes=[560, 420], firm=True)
+        fill(self.right, split(above, self.tabs, sizes=[360, 400], down=True, firm=True))
         self._shown: Snapshot | None = None
         self._pictures = PsfPictures()
-        self.run.judged.connect(self._heard)
+        self.run.judged.connect(self._judged)
         self.psfs.chosen.connect(self._show_psf)
-        self.views["plan"].changed.connect(self._read_plan)
+        self.views["plan"].settled.connect(lambda name: self._read_plan() if name == "file" else None)
+        self._reader = NewestOnly(session.jobs, "Reading")
         self._plan_file: Path | None = None
 
     def show_outlook(self, outlook: Outlook) -> None:
@@ -106,15 +127,18 @@ class SweepsPanel(ProcedurePanel):
             self.frame_words.setText("The photograph, dark frames taken off")
         pictures = [file for file in outcome.files if file.suffix == ".png"]
         if pictures:
-            self.picture.show_pixmap(QPixmap(str(pictures[0])))
-            self.tabs.setCurrentWidget(self.picture)
+            self._reader.ask(lambda: QImage(str(pictures[0])), self._show_result)
+
+    def _show_result(self, picture: QImage) -> None:
+        self.picture.show_pixmap(QPixmap.fromImage(picture))
+        self.tabs.setCurrentWidget(self.picture)
 
     def theme_changed(self) -> None:
         """Restyle the plots."""
         self.path.restyle()
         self.psfs.restyle()
 
-    def _heard(self, event: object) -> None:
+    def _judged(self, event: object) -> None:
         if isinstance(event, PointTaken):
             self._pictures.keep(event.number - 1, event.image)
             self.psfs.arrived(event)
@@ -147,17 +171,26 @@ class SweepsPanel(ProcedurePanel):
 
     def _read_plan(self) -> None:
         """Show the plan of a file that was chosen."""
-        view = self.views["plan"]
-        values = view.values()
+        values = self.views["plan"].values()
         file = None if values is None else values["file"]
         if file == self._plan_file:
             return
         self._plan_file = file
-        if file is None or not file.is_file():
-            return
-        try:
-            text = file.read_text() if file.suffix == ".toml" else plan_toml(load_plan(file))
-        except (FileError, UnicodeDecodeError, OSError) as error:
-            view.refuse("file", str(error))
-            return
-        view.set_values({"text": text})
+        if file is not None:
+            self._reader.ask(lambda: _plan_text(file), self._show_plan)
+
+    def _show_plan(self, text: str | FileError) -> None:
+        if isinstance(text, str):
+            self.views["plan"].set_values({"text": text})
+        else:
+            self.views["plan"].refuse("file", str(text))
+
+
+def _plan_text(file: Path) -> str | FileError:
+    """Return a plan as TOML; why it cannot be read."""
+    try:
+        return file.read_text() if file.suffix == ".toml" else plan_toml(load_plan(file))
+    except FileError as error:
+        return error
+    except (UnicodeDecodeError, OSError) as error:
+        return FileError(file, str(error))

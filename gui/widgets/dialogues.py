@@ -14,10 +14,11 @@ from PySide6.QtWidgets import (
     QFileDialog,
     QLabel,
     QMessageBox,
-    QPlainTextEdit,
     QVBoxLayout,
     QWidget,
 )
+
+from gui.widgets.building import text_view
 
 Browse = Literal["open", "folder", "save"]
 
@@ -30,17 +31,34 @@ class Question(QMessageBox):
 
     Parameters
     ----------
-    icon : QMessageBox.Icon
-    title, text : str
     parent : QWidget
         In front of its window it stays.
+    title, text : str
+    answers : (str, str)
+        What the buttons say: yes, and no, which is also the answer where it is just closed.
+    answered : callable
+        Called with whether it was yes.
+    icon : QMessageBox.Icon
     """
 
-    def __init__(self, icon: QMessageBox.Icon, title: str, text: str, parent: QWidget) -> None:
+    def __init__(
+        self,
+        parent: QWidget,
+        title: str,
+        text: str,
+        answers: tuple[str, str],
+        answered: Callable[[bool], object],
+        icon: QMessageBox.Icon = QMessageBox.Icon.Question,
+    ) -> None:
         super().__init__(icon, title, text, parent=parent)
         self.setOption(QMessageBox.Option.DontUseNativeDialog)
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowModality(Qt.WindowModality.NonModal)
+        yes = self.addButton(answers[0], QMessageBox.ButtonRole.AcceptRole)
+        no = self.addButton(answers[1], QMessageBox.ButtonRole.RejectRole)
+        if icon is not QMessageBox.Icon.Information:  # what breaks something off is not one key away
+            self.setDefaultButton(no)
+        self.finished.connect(lambda _: answered(self.clickedButton() is yes))
 
     def ask(self) -> None:
         """Show it, in front and with the keyboard."""
@@ -128,8 +146,7 @@ class TextWindow(QDialog):
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.setWindowTitle(title)
         self.resize(760, 420)
-        self.view = QPlainTextEdit(text)
-        self.view.setReadOnly(True)
+        self.view = text_view(text)
         self.view.setFont(QFontDatabase.systemFont(QFontDatabase.SystemFont.FixedFont))
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         copy = buttons.addButton("Copy all", QDialogButtonBox.ButtonRole.ActionRole)

@@ -1,20 +1,47 @@
-"""A field for words that mean something: understood when it is left, refused where it stands."""
+"""Fields for words and numbers that mean something: taken when they are left, refused where they stand."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import Signal
-from PySide6.QtGui import QFocusEvent
-from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLineEdit, QToolButton, QWidget
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtGui import QFocusEvent, QKeyEvent
+from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
 
+from gui.widgets.building import fill, mark
 from gui.widgets.dialogues import Browse, choose_path
 from instrument.files.errors import BenchError
 
 
-class Entry(QLineEdit):
+class _Refusing(QLineEdit):
+    """A field that is marked, with the reason as its tool tip, where its content is refused.
+
+    Signals
+    -------
+    refused : str
+        Why it is.
+    """
+
+    refused = Signal(str)
+
+    def _tip_now(self) -> str:
+        """Return the tool tip of a field that is not refused."""
+        raise NotImplementedError
+
+    def refuse(self, why: str) -> None:
+        """Show why the content cannot be used."""
+        self._mark(why)
+        self.refused.emit(why)
+
+    def _mark(self, why: str) -> None:
+        mark(self, "refused", bool(why))
+        self.setToolTip(why or self._tip_now())
+
+
+class Entry(_Refusing):
     """A text and the value that it stands for.
 
     Parameters
@@ -27,13 +54,10 @@ class Entry(QLineEdit):
 
     Signals
     -------
-    refused : str
-        Why what was written is not understood.
     understood
-        It is.
+        What was written is understood.
     """
 
-    refused = Signal(str)
     understood = Signal()
 
     def __init__(
@@ -54,6 +78,9 @@ class Entry(QLineEdit):
         self.returnPressed.connect(self.check)
         self.textEdited.connect(lambda _: self._mark(""))
 
+    def _tip_now(self) -> str:
+        return self._tip
+
     def value(self) -> Any:
         """Return what the text stands for.
 
@@ -64,7 +91,7 @@ class Entry(QLineEdit):
         return self._understand(self.text().strip())
 
     def check(self) -> bool:
-        """Tell whether the text is understood, and show the reason where it is not."""
+        """Return whether the text is understood, and show the reason where it is not."""
         try:
             self.value()
         except BenchError as error:
@@ -74,21 +101,10 @@ class Entry(QLineEdit):
         self.understood.emit()
         return True
 
-    def refuse(self, why: str) -> None:
-        """Show why the text cannot be used."""
-        self._mark(why)
-        self.refused.emit(why)
-
     def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
         """Check when the field is left."""
         super().focusOutEvent(event)
         self.check()
-
-    def _mark(self, why: str) -> None:
-        self.setProperty("refused", bool(why))
-        self.setToolTip(why or self._tip)
-        self.style().unpolish(self)
-        self.style().polish(self)
 
 
 class PathEntry(QWidget):
@@ -105,15 +121,7 @@ class PathEntry(QWidget):
         self.button.setText("…")
         self.button.setToolTip("Choose")
         self.button.clicked.connect(self._choose)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(0, 0, 0, 0)
-        row.setSpacing(3)
-        row.addWidget(entry, 1)
-        row.addWidget(self.button)
-
-    def set_browse(self, browse: Browse) -> None:
-        """Choose files, folders, or names to save under from now on."""
-        self._browse = browse
+        fill(self, (entry, 1), self.button, across=True, spacing=3)
 
     def _choose(self) -> None:
         words = {"open": "Choose a file", "folder": "Choose a folder", "save": "Choose a name"}[self._browse]
@@ -123,12 +131,6 @@ class PathEntry(QWidget):
         self.entry.setText(str(path))
         self.entry.check()
         self.entry.editingFinished.emit()  # as if it had been typed
-
-
-def narrow(box: QComboBox) -> None:
-    """Let a box be narrower than its longest entry."""
-    box.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
-    box.setMinimumContentsLength(5)
 
 
 def existing_path(text: str) -> Path:
@@ -141,22 +143,191 @@ def existing_path(text: str) -> Path:
     return path
 
 
-def number(name: str, unit: str, *, above_zero: bool = False, whole: bool = False) -> Callable[[str], Any]:
-    """Return what understands a number with or without its unit; an empty text or ``auto`` is None."""
+_LENGTHS_UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_TIMES_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
+_LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZµ×%/° "
 
-    def understand(text: str) -> float | int | None:
-        bare = text.removesuffix(unit).strip() if unit else text
-        if bare in ("", "auto"):
-            return None
+
+def _factor(typed: str, unit: str) -> float | None:
+    """Return what a number in a typed unit is multiplied with to be in another; None where that is none."""
+    for scale in (_LENGTHS_UM, _TIMES_MS):
+        if typed in scale and unit in scale:
+            return scale[typed] / scale[unit]
+    return None
+
+
+class NumberEdit(_Refusing):
+    """A field for one number: ``12.5 ms``. Enter or leaving it submits; Up and Down step by a tenth.
+
+    Lengths and times may be typed in another unit than the field's: ``2 s`` where it has milliseconds.
+
+    A value that is none, or outside the limits, is refused where it stands, with the reason as tool tip; what
+    was typed stays to be corrected. Nothing is ever clipped.
+
+    Signals
+    -------
+    submitted : float
+        A new number within the limits.
+
+    Parameters
+    ----------
+    unit : str
+        Shown behind the number; may be empty.
+    value : float, optional
+    minimum, maximum : float
+        Limits, inclusive.
+    integer : bool
+        Whether only whole numbers are numbers.
+    tip : str
+        The tool tip; the limits are added.
+    empty : str
+        What an empty field means, shown in it; where this is empty, a number is needed.
+    parent : QWidget, optional
+    """
+
+    submitted = Signal(float)
+
+    def __init__(
+        self,
+        unit: str = "",
+        value: float | None = None,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        integer: bool = False,
+        tip: str = "",
+        empty: str = "",
+        parent: QWidget | None = None,
+    ) -> None:
+        super().__init__(parent)
+        self.unit = unit
+        self.minimum, self.maximum = minimum, maximum
+        self.check: Callable[[float], str] | None = None
+        """Further says of a number why it cannot be; empty where it can."""
+        self._integer = integer
+        self._tip = tip
+        self._value = value
+        self.setPlaceholderText(empty)
+        self.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.returnPressed.connect(self.submit)
+        self._show()
+
+    @property
+    def value(self) -> float | None:
+        """The last number that was accepted or set."""
+        return self._value
+
+    def typed(self) -> tuple[float | None, str]:
+        """Return the number as it stands in the field, submitted or not, and why it is refused if it is.
+
+        None for a number, and no reason, where the field may be empty and is.
+        """
+        text = self.text().strip()
+        if not text:
+            return None, "" if self.placeholderText() else "A number is needed."
+        digits = text.rstrip(_LETTERS).strip()
+        typed = text[len(digits) :].strip() if digits else ""
+        factor: float | None = 1.0 if typed in ("", self.unit) else _factor(typed, self.unit)
         try:
-            value = float(bare.replace(",", "."))
+            number = float(digits.replace(",", "."))
         except ValueError:
-            raise BenchError(f"{name} {text!r} is no number{f' of {unit}' if unit else ''}.") from None
-        if not (value == value and abs(value) != float("inf")) or value < 0 or (above_zero and value == 0):
-            least = "above 0" if above_zero else "0 or more"
-            raise BenchError(f"{name} must be {least}{f' {unit}' if unit else ''}, not {text}.")
-        if whole and value != int(value):
-            raise BenchError(f"{name} must be a whole number, not {text}.")
-        return int(value) if whole else value
+            factor = None
+        if factor is None:
+            return None, f"{text!r} is no number{f' of {self.unit}' if self.unit else ''}."
+        # 2 cm are 20 mm, not 20.000000000000004.
+        number = float(f"{number * factor:.15g}")
+        if not math.isfinite(number):
+            return None, f"{text} is no finite number."
+        if self._integer and number != int(number):
+            return None, f"{number:g} is no whole number."
+        if not self.minimum <= number <= self.maximum:
+            unit = f" {self.unit}" if self.unit else ""
+            in_force = "" if self._value is None else f" In force: {self._text(self._value)}."
+            return None, f"{number:g}{unit} is outside what is allowed: {self._range()}.{in_force}"
+        problem = "" if self.check is None else self.check(number)
+        return (None, problem) if problem else (number, "")
 
-    return understand
+    def set_value(self, value: float | None, *, overwrite: bool = False) -> None:
+        """Show a number, e.g. as a device reads back; only ``overwrite`` replaces what is being typed."""
+        self._value = value
+        if overwrite or not self.isModified():
+            self._show()
+
+    def set_limits(self, minimum: float, maximum: float) -> None:
+        """Change the limits."""
+        if (minimum, maximum) != (self.minimum, self.maximum):
+            self.minimum, self.maximum = minimum, maximum
+            if not self.property("refused"):
+                self.setToolTip(self._tip_now())
+
+    def refuse(self, why: str) -> None:
+        """Show that the number was refused (by the device), and why; it stays to be corrected."""
+        self.setModified(True)
+        super().refuse(why)
+
+    def submit(self) -> bool:
+        """Take what was typed, or refuse it; returns whether the field holds a number that is in force.
+
+        To be called before what the number is for, too: not every key or click leaves the field.
+        """
+        if not self.isModified():
+            return not self.property("refused")
+        number, problem = self.typed()
+        if problem:
+            super().refuse(problem)
+            return False
+        changed = number != self._value
+        self._value = number
+        self._show()
+        if changed and number is not None:
+            self.submitted.emit(number)
+        return True
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802 - Qt's name
+        """Step by Up and Down; give up what was typed by Ctrl+Z at its end as any field does."""
+        if event.key() in (Qt.Key.Key_Up, Qt.Key.Key_Down):
+            number, problem = self.typed()
+            if number is not None and not problem:
+                step = self._step(number)
+                stepped = number + (step if event.key() == Qt.Key.Key_Up else -step)
+                self.setText(self._text(stepped))
+                self.setModified(True)
+                self.submit()
+            return
+        super().keyPressEvent(event)
+
+    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
+        """Submit when the field is left."""
+        super().focusOutEvent(event)
+        self.submit()
+
+    def _step(self, number: float) -> float:
+        """Return a step in the number's second digit."""
+        if self._integer:
+            return 1.0
+        return float(10 ** (math.floor(math.log10(abs(number))) - 1)) if number else 0.1
+
+    def _range(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if math.isinf(self.maximum):
+            return f"{self.minimum:g}{unit} or more"
+        if math.isinf(self.minimum):
+            return f"{self.maximum:g}{unit} or less"
+        return f"{self.minimum:g} to {self.maximum:g}{unit}"
+
+    def _tip_now(self) -> str:
+        if math.isinf(self.minimum) and math.isinf(self.maximum):
+            return f"{self._tip}\nin {self.unit}".strip() if self.unit else self._tip
+        return f"{self._tip}\n{self._range()}".strip()
+
+    def _text(self, number: float) -> str:
+        digits = f"{number:.0f}" if self._integer else f"{number:.6g}"
+        return f"{digits} {self.unit}".strip()
+
+    def _show(self) -> None:
+        text = "" if self._value is None else self._text(self._value)
+        if text != self.text():
+            self.setText(text)
+        self.setModified(False)
+        if self.property("refused") is not False:
+            self._mark("")

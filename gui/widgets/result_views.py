@@ -11,21 +11,12 @@ import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
-    QPushButton,
-    QTextBrowser,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QTextBrowser, QWidget
 
 from gui.theme import colours
+from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import ImageView
-from gui.widgets.levels_bar import LevelsBar
-from gui.widgets.plot import curve_pen, plot_widget, restyle
+from gui.widgets.plots import LevelsBar, curve_pen, legend, plot_widget
 from recon.solvers.base import IterationRecord
 
 
@@ -72,25 +63,13 @@ class PictureView(QWidget):
         self.image = _ScaledImage()
         self.levels = LevelsBar()
         self.levels.changed.connect(self._show)
-        self.turn = QPushButton("Turn 90°")
-        self.turn.setToolTip(
-            "Turn the picture counter-clockwise; a picture on the sensor's grid is upside down"
-        )
-        self.turn.clicked.connect(self.turn_by_90)
-        self.whole = QPushButton("Whole")
-        self.whole.setToolTip("Show the whole picture (the wheel zooms, dragging moves)")
-        self.whole.clicked.connect(self.image.whole)
+        tip = "Turn the picture counter-clockwise; a picture on the sensor's grid is upside down"
+        self.turn = button("Turn 90°", tip, self.turn_by_90)
+        tip = "Show the whole picture (the wheel zooms, dragging moves)"
+        self.whole = button("Whole", tip, self.image.whole)
         self.image.setMinimumSize(70, 50)
         self.hovered = self.image.hovered
-        below = QHBoxLayout()
-        below.addStretch()
-        below.addWidget(self.whole)
-        below.addWidget(self.turn)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.image, 1)
-        layout.addLayout(below)
-        layout.addWidget(self.levels)
+        fill(self, (self.image, 1), in_row(None, self.whole, self.turn), self.levels)
 
     @property
     def shown(self) -> npt.NDArray[np.float32] | None:
@@ -113,7 +92,6 @@ class PictureView(QWidget):
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
-        self.image.graphics.setBackground(colours().window)
         self.levels.restyle()
 
     def _show(self) -> None:
@@ -123,7 +101,7 @@ class PictureView(QWidget):
 
 
 class _ScaledImage(ImageView):
-    """An image whose places under the mouse are also told in micrometres from the middle."""
+    """An image whose places under the mouse are also given in micrometres from the middle."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -158,7 +136,7 @@ class ConvergenceView(QWidget):
             "Residual in units of what the noise explains (1: nothing is left to explain), "
             "and relative change of the result an iteration"
         )
-        self.legend = QLabel()
+        self.legend = label()
         self.legend.setMinimumWidth(10)
         self.against_time = QCheckBox("seconds")
         self.against_time.setToolTip("Horizontal axis: wall seconds of the solver instead of iterations")
@@ -167,14 +145,7 @@ class ConvergenceView(QWidget):
         self._numbers: dict[int, str] = {}
         self._histories: Histories = ()
         self._noise_norm: float | None = None
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.setSpacing(0)
-        row = QHBoxLayout()
-        row.addWidget(self.legend, 1)
-        row.addWidget(self.against_time)
-        layout.addLayout(row)
-        layout.addWidget(self.plot, 1)
+        fill(self, in_row((self.legend, 1), self.against_time), (self.plot, 1), spacing=0)
 
     def show_histories(self, histories: Histories, noise_norm: float | None) -> None:
         """Draw histories; ``noise_norm`` is the expected norm of the noise in the residuals' units."""
@@ -183,7 +154,6 @@ class ConvergenceView(QWidget):
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
-        restyle(self.plot)
         self._draw()
 
     def _draw(self) -> None:
@@ -197,13 +167,7 @@ class ConvergenceView(QWidget):
             suffix = "" if len(self._histories) == 1 else f", channel {channel}"
             self._add(f"residual / noise{suffix}", x, [r.data_residual / norm for r in history], 2 * channel)
             self._add(f"change{suffix}", x, [r.change for r in history], 2 * channel + 1)
-        colour = colours().curves
-        self.legend.setText(
-            " &nbsp;".join(
-                f'<span style="color:{colour[number % len(colour)]}">●</span> {name}'
-                for number, name in self._numbers.items()
-            )
-        )
+        self.legend.setText(legend(self._numbers))
         if self._noise_norm is not None and self._histories:
             pen = pg.mkPen(colours().dim, style=Qt.PenStyle.DashLine)
             self.plot.addItem(pg.InfiniteLine(0.0, angle=0, pen=pen))  # log10 of 1
@@ -234,16 +198,9 @@ class ViewGrid(QWidget):
         super().__init__(parent)
         self._cells: list[QWidget] = []
         for title, view in views:
-            cell = QWidget()
-            label = QLabel(title)
-            label.setProperty("role", "heading")
-            label.setFixedHeight(_HEADING_PX)
-            box = QVBoxLayout(cell)
-            box.setContentsMargins(0, 0, 0, 0)
-            box.setSpacing(0)
-            box.addWidget(label)
-            box.addWidget(view, 1)
-            self._cells.append(cell)
+            heading = label(title, "heading")
+            heading.setFixedHeight(_HEADING_PX)
+            self._cells.append(fill(QWidget(), heading, (view, 1), spacing=0))
         self._layout = QGridLayout(self)
         self._layout.setContentsMargins(0, 0, 0, 0)
         self._layout.setSpacing(_SPACING_PX)

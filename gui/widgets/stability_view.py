@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from gui.theme import colours
+from gui.widgets.building import choice, fill, in_row, label, offer
 from gui.widgets.image_view import ArrowKeys
-from gui.widgets.plot import curve_pen, plot_widget, restyle
+from gui.widgets.plots import curve_colour, curve_pen, dots, legend, plot_widget
 from recon.verdict.map import Failure
 
 _SPAN = 1.0
@@ -30,26 +30,18 @@ class StabilityView(QWidget):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._maps: Mapping[str, Any] = {}
-        self.map = QComboBox()
-        self.map.setToolTip("Which two stresses are varied")
-        self.map.currentIndexChanged.connect(lambda _: self._choose_map())
-        self.method = QComboBox()
-        self.method.setToolTip("Whose cells are coloured; the lines are the boundaries of all methods")
-        self.method.currentIndexChanged.connect(lambda _: self._draw())
-        self.question = QLabel()
-        self.question.setWordWrap(True)
-        self.question.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self.place = QLabel(_hint())
-        self.place.setProperty("role", "dim")
-        self.place.setWordWrap(True)
-        self.legend = QLabel()
-        self.legend.setWordWrap(True)
+        self.map = choice((), "Which two stresses are varied", lambda _: self._choose_map())
+        tip = "Whose cells are coloured; the lines are the boundaries of all methods"
+        self.method = choice((), tip, lambda _: self._draw())
+        self.question = label(selectable=True, wraps=True)
+        self.place = label(_hint(), "dim", wraps=True)
+        self.legend = label(wraps=True)
         self.plot: Any = plot_widget(grid=False)
         self.plot.setMouseEnabled(x=False, y=False)
         self.image: Any = pg.ImageItem()
         self.plot.scene().sigMouseMoved.connect(self._moved)
         self.cell = (0, 0)
-        """Column and row of the cell that was told of last, from the lower left."""
+        """Column and row of the cell that was described last, from the lower left."""
         self.keys = ArrowKeys(self.plot)
         self.keys.entered.connect(lambda: self._step(0, 0))
         self.keys.moved.connect(self._step)
@@ -58,25 +50,19 @@ class StabilityView(QWidget):
         self._cursor.hide()
         self.keys.left.connect(self._cursor.hide)
         self.boundaries: dict[str, npt.NDArray[np.float64]] = {}
-        row = QHBoxLayout()
-        row.addWidget(self.map, 2)
-        row.addWidget(self.method, 1)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(row)
-        layout.addWidget(self.question)
-        layout.addWidget(self.plot, 1)
-        layout.addWidget(self.legend)
-        layout.addWidget(self.place)
+        fill(
+            self,
+            in_row((self.map, 2), (self.method, 1)),
+            self.question,
+            (self.plot, 1),
+            self.legend,
+            self.place,
+        )
 
     def show_maps(self, maps: Mapping[str, Any]) -> None:
         """Show the maps of a ``stability.json``, by name."""
         self._maps = maps
-        self.map.blockSignals(True)
-        self.map.clear()
-        for name, record in maps.items():
-            self.map.addItem(record["title"], name)
-        self.map.blockSignals(False)
+        offer(self.map, [(record["title"], name) for name, record in maps.items()])
         self._choose_map()
 
     @property
@@ -87,17 +73,12 @@ class StabilityView(QWidget):
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
-        restyle(self.plot)
         self.place.setText(_hint())
         self._draw()
 
     def _choose_map(self) -> None:
-        record = self.record
-        self.method.blockSignals(True)
-        self.method.clear()
-        if record is not None:
-            self.method.addItems(list(record["methods"]))
-        self.method.blockSignals(False)
+        methods = [] if self.record is None else self.record["methods"]
+        offer(self.method, [(name, name) for name in methods])
         self._draw()
 
     def _draw(self) -> None:
@@ -107,8 +88,8 @@ class StabilityView(QWidget):
         if record is None or not name:
             return
         self.question.setText(f"{record['question']} ({record['size']} map)")
-        method = record["methods"][name]
-        severity = _grid(method["severity"])
+        methods = record["methods"]
+        severity = _grid(methods[name]["severity"])
         level = np.log10(np.maximum(severity, 1e-2))
         cells = _coloured(level)
         self.image.setImage(cells, levels=(0, 255))
@@ -116,17 +97,13 @@ class StabilityView(QWidget):
         self.plot.addItem(self.image)
         self._cursor.setPen(pg.mkPen(colours().text, width=2))
         self.plot.addItem(self._cursor, ignoreBounds=True)
-        self._write_errors(_grid(method["error"]), cells)
-        for number, (other, found) in enumerate(record["methods"].items()):
-            self._draw_boundary(number, other, found["boundary"], record, chosen=other == name)
-        self.legend.setText(
-            "Boundaries: "
-            + " &nbsp; ".join(
-                f'<span style="color:{_colour(number)}">●</span> {other}'
-                + ("" if found["boundary"] else " (none here)")
-                for number, (other, found) in enumerate(record["methods"].items())
-            )
-        )
+        self._write_errors(_grid(methods[name]["error"]), cells)
+        for number, (other, method) in enumerate(methods.items()):
+            self._draw_boundary(number, other, method["boundary"], record, chosen=other == name)
+        names = [
+            f"{other}{'' if method['boundary'] else ' (none here)'}" for other, method in methods.items()
+        ]
+        self.legend.setText(f"Boundaries: {legend(dict(enumerate(names)))}")
         for side, which in (("bottom", "x"), ("left", "y")):
             about = record[which]
             unit = f" ({about['unit']})" if about["unit"] else ""
@@ -152,14 +129,10 @@ class StabilityView(QWidget):
     ) -> None:
         places = np.array([(_place(record["x"], x), _place(record["y"], y)) for x, y in points], float)
         self.boundaries[name] = places.reshape(-1, 2)
-        width = 4.0 if chosen else 2.0
         self.plot.plot(
             *self.boundaries[name].T,
-            pen=curve_pen(number, width),
-            symbol="o",
-            symbolSize=9 if chosen else 6,
-            symbolPen=None,
-            symbolBrush=_colour(number),
+            pen=curve_pen(number, 4.0 if chosen else 2.0),
+            **dots(curve_colour(number), 9 if chosen else 6),
         )
 
     def _moved(self, place: Any) -> None:
@@ -210,10 +183,6 @@ def _hint() -> str:
         f"{fails} fails, {works} works, dark is the boundary; numbers are errors. Point at a cell, "
         "or go there by arrow keys, for more."
     )
-
-
-def _colour(number: int) -> str:
-    return colours().curves[number % len(colours().curves)]
 
 
 def _coloured(level: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:

@@ -10,23 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QRectF, Qt, Signal
-from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPixmap
-from PySide6.QtWidgets import (
-    QHBoxLayout,
-    QHeaderView,
-    QLabel,
-    QSizePolicy,
-    QSplitter,
-    QTableWidget,
-    QTableWidgetItem,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtGui import QPainter, QPaintEvent, QPixmap
+from PySide6.QtWidgets import QHBoxLayout, QSizePolicy, QWidget
 
 from calibration_routines.psf.psf_quality import MIN_SNR, PsfQuality
 from calibration_routines.psf.sweep_watch import PointTaken
 from gui.theme import colours
-from gui.widgets.plot import plot_widget, restyle
+from gui.widgets.building import cell, fill, label, split, table
+from gui.widgets.plots import dots, plot_widget
 
 Place = Mapping[str, float]
 
@@ -45,8 +36,7 @@ class PathPlot(QWidget):
         super().__init__(parent)
         self._layout = QHBoxLayout(self)
         self._layout.setContentsMargins(0, 0, 0, 0)
-        self.nothing = QLabel("Nothing moves.")
-        self.nothing.setObjectName("dim")
+        self.nothing = label("Nothing moves.", "dim")
         self.nothing.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
         self._layout.addWidget(self.nothing)
         self.views: list[_View] = []
@@ -85,7 +75,6 @@ class PathPlot(QWidget):
     def restyle(self) -> None:
         """Take over another theme."""
         for view in self.views:
-            restyle(view.plot)
             view.draw(self.places)
 
 
@@ -103,14 +92,13 @@ class _View:
 
     def draw(self, places: Sequence[Place]) -> None:
         x, y = self._values(places)
-        symbols = {"symbol": "o", "symbolSize": 5} if len(places) <= _MOST_SYMBOLS else {"symbol": None}
-        dim, ok, warning = colours().dim, colours().ok, colours().warning
-        accent = pg.mkBrush(colours().accent)
-        self._line.setData(x, y, pen=pg.mkPen(dim, width=1), symbolBrush=accent, symbolPen=None, **symbols)
-        start = {"symbol": "s", "symbolSize": 10, "symbolBrush": None}
-        self._first.setData(x[:1], y[:1], pen=None, symbolPen=pg.mkPen(ok, width=2), **start)
-        here = {"symbol": "o", "symbolSize": 13, "symbolBrush": None}
-        self._now.setData([], [], pen=None, symbolPen=pg.mkPen(warning, width=2), **here)
+        now = colours()
+        symbols = dots(now.accent) if len(places) <= _MOST_SYMBOLS else {"symbol": None}
+        self._line.setData(x, y, pen=pg.mkPen(now.dim, width=1), **symbols)
+        start = dots(None, 10) | {"symbol": "s", "symbolPen": pg.mkPen(now.ok, width=2)}
+        self._first.setData(x[:1], y[:1], pen=None, **start)
+        here = dots(None, 13) | {"symbolPen": pg.mkPen(now.warning, width=2)}
+        self._now.setData([], [], pen=None, **here)
         self.plot.autoRange()
 
     def mark(self, place: Place | None) -> None:
@@ -177,18 +165,9 @@ class PsfTable(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.table = QTableWidget(0, len(_COLUMNS))
-        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
-        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
-        self.table.verticalHeader().setDefaultSectionSize(24)
-        self.table.setTabKeyNavigation(False)
-        for column, (name, tip) in enumerate(_COLUMNS):
-            item = QTableWidgetItem(name)
-            item.setToolTip(tip)
-            self.table.setHorizontalHeaderItem(column, item)
-        header = self.table.horizontalHeader()
-        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(_VERDICT, QHeaderView.ResizeMode.Stretch)
+        self.table = table([name for name, _ in _COLUMNS], wide=_VERDICT)
+        for place, (name, tip) in enumerate(_COLUMNS):
+            self.table.setHorizontalHeaderItem(place, cell(name, tip))
         self.table.currentCellChanged.connect(lambda row, *_: self.chosen.emit(row))
         self.plot: Any = plot_widget("PSF", "signal / noise")
         self.plot.setMinimumHeight(90)
@@ -196,13 +175,7 @@ class PsfTable(QWidget):
         self._least: Any = pg.InfiniteLine(angle=0, pos=MIN_SNR)
         self.plot.addItem(self._least)
         self._qualities: list[PsfQuality | None] = []
-        split = QSplitter(Qt.Orientation.Vertical)
-        split.addWidget(self.table)
-        split.addWidget(self.plot)
-        split.setSizes([220, 140])
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(split)
+        fill(self, split(self.table, self.plot, sizes=[220, 140], down=True))
         self.restyle()
 
     @property
@@ -233,7 +206,6 @@ class PsfTable(QWidget):
 
     def restyle(self) -> None:
         """Take over another theme."""
-        restyle(self.plot)
         self._least.setPen(pg.mkPen(colours().warning, style=Qt.PenStyle.DashLine))
         self._draw()
 
@@ -245,14 +217,9 @@ class PsfTable(QWidget):
         verdict = note or ("good" if not quality.findings else " ".join(quality.findings))
         cells = [f"{value / 1e3:.4g}" for value in quality.source_um]
         cells += [f"{quality.snr:.0f}", f"{quality.saturated_pixels}", f"{quality.step_px:.2f}", verdict]
-        for column, text in enumerate(cells):
-            item = QTableWidgetItem(text)
-            if column != _VERDICT:
-                item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-            if quality.findings:
-                item.setForeground(QColor(colours().warning))
-                item.setToolTip("\n".join(quality.findings))
-            self.table.setItem(row, column, item)
+        tip, warns = "\n".join(quality.findings), bool(quality.findings)
+        for place, text in enumerate(cells):
+            self.table.setItem(row, place, cell(text, tip, number=place != _VERDICT, warns=warns))
 
     def _draw(self) -> None:
         # A single frame without noise has no figure.
@@ -263,10 +230,7 @@ class PsfTable(QWidget):
             [number for number, _ in known],
             [q.snr for _, q in known],
             pen=pg.mkPen(colours().line),
-            symbol="o",
-            symbolSize=7,
-            symbolPen=None,
-            symbolBrush=brushes or None,
+            **dots(brushes or None, 7),
         )
 
 

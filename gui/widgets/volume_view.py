@@ -4,43 +4,44 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
-from PySide6.QtCore import Qt, Signal
-from PySide6.QtWidgets import (
-    QButtonGroup,
-    QGridLayout,
-    QHBoxLayout,
-    QLabel,
-    QProgressBar,
-    QPushButton,
-    QSlider,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtCore import QSignalBlocker, Qt, Signal
+from PySide6.QtWidgets import QButtonGroup, QGridLayout, QProgressBar, QSlider, QWidget
 
-from gui.background_reading import Axis, Slice, SliceReader
+from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours
+from gui.widgets.building import button, fill, in_row, label
 from gui.widgets.image_view import StretchedImage
-from gui.widgets.levels_bar import LevelsBar
-from gui.widgets.plot import curve_pen, plot_widget, restyle
+from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
 from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
 
 Mode = Literal["brightest", "slices"]
+Axis = Literal["z", "y", "x"]
 Planes = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 _AXES: tuple[Axis, Axis, Axis] = ("z", "y", "x")
 
 
+@dataclass(frozen=True, slots=True)
+class Slice:
+    """A slice that was read."""
+
+    axis: Axis
+    index: int
+    pixels: Plane
+
+
 class VolumeView(QWidget):
     """Four views of one volume, and what is under the mouse in words.
 
-    Nothing is read in the window's thread: projections are a job, slices come from a :class:`SliceReader`.
+    Nothing is read in the window's thread: projections and slices are read in jobs.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ class VolumeView(QWidget):
         super().__init__(parent)
         self._jobs = jobs
         self._job: Job | None = None
-        self._reader: SliceReader | None = None
+        self._reader = NewestOnly(jobs, "Reading a slice", self.failed.emit)
         self._source: VolumeSource | None = None
         self._planes: Planes | None = None
         self.projections: Projections | None = None
@@ -79,9 +80,7 @@ class VolumeView(QWidget):
         self._here: Any = pg.InfiniteLine(pen=colours().dim)
         self.profile.addItem(self._here)
         self.profile.setToolTip("Values along depth through the chosen pixel, of the views' resolution")
-        self._titles = [QLabel() for _ in range(4)]
-        for label in self._titles:
-            label.setProperty("role", "heading")
+        self._titles = [label(role="heading") for _ in range(4)]
         self._lines = {view: (_line(view, 90), _line(view, 0)) for view in (self.front, self.side, self.top)}
         self.front.clicked.connect(lambda column, row: self.go_to(self.point[0], row, column))
         self.side.clicked.connect(lambda column, row: self.go_to(column, row, self.point[2]))
@@ -94,25 +93,27 @@ class VolumeView(QWidget):
             view.hovered.connect(self.hovered)
         self.profile.setMinimumSize(70, 50)
 
-        self.brightest_button = QPushButton("Brightest")
-        self.brightest_button.setToolTip("The brightest voxels along each axis (Ctrl+B)")
-        self.brightest_button.setShortcut("Ctrl+B")
-        self.slices_button = QPushButton("Slices")
-        self.slices_button.setToolTip(
-            "Slices through one point: a click or arrows in a view move it (Ctrl+J)"
+        self.brightest_button = button(
+            "Brightest",
+            "The brightest voxels along each axis (Ctrl+B)",
+            lambda: self.set_mode("brightest"),
+            shortcut="Ctrl+B",
+            checkable=True,
         )
-        self.slices_button.setShortcut("Ctrl+J")
+        self.slices_button = button(
+            "Slices",
+            "Slices through one point: a click or arrows in a view move it (Ctrl+J)",
+            lambda: self.set_mode("slices"),
+            shortcut="Ctrl+J",
+            checkable=True,
+        )
         group = QButtonGroup(self)
-        for button in (self.brightest_button, self.slices_button):
-            button.setCheckable(True)
-            group.addButton(button)
-        self.brightest_button.setChecked(True)
-        self.brightest_button.clicked.connect(lambda: self.set_mode("brightest"))
-        self.slices_button.clicked.connect(lambda: self.set_mode("slices"))
+        group.addButton(self.brightest_button)
+        group.addButton(self.slices_button)
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setToolTip("Depth plane of the front view (arrow keys)")
         self.slider.valueChanged.connect(lambda z: self.go_to(z, *self.point[1:]))
-        self.plane_label = QLabel()
+        self.plane_label = label()
         self.progress = QProgressBar()
         self.progress.setFormat("reading plane %v of %m")
         self.progress.hide()
@@ -124,32 +125,18 @@ class VolumeView(QWidget):
     def _arrange(self) -> None:
         grid = QGridLayout()
         grid.setSpacing(3)
-        cells: list[tuple[QWidget, int, int]] = [
-            (self.front, 0, 0),
-            (self.side, 0, 1),
-            (self.top, 1, 0),
-            (self.coloured, 1, 1),
-        ]
-        for (widget, row, column), title in zip(cells, self._titles, strict=True):
-            grid.addWidget(title, 2 * row, column)
-            grid.addWidget(widget, 2 * row + 1, column)
+        for number, (widget, title) in enumerate(
+            zip((self.front, self.side, self.top, self.coloured), self._titles, strict=True)
+        ):
+            grid.addWidget(title, 2 * (number // 2), number % 2)
+            grid.addWidget(widget, 2 * (number // 2) + 1, number % 2)
         grid.addWidget(self.profile, 3, 1)
         grid.setRowStretch(1, 3)
         grid.setRowStretch(3, 2)
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
-        bar = QHBoxLayout()
-        bar.addWidget(self.brightest_button)
-        bar.addWidget(self.slices_button)
-        bar.addWidget(self.slider, 1)
-        bar.addStretch()
-        bar.addWidget(self.plane_label)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(bar)
-        layout.addWidget(self.progress)
-        layout.addLayout(grid, 1)
-        layout.addWidget(self.levels)
+        bar = in_row(self.brightest_button, self.slices_button, (self.slider, 1), None, self.plane_label)
+        fill(self, bar, self.progress, (grid, 1), self.levels)
 
     # What is shown -------------------------------------------------------------------------------
     def open(self, source: VolumeSource, planes_um: Planes | None = None) -> Job:
@@ -163,9 +150,6 @@ class VolumeView(QWidget):
         """
         self.release()
         self._source, self._planes = source, planes_um
-        self._reader = SliceReader(source, self)
-        self._reader.arrived.connect(self._take_slice)
-        self._reader.failed.connect(self.failed)
         n_z, height, width = source.shape
         self.slider.setRange(0, n_z - 1)
         self.progress.setRange(0, n_z)
@@ -177,7 +161,7 @@ class VolumeView(QWidget):
 
         job = self._jobs.compute(f"Looking through {source.path.name}", work)
         job.progressed.connect(self.progress.setValue)
-        job.succeeded.connect(lambda found: self._take_projections(job, found))
+        job.succeeded.connect(lambda projections: self._take_projections(job, projections))
         job.failed.connect(self.failed)
         job.ended.connect(lambda: self._projecting_ended(job))
         self._job = job
@@ -198,9 +182,8 @@ class VolumeView(QWidget):
         if self._job is not None:
             self._job.cancel()
             self._job = None
-        if self._reader is not None:
-            self._reader.end()
-            self._reader = None
+        if self._source is not None:
+            self._reader.forget(last=self._source.close)
         self._source = self.projections = None
         self.slices, self._asked = {}, {}
         self.progress.hide()
@@ -223,22 +206,25 @@ class VolumeView(QWidget):
 
     def go_to(self, plane: int, row: int, column: int) -> None:
         """Let the slices go through a voxel."""
-        if self._source is None or self._reader is None:
+        if self._source is None:
             return
         n_z, height, width = self._source.shape
         point = (min(max(plane, 0), n_z - 1), min(max(row, 0), height - 1), min(max(column, 0), width - 1))
         self.point = point
-        self.slider.blockSignals(True)
-        self.slider.setValue(point[0])
-        self.slider.blockSignals(False)
+        with QSignalBlocker(self.slider):
+            self.slider.setValue(point[0])
         self.plane_label.setText(f"plane {point[0] + 1} of {n_z}{self._depth_words(point[0])}")
         for axis, index in zip(_AXES, point, strict=True):
             if self._asked.get(axis) != index:
                 self._asked[axis] = index
-                self._reader.ask(axis, index)
+                self._ask_slice(self._source, axis, index)
         self._place_lines()
         if self.mode == "slices":
             self._show_profile()
+
+    def _ask_slice(self, source: VolumeSource, axis: Axis, index: int) -> None:
+        read = {"z": source.plane, "y": source.across_y, "x": source.across_x}[axis]
+        self._reader.ask(lambda: Slice(axis, index, read(index)), self._take_slice, axis)
 
     def _step_by_keys(self, view: StretchedImage, step: Callable[[int, int], tuple[int, int, int]]) -> None:
         """Let the arrow keys in a view move the point by voxels; among projections they pan."""
@@ -263,29 +249,22 @@ class VolumeView(QWidget):
 
     def restyle(self) -> None:
         """Take over the colours of the theme in use."""
-        now = colours()
-        for view in (self.front, self.side, self.top, self.coloured):
-            view.graphics.setBackground(now.window)
-        restyle(self.profile)
         self._along.setPen(curve_pen(0))
-        self._here.setPen(now.dim)
+        self._here.setPen(colours().dim)
         self.levels.restyle()
         self._show()
 
     # Inside --------------------------------------------------------------------------------------
-    def _take_projections(self, job: Job, found: Projections) -> None:
-        if job is not self._job:
-            return
-        self.projections = found
-        self.levels.set_image(found.front)
+    def _take_projections(self, job: Job, projections: Projections) -> None:
+        if job is self._job:
+            self.projections = projections
+            self.levels.set_image(projections.front)
 
     def _projecting_ended(self, job: Job) -> None:
         if job is self._job:
             self.progress.hide()
 
     def _take_slice(self, held: Slice) -> None:
-        if self.sender() is not self._reader:
-            return  # of the volume before
         self.slices[held.axis] = held
         if self.mode == "slices":
             self._show_slice(held, self.levels.levels)
@@ -310,19 +289,16 @@ class VolumeView(QWidget):
         self._draw(self.side, np.ascontiguousarray(p.side.T), levels)
         self._draw(self.coloured, self._coloured(p), (0.0, 1.0))
         first, last = (self._depth_words(z) or f", plane {z + 1}" for z in (0, len(p.top) - 1))
-        for label, text in zip(
-            self._titles,
-            (
-                "x–y, brightest over depth",
-                "z–y, brightest over x",
-                "x–z, brightest over y",
-                f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace(
-                    "red, ", "red "
-                ),
-            ),
-            strict=True,
-        ):
-            label.setText(text)
+        self._name(
+            "x–y, brightest over depth",
+            "z–y, brightest over x",
+            "x–z, brightest over y",
+            f"depth as colour: blue{first}, red{last}".replace("blue, ", "blue ").replace("red, ", "red "),
+        )
+
+    def _name(self, *titles: str) -> None:
+        for shown, title in zip(self._titles, titles, strict=True):
+            shown.setText(title)
 
     def _show_slices(self) -> None:
         for held in self.slices.values():
@@ -338,12 +314,9 @@ class VolumeView(QWidget):
 
     def _name_slices(self) -> None:
         z, y, x = self.point
-        for label, text in zip(
-            self._titles,
-            (f"x–y at plane {z + 1}", f"z–y at column {x}", f"x–z at row {y}", f"along depth at ({x}, {y})"),
-            strict=True,
-        ):
-            label.setText(text)
+        self._name(
+            f"x–y at plane {z + 1}", f"z–y at column {x}", f"x–z at row {y}", f"along depth at ({x}, {y})"
+        )
 
     def _draw(self, view: StretchedImage, image: Plane, levels: tuple[float, float]) -> None:
         """Show an image over the volume's own voxels."""

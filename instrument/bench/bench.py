@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self, cast
 
 from drivers.camera import Camera
@@ -37,13 +36,8 @@ class Bench:
 
     Made by :func:`open_bench`, which opens the devices in this order; ``close`` (or leaving the context)
     makes the bench safe and closes them in reverse order, each even if another fails. ``stop`` may be called
-    from any thread at any time.
-
-    Parameters
-    ----------
-    config : BenchConfig
-    ask : callable, optional
-        Asks the operator to light or darken something by hand, with a sentence to show; returns when done.
+    from any thread at any time. ``ask`` asks the operator to light or darken something by hand, with a
+    sentence to show, and returns when it is done.
     """
 
     def __init__(self, config: BenchConfig, ask: Ask | None = None) -> None:
@@ -304,11 +298,9 @@ class Bench:
 
     # Safety ------------------------------------------------------------------------------------
     def stop(self) -> None:
-        """Stop whatever runs and make the bench safe, from any thread; see ``safe_state``."""
-        self.safe_state()
+        """Make the bench safe, from any thread and whatever runs.
 
-    def safe_state(self) -> None:
-        """Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
+        Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
 
         Raises
         ------
@@ -363,12 +355,7 @@ class Bench:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _type: object, exc: BaseException | None, _traceback: object) -> None:
         if exc is None:
             self.close()
         else:
@@ -378,18 +365,9 @@ class Bench:
 def open_bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | None = None) -> Bench:
     """Open a bench: every device that its configuration names, or none.
 
-    Parameters
-    ----------
-    config : BenchConfig or path, optional
-        None means ``bench.toml`` in the working folder if there is one, otherwise the built-in simulated
-        bench, which says SIMULATED wherever it is named.
-    ask : callable, optional
-        Asks the operator to do something by hand, with a sentence to show; returns when it is done.
-
-    Returns
-    -------
-    Bench
-        Open; use it as a context manager, or call ``close``.
+    ``config`` None means ``bench.toml`` in the working folder if there is one, otherwise the built-in
+    simulated bench, which says SIMULATED wherever it is named. ``ask`` is as in :class:`Bench`. Use the bench
+    as a context manager, or call ``close``.
 
     Raises
     ------

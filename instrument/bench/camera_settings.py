@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from drivers.camera import Camera, Roi
@@ -42,19 +42,7 @@ class CameraOptions:
 
 @dataclass(frozen=True, slots=True)
 class CameraState:
-    """What a camera says of itself now, and what it offers.
-
-    Attributes
-    ----------
-    exposure_ms, gain, black_level, binning, roi, pixel_format
-        As read back.
-    exposure_limits_ms, gain_limits, binnings, pixel_formats, sensor_shape
-        What it offers.
-    temperature_c : float or None
-        Of the sensor or the camera, where it has a thermometer; degrees Celsius.
-    settings : mapping
-        All of its settings, by name.
-    """
+    """What a camera says of itself now, and what it offers."""
 
     exposure_ms: float
     gain: float
@@ -62,13 +50,17 @@ class CameraState:
     binning: int
     roi: Roi
     pixel_format: str
+    """As read back."""
     exposure_limits_ms: tuple[float, float]
     gain_limits: tuple[float, float]
     binnings: tuple[int, ...]
     pixel_formats: tuple[str, ...]
     sensor_shape: tuple[int, int]
+    """What it offers."""
     temperature_c: float | None
+    """Of the sensor or the camera, where it has a thermometer; degrees Celsius."""
     settings: Mapping[str, Setting]
+    """All of its settings, by name."""
 
 
 def read_camera(camera: Camera) -> CameraState:
@@ -77,18 +69,9 @@ def read_camera(camera: Camera) -> CameraState:
     temperature = next(
         (v for k, v in settings.items() if "temperature" in k.lower() and isinstance(v, int | float)), None
     )
+    asked = [field.name for field in fields(CameraState) if field.name not in ("temperature_c", "settings")]
     return CameraState(
-        exposure_ms=camera.exposure_ms,
-        gain=camera.gain,
-        black_level=camera.black_level,
-        binning=camera.binning,
-        roi=camera.roi,
-        pixel_format=camera.pixel_format,
-        exposure_limits_ms=camera.exposure_limits_ms,
-        gain_limits=camera.gain_limits,
-        binnings=camera.binnings,
-        pixel_formats=camera.pixel_formats,
-        sensor_shape=camera.sensor_shape,
+        **{name: getattr(camera, name) for name in asked},
         temperature_c=None if temperature is None else float(temperature),
         settings=dict(settings),
     )
@@ -114,19 +97,9 @@ def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
     DeviceError
         Naming the settings that the camera did not take.
     """
-    now = camera_settings(camera)
-    if now["pixel_format"] != wanted["pixel_format"]:
-        camera.set_pixel_format(wanted["pixel_format"])
-    if now["binning"] != wanted["binning"]:
-        camera.set_binning(wanted["binning"])
-    if now["roi"] != list(wanted["roi"]):
-        camera.set_roi(Roi(*wanted["roi"]))
-    if not _same(camera.black_level, wanted["black_level"]):
-        camera.set_black_level(wanted["black_level"])
-    if not _same(now["gain"], wanted["gain"]):
-        camera.set_gain(wanted["gain"])
-    if not _same(now["exposure_ms"], wanted["exposure_ms"]):
-        camera.set_exposure_ms(wanted["exposure_ms"])
+    for name, set_to in _setters(camera).items():
+        if not _same(camera_settings(camera)[name], wanted[name]):
+            set_to(wanted[name])
     now = camera_settings(camera)
     different = [
         f"{name} is {now[name]}, was {wanted[name]}" for name in now if not _same(now[name], wanted[name])
@@ -147,16 +120,8 @@ def apply_table(wanted: CameraTable, camera: Camera) -> None:
     LimitError
         Naming every setting that the camera refuses; the others are set.
     """
-    setters: dict[str, Callable[[Any], object]] = {
-        "pixel_format": camera.set_pixel_format,
-        "binning": camera.set_binning,
-        "roi": lambda roi: camera.set_roi(Roi(*roi)),
-        "black_level": camera.set_black_level,
-        "gain": camera.set_gain,
-        "exposure_ms": camera.set_exposure_ms,
-    }
     refused = []
-    for name, set_to in setters.items():
+    for name, set_to in _setters(camera).items():
         value = getattr(wanted, name)
         if value is None:
             continue
@@ -169,6 +134,18 @@ def apply_table(wanted: CameraTable, camera: Camera) -> None:
     if refused:
         listed = "".join(f"\n  {name}: {error.problem} {error.remedy}".rstrip() for name, error in refused)
         raise LimitError(camera.name, f"does not take {len(refused)} of its configured settings:{listed}")
+
+
+def _setters(camera: Camera) -> dict[str, Callable[[Any], object]]:
+    """Return what sets each setting, in the order in which they depend on each other."""
+    return {
+        "pixel_format": camera.set_pixel_format,
+        "binning": camera.set_binning,
+        "roi": lambda roi: camera.set_roi(Roi(*roi)),
+        "black_level": camera.set_black_level,
+        "gain": camera.set_gain,
+        "exposure_ms": camera.set_exposure_ms,
+    }
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -182,28 +182,21 @@ class SharedConfig:
 
 @dataclass(frozen=True, slots=True)
 class BenchConfig:
-    """A checked ``bench.toml``.
-
-    Attributes
-    ----------
-    path : Path or None
-        The file it was read from; None for the embedded default.
-    text : str
-        The TOML text as it was read, kept with every run.
-    devices : mapping of kind to DeviceConfig
-        Only devices that the bench has.
-    shared : mapping of table name to SharedConfig
-    """
+    """A checked ``bench.toml``."""
 
     path: Path | None
+    """The file it was read from; None for the embedded default."""
     text: str
+    """The TOML text as it was read, kept with every run."""
     bench: BenchTable
     source: SourceTable
     scene: SceneTable
     geometry: GeometryTable
     display: DisplayTable
     devices: Mapping[Kind, DeviceConfig]
+    """Only devices that the bench has."""
     shared: Mapping[str, SharedConfig] = field(default_factory=dict)
+    """By the name of their table."""
 
     @property
     def data_folder(self) -> Path:

@@ -33,29 +33,16 @@ BUILT_IN = "built-in bench.toml"
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def default_text() -> str:
-    """Return the commented default configuration: the simulated bench."""
-    return resources.files("instrument.bench").joinpath("default_bench.toml").read_text("utf-8")
-
-
-def display_text() -> str:
-    """Return the configuration of a simulated holographic display."""
-    return resources.files("instrument.bench").joinpath("display_bench.toml").read_text("utf-8")
-
-
-def led_microscope_text() -> str:
-    """Return the configuration of a simulated LED array microscope."""
-    return resources.files("instrument.bench").joinpath("led_microscope_bench.toml").read_text("utf-8")
+def template(name: str = "default") -> str:
+    """Return a commented configuration: ``default``, the simulated bench; ``display``; ``led_microscope``."""
+    return resources.files("instrument.bench").joinpath(f"{name}_bench.toml").read_text("utf-8")
 
 
 def load_config(path: Path | str | None = None) -> BenchConfig:
     """Read and check a bench configuration without touching any device.
 
-    Parameters
-    ----------
-    path : path, optional
-        The file. None means ``bench.toml`` in the working folder if there is one, otherwise the embedded
-        default, which is the simulated bench (:attr:`BenchConfig.path` is then None).
+    Without a path it is ``bench.toml`` in the working folder if there is one, otherwise the embedded default,
+    which is the simulated bench (:attr:`BenchConfig.path` is then None).
 
     Raises
     ------
@@ -66,7 +53,7 @@ def load_config(path: Path | str | None = None) -> BenchConfig:
     """
     if path is None:
         if not Path(DEFAULT_NAME).exists():
-            return parse_config(default_text(), None)
+            return parse_config(template(), None)
         path = DEFAULT_NAME
     path = Path(path)
     try:

@@ -25,13 +25,7 @@ _UNITS: Mapping[str, tuple[str, float]] = {
 
 
 class Mistakes:
-    """Collects the mistakes of one file, with lines.
-
-    Parameters
-    ----------
-    lines : mapping
-        From :func:`instrument.bench.config_mistakes.key_lines`.
-    """
+    """Collects the mistakes of one file, with lines."""
 
     def __init__(self, lines: Mapping[KeyPath, int]) -> None:
         self._lines = lines
@@ -219,16 +213,9 @@ _STRINGS = tuple(
 def key_lines(text: str) -> dict[KeyPath, int]:
     """Return the line, from 1, of every key, table and array element of a TOML text.
 
-    Parameters
-    ----------
-    text : str
-        A text that ``tomllib`` accepts; of any other text, positions up to its first flaw are returned.
-
-    Returns
-    -------
-    dict
-        ``("camera", "roi", 0)`` to the line where that element begins. A table that several headers or
-        dotted keys build up has the line of its first mention.
+    Of a text that ``tomllib`` does not accept, those up to its first flaw. ``("camera", "roi", 0)`` leads to
+    the line where that element begins; a table that several headers or dotted keys build up has the line of
+    its first mention.
     """
     return _Scanner(text).scan()
 

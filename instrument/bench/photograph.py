@@ -15,7 +15,7 @@ import numpy.typing as npt
 from drivers.camera import Camera
 from drivers.frame import Frame, FrameMetadata
 from drivers.led_array import LedPattern
-from instrument.files.atomic import check_writable
+from instrument.files.atomic import check_writable, require_new
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import check_suffix, read_image, side_car, write_image
 from instrument.files.record import plain, value_of
@@ -30,22 +30,15 @@ Progress = Callable[[int, int], object]
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """One photograph: a frame, or the mean of several.
-
-    Attributes
-    ----------
-    image : ndarray
-        ``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for
-        a single frame, float32 for a mean.
-    metadata : FrameMetadata
-        Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`.
-    average : int
-        Number of frames averaged.
-    """
+    """One photograph: a frame, or the mean of several."""
 
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+    """``(height, width)`` or ``(height, width, 3)`` in counts, read only; the camera's uint8 or uint16 for a
+    single frame, float32 for a mean."""
     metadata: FrameMetadata
+    """Of the last frame, but for what is combined of all: see :meth:`FrameMetadata.of_mean`."""
     average: int
+    """Number of frames averaged."""
 
     @property
     def full_scale(self) -> int:
@@ -178,8 +171,7 @@ def check_photograph_file(target: Path, average: int, *, force: bool = False) ->
     files = [target] if target.suffix.lower() in (".tif", ".tiff") else [target, side_car(target)]
     for file in files:
         check_writable(file)
-        if file.exists() and not force:
-            raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+        require_new(file, overwrite=force)
 
 
 def write_snapshot(

@@ -26,17 +26,7 @@ class SceneSwitch(Protocol):
 
 
 class Lights:
-    """Switches point source and scene, asking the operator where no device can do it.
-
-    Parameters
-    ----------
-    source : SourceTable
-    scene : SceneTable
-    led_array : LedArray, optional
-    scene_switch : SceneSwitch, optional
-    ask : callable, optional
-        None where nobody can be asked.
-    """
+    """Switches point source and scene, asking the operator where no device can do it."""
 
     def __init__(
         self,
@@ -146,17 +136,11 @@ AXES = ("x_um", "y_um", "z_um")
 
 @dataclass(frozen=True, slots=True)
 class SourceMount:
-    """The point source on its stage.
-
-    Attributes
-    ----------
-    stage : Stage
-    offset_um : tuple of float
-        Where the source is, from the diffuser's centre, when every axis reads zero.
-    """
+    """The point source on its stage."""
 
     stage: Stage
     offset_um: Position
+    """Where the source is, from the diffuser's centre, when every axis reads zero."""
 
     @property
     def position_um(self) -> Position:

@@ -42,20 +42,19 @@ def new(
     ] = False,
 ) -> None:
     """Write a commented bench.toml in which every key is explained: the simulated bench to start from."""
-    from instrument.bench.config_file import DEFAULT_NAME, default_text, display_text, led_microscope_text
-    from instrument.files.atomic import write_text
+    from instrument.bench.config_file import DEFAULT_NAME, template
+    from instrument.files.atomic import require_new, write_text
 
     if file.is_dir():
         raise FileError(file, "is a folder.", f"Name a file in it, e.g. {file / DEFAULT_NAME}")
-    if file.exists() and not force:
-        raise FileError(file, "exists already and was left as it is.", "Use --force to overwrite it.")
+    require_new(file, overwrite=force)
     if display and led_microscope:
         raise BenchError("Give --display or --led-microscope, not both.")
-    text, what = default_text(), "bench, with every key explained"
+    text, what = template(), "bench, with every key explained"
     if display:
-        text, what = display_text(), "holographic display"
+        text, what = template("display"), "holographic display"
     if led_microscope:
-        text, what = led_microscope_text(), "LED array microscope"
+        text, what = template("led_microscope"), "LED array microscope"
     write_text(file, text)
     typer.echo(f"Wrote {file}: a SIMULATED {what}.")
     typer.echo(f"Next: diffuserbench check{'' if file == Path(DEFAULT_NAME) else f' --bench {file}'}")

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from instrument.cli.app import App, examples, require_new, saying_what_is_left
+from instrument.cli.app import App, examples, saying_what_is_left
 from instrument.cli.options import Given
 from instrument.cli.progress import one_task
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
 from recon.analysis import AnalysisSettings, Noise
 from recon.base.declare import option
@@ -79,7 +80,7 @@ def analyze(
 
     from calibration_routines.optics.angular_response import load_response
     from instrument.evaluation.analysis_figure import draw_analysis, facts
-    from instrument.files.atomic import whole_file, write_text
+    from instrument.files.atomic import write_text
     from instrument.files.calibration_file import load_calibration
     from instrument.files.figures import save_figure
     from instrument.files.record import plain
@@ -108,8 +109,7 @@ def analyze(
             analysis = analyse(measured, settings, progress=lambda _what, share: advance(share * 100, 100))
         title, subtitle = _titles(measured, folder)
         figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
-        with whole_file(out) as file:
-            save_figure(figure, file)
+        save_figure(figure, out)
         described = {
             "calibration": str(folder.resolve()),
             "simulated": simulated,

@@ -12,12 +12,18 @@ from typing import Annotated
 import typer
 
 from instrument.cli.app import App, BenchOption, examples, open_and_say
-from instrument.files.atomic import write_text
+from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError, duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
-from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
-from instrument.plan.model import load_plan, save_plan
-from instrument.plan.patterns import LED_PATTERNS, led_shape, pattern_help, shape_from_text
+from instrument.plan.model import illumination_plan, load_plan, save_plan
+from instrument.plan.patterns import (
+    LED_PATTERNS,
+    group_lights,
+    groups_from_text,
+    led_shape,
+    pattern_help,
+    shape_from_text,
+)
 from instrument.runs.acquire import abilities_of
 from recon.base.declare import option
 
@@ -121,8 +127,7 @@ def new(
     """Write a commented plan to start from."""
     if file.suffix.lower() != ".toml":
         raise FileError(file, "the commented plan is TOML; choose a name that ends in .toml.")
-    if file.exists():
-        raise FileError(file, "exists already and was left as it is.")
+    require_new(file)
     write_text(file, (files("instrument.plan") / "example.toml").read_text())
     typer.echo(f"Wrote {file}. Look at it with: diffuserbench plan show {file}")
 
@@ -151,8 +156,7 @@ def illumination(
         raise BenchError("Give the patterns either as --groups, --lattice N or --pattern NAME (one of them).")
     if file.suffix.lower() not in (".toml", ".json"):
         raise FileError(file, "a plan's name ends in .toml or .json.")
-    if file.exists():
-        raise FileError(file, "exists already and was left as it is.")
+    require_new(file)
     if groups is not None:
         lights = group_lights(groups, level)
     else:

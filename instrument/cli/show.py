@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibration_routines.display.hologram_photograph import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
 from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say
 from instrument.cli.options import Given
+from instrument.display.hologram import HOLOGRAM, PHOTOGRAPHED, CaptureOptions
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError, FileError
 from recon.base.declare import option
 
@@ -83,10 +84,10 @@ class ShowOptions(CaptureOptions, _Shown):
         capture = self.capture
         if (capture is None) != (self.target is None):
             raise BenchError("Give --capture FILE and --target FILE together.")
-        if capture is not None and (capture.exists() and not self.force):
-            raise FileError(capture, "exists already.", "Choose another name, or overwrite with --force.")
-        if capture is not None and capture.suffix.lower() != ".png":
-            raise FileError(capture, "a capture is written as .png.")
+        if capture is not None:
+            require_new(capture, overwrite=self.force)
+            if capture.suffix.lower() != ".png":
+                raise FileError(capture, "a capture is written as .png.")
         if self.as_is and capture is None:
             raise BenchError("--as-is goes with --capture: without it no light is switched and nobody asked.")
         if self.refine and (capture is None or n_patterns > 1):

@@ -113,11 +113,9 @@ def _make(folder: Path) -> None:
 
 def _draw(record: dict[str, object], picture: Path) -> None:
     from instrument.evaluation.figures import map_figure
-    from instrument.files.atomic import whole_file
     from instrument.files.figures import save_figure
 
-    with whole_file(picture) as temporary:
-        save_figure(map_figure(record), temporary)
+    save_figure(map_figure(record), picture)
 
 
 def _redraw(out: Path, names: list[str] | None, *, shipped: bool) -> None:

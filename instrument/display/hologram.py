@@ -17,7 +17,7 @@ from instrument.bench.config import BenchConfig
 from instrument.files.errors import BenchError, FileError
 from instrument.files.images import read_image
 from instrument.files.record import RecordFormat, plain, value_of
-from recon.base.declare import record
+from recon.base.declare import option, record
 from recon.holography import (
     DcTerm,
     Display,
@@ -44,24 +44,35 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.float64]
 
 
+HOLOGRAM, PHOTOGRAPHED = "hologram", "Photographed, with --capture"
+"""What options of photographs are about, and their heading."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How a hologram is photographed."""
+
+    average: int = option(4, least=1, help="Photographs a frame.", applies=(HOLOGRAM,), group=PHOTOGRAPHED)
+    refine: int = option(
+        0,
+        least=0,
+        help="Rounds with the camera in the loop; writes PATTERN-refined.png.",
+        applies=(HOLOGRAM,),
+        group=PHOTOGRAPHED,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class HologramResult:
-    """A hologram and what will be seen of it, plane by plane.
-
-    Attributes
-    ----------
-    hologram : Hologram
-    wanted, seen, unfiltered : tuple of ndarray
-        Target and image through the eye's low-pass, and the image before it, in units of the target's white.
-    scores : tuple of Scores
-        Alias-free, with the envelope that was asked for and all frames.
-    """
+    """A hologram and what will be seen of it, plane by plane."""
 
     hologram: Hologram
     wanted: tuple[Image, ...]
     seen: tuple[Image, ...]
     unfiltered: tuple[Image, ...]
+    """Target and image through the eye's low-pass, and the image before; in units of the target's white."""
     scores: tuple[Scores, ...]
+    """Alias-free, with the envelope that was asked for and all frames."""
 
     def facts(self, options: HologramOptions) -> dict[str, Any]:
         """Return metrics and options, JSON-compatible."""
@@ -119,7 +130,6 @@ def prepare_target(
         Intensity; 0 is black, an integer type's greatest value (float: the maximum) is white.
     options : HologramOptions
         Its ``fit``, ``srgb`` and ``envelope``.
-    z_mm : float
     """
     options = options or HologramOptions()
     image = field_picture(pixels, fit=options.fit, srgb=options.srgb)
@@ -202,15 +212,8 @@ def bench_display(
 ) -> Display:
     """Return the display that ``[display]`` describes.
 
-    Parameters
-    ----------
-    config : BenchConfig
-    size : ((int, int), float)
-        The SLM's shape and pitch, from :func:`slm_size`.
-    expansion : int, optional
-        Another étendue expansion than the bench's, with a random mask of its own.
-    wavelength_nm : float, optional
-        Another wavelength; the mask keeps its height.
+    ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
+    random mask of its own; with another wavelength the mask keeps its height.
 
     Raises
     ------
@@ -289,31 +292,21 @@ ALIGNMENT = RecordFormat(
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Where the mask was found.
-
-    Attributes
-    ----------
-    pose : Pose
-        Left over with the stage at ``stage_position``.
-    error : mapping of parameter name to float
-        Standard uncertainties.
-    rest : ndarray, float64, (rows, columns, 2)
-        Smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask pixels.
-    efficiency : float
-        Spot brightness over the model's ideal.
-    stage_position : mapping of axis name to float
-        Where the stage was.
-    mask_shape : (int, int)
-        Of the mask that it holds for, in pixels.
-    simulated : bool
-    """
+    """Where the mask was found."""
 
     pose: Pose
+    """Left over with the stage at ``stage_position``."""
     error: Mapping[str, float]
+    """Standard uncertainties, by the name of the pose's parameter."""
     rest: npt.NDArray[np.float64]
+    """(rows, columns, 2): smooth displacement beyond the pose's, on the nodes of ``Pose.displacement``, mask
+    pixels."""
     efficiency: float
+    """Spot brightness over the model's ideal."""
     stage_position: Mapping[str, float]
+    """Where the stage was, by the names of its axes."""
     mask_shape: tuple[int, int]
+    """Of the mask that it holds for, in pixels."""
     simulated: bool
 
     def of(self, display: Display) -> Display:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instrument.display.hologram import HologramResult
-from instrument.files.atomic import whole_file, write_text
+from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import side_car, write_image
@@ -51,9 +51,8 @@ class HologramFiles:
             raise FileError(self.out, f"{kind} pattern is written as {expected}.")
         if not self.out.parent.is_dir():
             raise FileError(self.out.parent, "there is no such folder.")
-        existing = [file for file in self.files() if file.exists()]
-        if existing and not overwrite:
-            raise FileError(existing[0], "exists already.", "Choose another name, or overwrite with --force.")
+        for file in self.files():
+            require_new(file, overwrite=overwrite)
 
     def label(self, number: int, channel: int) -> str:
         """Return which pattern it is, for bar and report."""
@@ -163,8 +162,7 @@ def write_hologram_figure(
         "seconds of optimisation",
     )
     summary = Summary(title, panels, convergence, sweep=strip, lines=facts, simulated=True)
-    with whole_file(path) as temporary:
-        save_figure(summary_figure(summary), temporary)
+    save_figure(summary_figure(summary), path)
 
 
 def _detail(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -194,20 +192,15 @@ def write_alignment_figure(
 
     Parameters
     ----------
-    path : Path
     displacement, rest : ndarray, (rows, columns, 2)
         Of the pose, and the smooth rest; mask pixels on nodes from edge to edge of the mask.
     mask_shape : (int, int)
     efficiencies : sequence of (int, float)
         Frames taken, and spot brightness over the model's ideal.
-    title : str
-    simulated : bool
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 4.4), dpi=100, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     left, middle, right = figure.subplots(1, 3, width_ratios=[1, 1.3, 1.3])
     frames, values = zip(*efficiencies, strict=True)
     left.plot(frames, values, "o-", color="#00798c")
@@ -230,8 +223,7 @@ def write_alignment_figure(
         axes.invert_yaxis()
         axes.set_title(f"{words}: {np.sqrt(np.mean(size**2)):.2f} mask pixels rms", loc="left")
     figure.suptitle(title + ("   SIMULATED" if simulated else ""), x=0.01, ha="left")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)
 
 
 def expansions_of(cells: Sequence[Cell]) -> list[int]:
@@ -282,12 +274,10 @@ def write_csv(path: Path, cells: Sequence[Cell]) -> None:
 
 def write_chart(path: Path, cells: Sequence[Cell], note: str) -> None:
     """Draw PSNR by method, whole field above and middle quarter below; errors as ``whole_file``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     found = expansions_of(cells)
     figure = Figure(figsize=(4.6 * len(found), 8.0), dpi=100, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(found), squeeze=False, sharey="row")
     looks = (
         ("printed in the dissertation", "#8496a5", "D"),
@@ -310,5 +300,4 @@ def write_chart(path: Path, cells: Sequence[Cell], note: str) -> None:
                 ax.set_ylabel("PSNR of the low-passed image, dB")
     figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.suptitle(f"Table 7.1 (computed). {note}", x=0.01, ha="left", fontsize=11)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary)
+    save_figure(figure, path)

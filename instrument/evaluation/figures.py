@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from instrument.evaluation.chart import ChartData, colours_of, in_words, title_of
-from instrument.files.atomic import whole_file, write_text
+from instrument.files.atomic import write_text
 from instrument.files.figures import save_figure
 from recon.evaluation.scored import MEMORY, Axis, Kind, Point, is_known, pareto
 
@@ -158,8 +158,7 @@ _SAME_PLACE = (0.02, 0.03)
 def write_charts(folder: Path, data: ChartData) -> tuple[Path, ...]:
     """Write chart.png, chart.html and chart.csv into a folder; return their paths."""
     picture, page, table = (folder / f"chart.{kind}" for kind in ("png", "html", "csv"))
-    with whole_file(picture) as temporary:
-        save_figure(chart_figure(data), temporary)
+    save_figure(chart_figure(data), picture)
     write_text(page, chart_page(data))
     write_text(table, data.to_csv())
     return picture, page, table

@@ -87,6 +87,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def require_new(path: Path, *, overwrite: bool | None = None) -> None:
+    """Refuse to write over what exists, unless it may be overwritten; None: no option would allow it.
+
+    Raises
+    ------
+    FileError
+    """
+    if path.exists() and not overwrite:
+        remedy = "" if overwrite is None else "Choose another name, or overwrite with --force."
+        raise FileError(path, "exists already and was left as it is.", remedy)
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write UTF-8 text; errors as ``whole_file``."""
     write_bytes(path, text.encode())
@@ -112,12 +124,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 def check_writable(path: Path | str, n_bytes: int = 0) -> None:
     """Refuse a file that could not be written, before the work that would fill it.
 
-    Parameters
-    ----------
-    path : path
-        The file to be.
-    n_bytes : int
-        Its expected size; the disk must have that much room.
+    The disk must have room for ``n_bytes``.
 
     Raises
     ------

@@ -51,18 +51,8 @@ CALIBRATION = RecordFormat(
 def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite: bool = False) -> Path:
     """Write ``calibration`` as a folder, whole or not at all.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    folder : path
-        Made by this call; its parent is made as well where missing.
-    overwrite : bool
-        Replace a calibration already there (never anything else).
-
-    Returns
-    -------
-    Path
-        The folder written.
+    The folder, and its parent where missing, is made by this call, and returned. ``overwrite`` replaces a
+    calibration already there, never anything else.
 
     Raises
     ------

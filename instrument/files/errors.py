@@ -82,11 +82,7 @@ class ConfigProblem:
 class ConfigError(BenchError):
     """A configuration file with mistakes: all of them, in the order of their lines.
 
-    Parameters
-    ----------
-    path : path or str
-        The file, or a name for a text that is no file.
-    problems : sequence of ConfigProblem
+    ``path`` is the file, or a name for a text that is no file.
     """
 
     def __init__(self, path: Path | str, problems: Sequence[ConfigProblem]) -> None:
@@ -153,6 +149,19 @@ def size(n_bytes: float) -> str:
 def count(number: int, noun: str) -> str:
     """Return how many of something there are: ``1 frame``, ``2 frames``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def ranges(numbers: Sequence[int], most: int | None = None) -> str:
+    """Return ascending numbers for people: ``0-7, 9``; of more than ``most`` pieces only how many follow."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs[:most])
+    left = sum(b - a + 1 for a, b in runs[len(runs) if most is None else most :])
+    return f"{text} and {left} more" if left else text
 
 
 def duration(seconds: float) -> str:

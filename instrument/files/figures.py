@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+from instrument.files.atomic import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,12 +115,14 @@ def summary_figure(summary: Summary) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path | str) -> Path:
-    """Write a figure as PNG (or what the name's ending says) and return its path."""
+    """Write a figure, whole or not at all, as PNG (or what the name's ending says) and return its path.
+
+    Errors as ``whole_file``.
+    """
     target = Path(path)
-    if target.suffix.lower() == ".png":
-        figure.savefig(target, pil_kwargs={"optimize": True})
-    else:  # other writers do not know the option, not even as None
-        figure.savefig(target)
+    optimised: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if target.suffix.lower() == ".png" else {}
+    with whole_file(target) as temporary:  # other writers do not know the option, not even as None
+        figure.savefig(temporary, **optimised)
     return target
 
 

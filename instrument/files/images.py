@@ -31,23 +31,15 @@ _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """What was read from an image file.
-
-    Attributes
-    ----------
-    path : Path
-    pixels : ndarray
-        One image, or a stack with the images along the first axis; see the module.
-    notes : tuple of str
-        What reading left out or converted, in sentences without full stop.
-    metadata : mapping
-        What :func:`write_image` kept with the image; empty for images from elsewhere.
-    """
+    """What was read from an image file."""
 
     path: Path
     pixels: Pixels
+    """One image, or a stack with the images along the first axis; see the module."""
     notes: tuple[str, ...] = ()
+    """What reading left out or converted, in sentences without full stop."""
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    """What :func:`write_image` kept with the image; empty for images from elsewhere."""
 
     @property
     def is_simulated(self) -> bool:

@@ -40,39 +40,27 @@ Unknown = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class RecordFormat:
-    """One format of JSON records.
-
-    Attributes
-    ----------
-    name : str
-        As ``"format"`` has it.
-    thing : str
-        What such a file holds, for sentences: ``"mask alignment"``.
-    major, minor : int
-        The version that is written.
-    make, restore : str
-        What to do where there is none, and where one is damaged.
-    migrate : mapping of int to callable
-        From the major version that a record has to the next: takes its fields and returns them changed.
-    fields : sequence of str, optional
-        Every field that is known at the top; None where a record carries any further facts.
-    error : type of FileError
-        Raised for whatever is wrong with a file.
-    numbered_before, unnamed_before : bool
-        Whether files of before named no format, and had the version as ``"format"`` or nothing there.
-    """
+    """One format of JSON records."""
 
     name: str
+    """As ``"format"`` has it."""
     thing: str
+    """What such a file holds, for sentences: ``"mask alignment"``."""
     major: int = 1
     minor: int = 0
+    """The version that is written."""
     make: str = ""
     restore: str = ""
+    """What to do where there is none, and where one is damaged."""
     migrate: Mapping[int, Migration] = dataclasses.field(default_factory=dict)
+    """From the major version that a record has to the next: takes its fields and returns them changed."""
     fields: Sequence[str] | None = None
+    """Every field that is known at the top; None where a record carries any further facts."""
     error: type[FileError] = FileError
+    """Raised for whatever is wrong with a file."""
     numbered_before: bool = False
     unnamed_before: bool = False
+    """Whether files of before named no format, and had the version as ``"format"`` or nothing there."""
 
     # Writing -------------------------------------------------------------------------------------
     def stamped(self, fields: Mapping[str, Any]) -> Fields:
@@ -141,7 +129,7 @@ class RecordFormat:
             for old in range(major, self.major):
                 fields = self.migrate[old](fields)
         if self.fields is not None:
-            self.tell_unknown(path, [name for name in fields if name not in self.fields])
+            self.warn_unknown(path, [name for name in fields if name not in self.fields])
         elif (major, minor) > (self.major, self.minor):
             _say(path, f"is of version {version}, newer than this program's: what is new in it is left out.")
         return fields
@@ -157,10 +145,10 @@ class RecordFormat:
         unknown: Unknown = {}
         with self.damaged(path):
             value = value_of(kind, fields, unknown)
-        self.tell_unknown(path, list(unknown))
+        self.warn_unknown(path, list(unknown))
         return value
 
-    def tell_unknown(self, path: Path, names: Sequence[str]) -> None:
+    def warn_unknown(self, path: Path, names: Sequence[str]) -> None:
         """Say once that a file has fields which this program does not know."""
         if names:
             _say(path, f"holds {', '.join(map(repr, names))}, which this program does not know: left out.")
@@ -225,7 +213,6 @@ def value_of(kind: type[T], data: Any, unknown: Unknown | None = None) -> T:
     kind : type
         A dataclass, or what its fields may be: numbers, strings, dates, paths, enumerations, tuples, lists,
         mappings, arrays, other dataclasses, and any of these or None.
-    data
     unknown : dict, optional
         Takes the fields that no dataclass here has, by dotted name; without it they are left out silently.
 

@@ -26,18 +26,12 @@ SLM_CALIBRATION = RecordFormat(
 
 @dataclass(frozen=True, slots=True)
 class SlmCorrection:
-    """How one SLM answers.
-
-    Attributes
-    ----------
-    phase_of_level_rad : ndarray, float64, (256,)
-        Phase that each level really gives, relative to level 0.
-    flatness_rad : ndarray, float64, (height, width), or None
-        Phase error over the SLM at any sampling, to be taken off.
-    """
+    """How one SLM answers."""
 
     phase_of_level_rad: npt.NDArray[np.float64]
+    """(256,): phase that each level really gives, relative to level 0."""
     flatness_rad: npt.NDArray[np.float64] | None = None
+    """(height, width): phase error over the SLM at any sampling, to be taken off."""
 
     @classmethod
     def ideal(cls) -> SlmCorrection:
@@ -83,13 +77,6 @@ class SlmCorrection:
 
 def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrection | None = None) -> None:
     """Show ideal levels (256 a turn) on an SLM, through its calibration where there is one.
-
-    Parameters
-    ----------
-    slm : Slm
-        Open.
-    levels : ndarray, uint8, of the SLM's shape
-    correction : SlmCorrection, optional
 
     Raises
     ------

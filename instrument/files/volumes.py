@@ -35,10 +35,7 @@ def middle_step_um(z_um: npt.NDArray[np.float64]) -> float:
 def uneven_steps(z_um: npt.NDArray[np.float64]) -> str:
     """Say that planes are not evenly spaced, and which step an OME file has; empty where they are.
 
-    Parameters
-    ----------
-    z_um : ndarray, float64, (n_z,)
-        Depths of the planes, ascending or descending; not finite where they are not known.
+    ``z_um``, (n_z,), are the planes' depths, ascending or descending; not finite where they are not known.
     """
     steps = np.abs(np.diff(z_um))
     if len(steps) < 2 or not np.isfinite(steps).all() or np.ptp(steps) <= EVEN * steps.min():
@@ -201,7 +198,6 @@ class VolumeSource:
         ``read(z, y, x)`` takes slices or numbers and returns (..., n_channels); the finest level first.
     shapes : sequence of (int, int, int)
         ``(n_z, height, width)`` of each level.
-    n_channels : int
     """
 
     def __init__(

@@ -30,36 +30,26 @@ LOOPS: tuple[Loop, ...] = ("repeat", "position", "slm", "light", "exposure")
 
 
 class Part(PlanData):
-    """One part of a plan: the product of its loops, the first in ``order`` slowest.
-
-    Attributes
-    ----------
-    label : str
-        What the frames are, for whoever analyses them: ``"dark"``, ``"psf"``, ``"scene"`` ...
-    positions
-        Where the source or the stage goes; None leaves it where it is.
-    light, slm_images, exposures_ms, gains
-        What the other loops run over. An empty tuple leaves the device as it is; SLM images are files
-        (8-bit grey levels), relative paths seen from the plan's file. Exposure and gain run together when
-        both have the same number of values; one gain serves all exposures.
-    scene_lit : bool
-        Whether the scene (screen, sample) glows.
-    average : int
-        Frames averaged into the one that is stored.
-    repeats : int
-        How often all of it is done again; ``interval_s`` is the time from start to start of a repeat
-        (0: at once).
-    """
+    """One part of a plan: the product of its loops, the first in ``order`` slowest."""
 
     label: Label
+    """What the frames are, for whoever analyses them: ``"dark"``, ``"psf"``, ``"scene"`` ..."""
     positions: Positions | None = None
+    """Where the source or the stage goes; None leaves it where it is."""
     light: tuple[Light, ...] = (OFF,)
     slm_images: tuple[Path, ...] = ()
     exposures_ms: tuple[PositiveFloat, ...] = ()
     gains: tuple[PositiveFloat, ...] = ()
+    """As light, SLM images and exposures, what loops run over; empty: the device stays as it is. Images are
+    files (8-bit grey levels), relative paths seen from the plan's file. Exposure and gain run together when
+    both have the same number of values; one gain serves all exposures."""
     scene_lit: bool = False
+    """Whether the scene (screen, sample) glows."""
     average: int = Field(default=1, ge=1, le=65_536)
+    """Frames averaged into the one that is stored."""
     repeats: int = Field(default=1, ge=1)
+    """How often all of it is done again; ``interval_s`` is the time from start to start of a repeat (0: at
+    once)."""
     interval_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
     order: tuple[Loop, ...] = LOOPS
 
@@ -309,14 +299,7 @@ def _leave_out(data: Any, location: Sequence[int | str]) -> None:
 
 
 class PlanError(BenchError):
-    """A plan that cannot be carried out: every reason at once. Nothing has moved.
-
-    Parameters
-    ----------
-    name : path or str
-        The plan's file or label.
-    problems : sequence of str
-    """
+    """A plan that cannot be carried out: every reason at once. Nothing has moved."""
 
     def __init__(self, name: Path | str, problems: Sequence[str]) -> None:
         self.name = name
@@ -404,3 +387,32 @@ def _toml(value: Any) -> str:
         return "[" + ", ".join(map(_toml, value)) + "]"
     # Strings, numbers and booleans are written alike in both; a TOML basic string takes JSON's escapes.
     return json.dumps(value, ensure_ascii=False)
+
+
+# Active illumination ---
+DARK, PATTERN = "dark", "pattern"
+"""What the frames of such a plan are called."""
+
+
+def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: int = 1) -> Plan:
+    """Return a plan that photographs the scene in each light in turn, and once in the dark.
+
+    The frames of its part ``"pattern"``, less the one of its part ``"dark"``, are what
+    :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
+    :mod:`instrument.reconstruction.patterned` reads them from runs.
+
+    Raises
+    ------
+    BenchError
+        When there is no light.
+    """
+    if not lights:
+        raise BenchError("Active illumination needs patterns, each with one LED at least.")
+    exposures = (exposure_ms,)
+    return Plan(
+        label="active illumination",
+        parts=(
+            Part(label=DARK, light=(OFF,), exposures_ms=exposures, average=average),
+            Part(label=PATTERN, light=tuple(lights), exposures_ms=exposures, average=average),
+        ),
+    )

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import whole_file
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.job import Job
@@ -154,8 +153,7 @@ def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: in
     FileError, OSError
         When it cannot be written.
     """
-    with whole_file(path) as temporary:
-        save_figure(summary_figure(_summary(result, job, rotate_deg)), temporary)
+    save_figure(summary_figure(_summary(result, job, rotate_deg)), path)
 
 
 def _summary(result: Reconstruction, job: Job, rotate_deg: int) -> Summary:

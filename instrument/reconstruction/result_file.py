@@ -212,8 +212,7 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
         write_volume_zarr(outputs.image, result.volume, result.grid, about)
     else:
         _write_tiff(outputs.image, result)
-    with whole_file(outputs.preview) as temporary:
-        save_figure(volume_figure(result, simulated=job.simulated), temporary)
+    save_figure(volume_figure(result, simulated=job.simulated), outputs.preview)
     _write_record(outputs.record, reconstruction_record(result, job, volume=True))
 
 

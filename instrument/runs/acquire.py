@@ -30,19 +30,9 @@ def acquire(
 ) -> Run:
     """Check a plan, carry it out and return the run.
 
-    Parameters
-    ----------
-    bench : Bench
-        Open.
-    plan : Plan
-    folder : path, optional
-        Where the run's folder is made; None means the bench's own data folder.
-    on_progress : callable, optional
-        Called with a :class:`~instrument.runs.runner.RunStatus` after every step.
-    calibrations : sequence of str
-        Identifiers of the calibrations in use, kept with the run.
-    control : RunControl, optional
-        To pause, abort or stop the run from another thread.
+    The run's folder is made in ``folder`` (None: the bench's own data folder). ``on_progress`` is called
+    after every step; the identifiers of ``calibrations`` in use are kept with the run; ``control`` pauses,
+    aborts or stops it from another thread.
 
     Raises
     ------
@@ -149,30 +139,20 @@ def there_now(folder: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class RunFindings:
-    """What was found in a run's folder before it is continued.
-
-    Attributes
-    ----------
-    condition : RunCondition
-        How the run was left.
-    stored : int
-        Frames that are on the disk as they were written; none of them is taken again.
-    todo : tuple of int
-        Steps whose data are not safely stored, in order.
-    damaged : tuple of DamagedFrame
-        Frames among them that the log calls written, but that are not as they were.
-    torn_bytes : int
-        Length of the half line that a crash left at the end of the log.
-    unlogged : int
-        Frames among them whose image had reached the disk, but not their line in the log.
-    """
+    """What was found in a run's folder before it is continued."""
 
     condition: RunCondition
+    """How the run was left."""
     stored: int
+    """Frames that are on the disk as they were written; none of them is taken again."""
     todo: tuple[int, ...]
+    """Steps whose data are not safely stored, in order."""
     damaged: tuple[DamagedFrame, ...] = ()
+    """Frames among them that the log calls written, but that are not as they were."""
     torn_bytes: int = 0
+    """Length of the half line that a crash left at the end of the log."""
     unlogged: int = 0
+    """Frames among them whose image had reached the disk, but not their line in the log."""
 
     def __str__(self) -> str:
         lines = [f"{self.condition}: {self.stored} frames safely stored, {len(self.todo)} to do"]
@@ -189,12 +169,7 @@ class RunFindings:
 def inspect(run: Run, on_progress: Progress | None = None) -> RunFindings:
     """Read every frame that a run's log calls written, and say what is left to do.
 
-    Parameters
-    ----------
-    run : Run
-        Of a plan.
-    on_progress : callable, optional
-        Called with frames read and frames to read.
+    ``on_progress`` is called with frames read and frames to read.
 
     Raises
     ------
@@ -228,19 +203,10 @@ def prepare_resume(
 ) -> tuple[Runner, RunFindings]:
     """Verify a run and return the runner of the steps that are left, with what was found.
 
-    The camera gets the settings that it had when the run began. Settings that the plan left as they were
-    are brought back as the steps before had them.
-
-    Parameters
-    ----------
-    bench : Bench
-        Open; as a rule from the run's own ``bench.toml``.
-    path : path
-        The run's folder.
-    on_verify : callable, optional
-        Called with frames verified and frames to verify.
-    on_progress : callable, optional
-        As in :func:`instrument.runs.acquire.acquire`.
+    The camera gets the settings that it had when the run began. Settings that the plan left as they were are
+    brought back as the steps before had them. The bench is as a rule opened from the run's own
+    ``bench.toml``. ``on_verify`` is called with frames verified and frames to verify, ``on_progress`` as in
+    :func:`acquire`.
 
     Raises
     ------

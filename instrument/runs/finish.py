@@ -7,7 +7,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 from instrument.bench.bench import Bench
@@ -39,12 +39,7 @@ class CtrlC:
             signal.signal(signal.SIGINT, self._note)
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _type: object, exc: BaseException | None, _traceback: object) -> None:
         if self._previous is not None:
             signal.signal(signal.SIGINT, self._previous)
         if exc is None:
@@ -113,10 +108,8 @@ def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseEx
 
     Parameters
     ----------
-    bench : Bench
     writer : RunWriter
         Closed afterwards.
-    reason : FinishReason
     error : BaseException, optional
         What ended the acquisition. It gets notes on what failed here and on where the run is, and stays the
         error that matters, also when Ctrl-C is pressed meanwhile.
@@ -151,7 +144,7 @@ def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseExcep
     try:
         try_all(
             [
-                ("bench made safe", bench.safe_state),
+                ("bench made safe", bench.stop),
                 ("run finished", lambda: ended.append(writer.finish(reason, text))),
             ]
         )

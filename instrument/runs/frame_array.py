@@ -86,11 +86,6 @@ class FrameArray:
 
     On the disk the axes are ``t, y, x`` for grey and ``t, c, y, x`` for colour frames (OME-Zarr's order);
     :meth:`write` takes and :meth:`read` returns ``(height, width)`` or ``(height, width, 3)``.
-
-    Parameters
-    ----------
-    path : Path
-        Folder of the OME-Zarr group, e.g. ``frames.ome.zarr``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -126,14 +121,8 @@ class FrameArray:
     ) -> FrameArray:
         """Make an array without frames.
 
-        Parameters
-        ----------
-        frame_shape : tuple of int
-            ``(height, width)`` or ``(height, width, 3)``.
-        dtype
-            uint8, uint16 or float32.
-        pixel_pitch_um : float
-            Pitch of the stored pixels on the sensor, micrometres.
+        ``frame_shape`` is ``(height, width)`` or ``(height, width, 3)``, the type uint8, uint16 or float32;
+        the pitch that of stored pixels on the sensor, micrometres.
         """
         data_type = np.dtype(dtype).name
         if data_type not in _DTYPES:

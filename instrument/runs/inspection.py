@@ -8,27 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import Progress
-from instrument.files.atomic import whole_file
+from instrument.files.errors import ranges
+from instrument.files.figures import save_figure
 from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What reading a whole run found.
-
-    Attributes
-    ----------
-    frames : int
-        Frames that are as they were written.
-    damaged : tuple of DamagedFrame
-        Frames that the log calls written and that are not as they were.
-    problems : tuple of str
-        Whatever else contradicts itself.
-    """
+    """What reading a whole run found."""
 
     frames: int
+    """Frames that are as they were written."""
     damaged: tuple[DamagedFrame, ...]
+    """Frames that the log calls written and that are not as they were."""
     problems: tuple[str, ...]
+    """Whatever else contradicts itself."""
 
     @property
     def is_sound(self) -> bool:
@@ -50,15 +44,15 @@ def _contradictions(run: Run) -> list[str]:
     if run.torn_bytes:
         problems.append(f"the log ends in a half line of {run.torn_bytes} bytes")
     if run.reason is FinishReason.COMPLETED and run.plan is not None and run.missing():
-        problems.append(f"marked as completed, but frames {_few(run.missing())} are not there")
+        problems.append(f"marked as completed, but frames {ranges(run.missing(), 8)} are not there")
     beyond = [index for index in run.records if not 0 <= index < run.n_frames]
     if beyond:
-        problems.append(f"the log has frames {_few(beyond)}, beyond the plan's {run.n_frames}")
+        problems.append(f"the log has frames {ranges(beyond, 8)}, beyond the plan's {run.n_frames}")
     gaps = [index for gap in run.gaps for index in range(gap.first, gap.first + gap.count)]
     if both := sorted(set(gaps) & set(run.records)):
-        problems.append(f"frames {_few(both)} are both stored and lost")
+        problems.append(f"frames {ranges(both, 8)} are both stored and lost")
     if run.plan is None and (nowhere := sorted(set(run.missing()) - set(gaps))):
-        problems.append(f"frames {_few(nowhere)} are neither stored nor accounted for as lost")
+        problems.append(f"frames {ranges(nowhere, 8)} are neither stored nor accounted for as lost")
     if run.has_frames:
         problems += _array_contradictions(run)
     if run.plan is not None:
@@ -84,11 +78,6 @@ def _array_contradictions(run: Run) -> list[str]:
                 f"frame {index}: its region {roi} at binning {binning} is not {height} x {width} pixels"
             )
     return problems
-
-
-def _few(indices: list[int]) -> str:
-    text = ", ".join(map(str, indices[:8]))
-    return text if len(indices) <= 8 else f"{text} and {len(indices) - 8} more"
 
 
 COLUMNS, ROWS = 4, 3
@@ -129,8 +118,7 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
             fontsize=8,
         )
         axes.set_axis_off()
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
+    save_figure(figure, path)
     return indices
 
 
@@ -149,26 +137,15 @@ def _shown(run: Run, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.floa
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """One run of a folder.
-
-    Attributes
-    ----------
-    path : Path
-    condition : RunCondition or None
-        None when it cannot be read; ``problem`` says why.
-    label : str
-    stored, frames : int
-        Frames on the disk, and those that belong to it.
-    is_recording : bool
-    is_simulated : bool
-    problem : str
-    """
+    """One run of a folder."""
 
     path: Path
     condition: RunCondition | None = None
+    """None when it cannot be read; ``problem`` says why."""
     label: str = ""
     stored: int = 0
     frames: int = 0
+    """Frames on the disk, and those that belong to it."""
     is_recording: bool = False
     is_simulated: bool = False
     problem: str = ""

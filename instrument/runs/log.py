@@ -16,27 +16,18 @@ from instrument.files.record import plain, value_of
 
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
-    """A frame that is on the disk.
-
-    Attributes
-    ----------
-    index : int
-        Place in the image array: index of the plan's step, or number of the recording's frame.
-    n_bytes, crc32 : int
-        Size and CRC-32 of its chunk's file.
-    average : int
-        Number of exposures whose mean it is.
-    metadata : FrameMetadata
-    unknown : mapping
-        Metadata that a newer version of this program has added: kept, and not used.
-    """
+    """A frame that is on the disk."""
 
     index: int
+    """Place in the image array: index of the plan's step, or number of the recording's frame."""
     n_bytes: int
     crc32: int
+    """Size and CRC-32 of its chunk's file."""
     average: int
+    """Number of exposures whose mean it is."""
     metadata: FrameMetadata
     unknown: Mapping[str, Any] = field(default_factory=dict)
+    """Metadata that a newer version of this program has added: kept, and not used."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the log line."""
@@ -65,21 +56,14 @@ class FrameRecord:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Frames of a recording that are lost: those from ``first`` on, and why.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first frame lost.
-    by_device : int
-        Frames that the camera or its driver lost.
-    not_written : int
-        Frames that came while the disk was too slow.
-    """
+    """Frames of a recording that are lost: those from ``first`` on, and why."""
 
     first: int
+    """Number of the first frame lost."""
     by_device: int
+    """Frames that the camera or its driver lost."""
     not_written: int
+    """Frames that came while the disk was too slow."""
 
     @property
     def count(self) -> int:

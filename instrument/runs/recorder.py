@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from drivers.common.stream import FrameStream
 from drivers.common.stream_reader import StreamReader
@@ -22,32 +23,42 @@ from instrument.runs.finish import end_run
 from instrument.runs.log import Gap
 from instrument.runs.run import FinishReason, Run, RunError
 from instrument.runs.writer import FrameToStore, RunWriter
+from recon.base.declare import option, with_overrides
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions:
+    """How long a recording goes on (whichever end comes first), and what it is called."""
+
+    seconds: float | None = option(
+        None, help="How long.", unit="s", least=0, flags=("--seconds", "-s"), group="Camera"
+    )
+    n_frames: int | None = option(
+        None, help="How many frames, lost ones counted.", least=1, flags=("--frames", "-n"), group="Camera"
+    )
+    n_buffers: int | None = option(
+        None,
+        help="Frames that may wait in memory for the disk.",
+        default_words="what fits into 256 MB",
+        least=16,
+        flags=("--buffers",),
+        group="Camera",
+    )
+    label: str = option("recording", help="Becomes part of the folder's name.", group="Files")
 
 
 def record(
     bench: Bench,
     folder: Path | str | None = None,
+    options: RecordingOptions | None = None,
     *,
-    label: str = "recording",
-    n_frames: int | None = None,
-    seconds: float | None = None,
-    n_buffers: int | None = None,
     on_progress: Callable[[RecordingStatus], None] | None = None,
+    **overrides: Any,
 ) -> Run:
     """Record a camera's stream into a new run; see :class:`Recorder`.
 
-    Parameters
-    ----------
-    bench : Bench
-        Open; light, stage and SLM stay as they are until the end, when the bench is made safe.
-    folder : path, optional
-        Where the run's folder is made; None means the bench's own data folder.
-    label : str
-        Becomes part of the folder's name.
-    n_frames, seconds
-        The end, whichever comes first; one of them is needed.
-    n_buffers, on_progress
-        As in :class:`Recorder`.
+    Light, stage and SLM of the open bench stay as they are until the end, when the bench is made safe. The
+    run's folder is made in ``folder`` (None: the bench's own data folder); ``overrides`` are single options.
 
     Raises
     ------
@@ -56,42 +67,36 @@ def record(
     DeviceError, RunError
         When the camera or the disk fails; what was recorded is kept.
     """
-    if n_frames is None and seconds is None:
+    options = with_overrides(options or RecordingOptions(), overrides)
+    if options.n_frames is None and options.seconds is None:
         raise BenchError("Say how much to record: n_frames, seconds, or both.")
-    return prepare_recording(
-        bench,
-        folder,
-        label=label,
-        n_frames=n_frames,
-        seconds=seconds,
-        n_buffers=n_buffers,
-        on_progress=on_progress,
-    ).execute()
+    return prepare_recording(bench, folder, options, on_progress=on_progress).execute()
 
 
 def prepare_recording(
     bench: Bench,
     folder: Path | str | None = None,
+    options: RecordingOptions | None = None,
     *,
-    label: str = "recording",
-    n_frames: int | None = None,
-    seconds: float | None = None,
-    n_buffers: int | None = None,
     on_progress: Callable[[RecordingStatus], None] | None = None,
+    **overrides: Any,
 ) -> Recorder:
-    """Make a recording's folder and return its recorder, for those who end it by ``stop``."""
+    """Make a recording's folder and return its recorder, for those who end it by ``stop``; see ``record``."""
+    options = with_overrides(options or RecordingOptions(), overrides)
     folder = Path(folder) if folder is not None else bench.config.data_folder
-    camera = bench.camera
-    need = (n_frames or 1) * math.prod(camera.frame_shape) * camera.frame_dtype.itemsize
+    frames = options.n_frames or 1
+    need = frames * _frame_bytes(bench)
     if (free := free_bytes(folder)) < need + SPARE_BYTES:
         raise BenchError(
-            f"{folder}: {n_frames or 1} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to "
+            f"{folder}: {frames} frames need {need / 1e9:.2f} GB and {SPARE_BYTES / 1e9:.2f} GB to "
             f"spare, but only {free / 1e9:.2f} GB are free. Free some, or choose another folder."
         )
-    writer = RunWriter.create(folder, label=label, bench=record_of(bench))
-    return Recorder(
-        bench, writer, n_frames=n_frames, seconds=seconds, n_buffers=n_buffers, on_progress=on_progress
-    )
+    writer = RunWriter.create(folder, label=options.label, bench=record_of(bench))
+    return Recorder(bench, writer, options, on_progress)
+
+
+def _frame_bytes(bench: Bench) -> int:
+    return math.prod(bench.camera.frame_shape) * bench.camera.frame_dtype.itemsize
 
 
 _log = logging.getLogger(__name__)
@@ -105,82 +110,51 @@ _DISK_CHECK_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RecordingStatus:
-    """A snapshot of a recording.
-
-    Attributes
-    ----------
-    written : int
-        Frames on the disk.
-    numbered : int
-        Those and the lost ones: the number of the next frame.
-    dropped_by_device : int
-        Frames that the camera or its driver lost.
-    not_written : int
-        Frames lost because the disk was slower than the camera.
-    waiting : int
-        Frames in memory on their way to the disk; more than ``n_buffers`` never are.
-    n_buffers : int
-    seconds : float
-        Since the first frame.
-    frames_per_s, bytes_per_s : float
-        Mean rates of what was written.
-    saturated_fraction : float
-        Of the newest frame.
-    free_bytes : int
-        Left on the disk.
-    """
+    """A snapshot of a recording."""
 
     written: int
+    """Frames on the disk."""
     numbered: int
+    """Those and the lost ones: the number of the next frame."""
     dropped_by_device: int
+    """Frames that the camera or its driver lost."""
     not_written: int
+    """Frames lost because the disk was slower than the camera."""
     waiting: int
+    """Frames in memory on their way to the disk; more than ``n_buffers`` never are."""
     n_buffers: int
     seconds: float
+    """Since the first frame."""
     frames_per_s: float
     bytes_per_s: float
+    """Mean rates of what was written."""
     saturated_fraction: float
+    """Of the newest frame."""
     free_bytes: int
+    """Left on the disk."""
 
 
 class Recorder:
     """Records until a number of frames or seconds is reached, or until ``stop``.
 
     Memory is that of the stream's ring: when the disk is slower than the camera, frames are lost there and
-    counted, and nothing grows. A lost frame keeps its number: the recording's array has a gap.
-
-    Parameters
-    ----------
-    bench : Bench
-        Open; its light is as the caller set it.
-    writer : RunWriter
-        A run without a plan.
-    n_frames : int, optional
-        Frames to record, lost ones counted.
-    seconds : float, optional
-        Time to record.
-    n_buffers : int, optional
-        Frames held in memory for the disk; None means as many as 256 MB hold.
-    on_progress : callable, optional
-        Called with the status after every batch of frames, at once when frames were lost.
+    counted, and nothing grows. A lost frame keeps its number: the recording's array has a gap. The bench's
+    light is as the caller set it; ``writer`` is of a run without a plan. ``on_progress`` is called with the
+    status after every batch of frames, at once when frames were lost.
     """
 
     def __init__(
         self,
         bench: Bench,
         writer: RunWriter,
-        *,
-        n_frames: int | None = None,
-        seconds: float | None = None,
-        n_buffers: int | None = None,
+        options: RecordingOptions,
         on_progress: Callable[[RecordingStatus], None] | None = None,
     ) -> None:
         self._bench = bench
         self._writer = writer
-        self._n_frames = n_frames
-        self._seconds = seconds
-        frame_bytes = math.prod(bench.camera.frame_shape) * bench.camera.frame_dtype.itemsize
-        self.n_buffers = n_buffers or min(_MOST_BUFFERS, max(_FEWEST_BUFFERS, _RING_BYTES // frame_bytes))
+        self._n_frames, self._seconds = options.n_frames, options.seconds
+        fitting = _RING_BYTES // _frame_bytes(bench)
+        self.n_buffers = options.n_buffers or min(_MOST_BUFFERS, max(_FEWEST_BUFFERS, fitting))
         self._batch = min(_BATCH, max(1, self.n_buffers // 4))
         self.on_progress = on_progress
         self._stopping = threading.Event()

@@ -25,16 +25,13 @@ from typing import Any
 from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
-from instrument.bench.safety import StepsFailedError
+from instrument.bench.safety import stop_until
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan import Light, Plan, Step
 from instrument.runs.finish import end_run
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.writer import FrameToStore, RunWriter
-
-_STOP_REPEAT_S = 0.005
-_STOP_WAIT_S = 2.0
 
 
 class RunState(StrEnum):
@@ -50,41 +47,28 @@ class RunState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
-    """A snapshot of a runner, for a progress bar or a window.
-
-    Attributes
-    ----------
-    done, total : int
-        Steps whose frames are on the disk, and steps of the plan.
-    step : Step or None
-        The step being done, or the last one.
-    done_here : int
-        Steps among ``done`` that this runner did: those of a run that goes on were done before.
-    seconds : float
-        Since the run was started or resumed.
-    seconds_left : float or None
-        Estimated from the steps done so far; None before the first.
-    dropped : int
-        Frames that the camera dropped during exposures of this run.
-    saturated_fraction : float
-        Of the newest frame.
-    reason : FinishReason or None
-        Why it ended, once it has.
-    newest : Snapshot or None
-        The photograph that was stored last.
-    """
+    """A snapshot of a runner, for a progress bar or a window."""
 
     state: RunState
     done: int
     total: int
+    """Steps whose frames are on the disk, and steps of the plan."""
     done_here: int = 0
+    """Steps among ``done`` that this runner did: those of a run that goes on were done before."""
     step: Step | None = None
+    """The step being done, or the last one."""
     seconds: float = 0.0
+    """Since the run was started or resumed."""
     seconds_left: float | None = None
+    """Estimated from the steps done so far; None before the first."""
     dropped: int = 0
+    """Frames that the camera dropped during exposures of this run."""
     saturated_fraction: float = 0.0
+    """Of the newest frame."""
     reason: FinishReason | None = None
+    """Why it ended, once it has."""
     newest: Snapshot | None = field(default=None, compare=False, repr=False)
+    """The photograph that was stored last."""
 
 
 RunProgress = Callable[[RunStatus], None]
@@ -170,7 +154,6 @@ class Runner:
     ----------
     bench : Bench
         Open.
-    plan : Plan
     writer : RunWriter
         The run; the runner finishes and closes it.
     todo : sequence of int, optional
@@ -261,20 +244,13 @@ class Runner:
         self._stopping.set()
         with self._condition:
             self._condition.notify_all()
-        failure: StepsFailedError | None = None
-        deadline_s = time.monotonic() + _STOP_WAIT_S
-        # Once is not enough: the executing thread may have been about to start a move or an exposure.
-        while True:
+
+        def stop() -> None:
             if self.status.state is not RunState.ENDING:
-                try:
-                    self._bench.stop()
-                except StepsFailedError as error:
-                    failure = error
-            executes_here = self._thread in (None, threading.current_thread())
-            if executes_here or self._finished.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
-                break
-        if failure is not None:
-            raise failure
+                self._bench.stop()
+
+        executes_here = self._thread in (None, threading.current_thread())
+        stop_until(stop, self._finished, once=executes_here)
 
     # In one thread -------------------------------------------------------------------------------
     def execute(self) -> Run:

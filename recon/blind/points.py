@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.camera.varying_psfs import field_of
+from recon.camera.convolution import field_of
 
 Array = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from recon.base import fft
 from recon.blind.points import Mixer, Points
 from recon.camera.base import Array
+from recon.camera.convolution import field_of
 from recon.camera.registration import LOCAL_MEAN_PX
-from recon.camera.varying_psfs import field_of
 from recon.errors import InputError
 
 Floats = npt.NDArray[np.float32]

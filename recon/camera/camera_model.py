@@ -13,10 +13,10 @@ import numpy.typing as npt
 from recon.base.checks import select_psf
 from recon.base.registry import Registry
 from recon.camera.base import LinearOperator
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution, field_of
 from recon.camera.field_registration import remembered_field, shown
 from recon.camera.registration import moved
-from recon.camera.varying_psfs import FieldOfPsfs, field_of, interpolation_weights, principal_psfs
+from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, principal_psfs
 from recon.errors import InputError
 from recon.types import Calibration
 
@@ -192,7 +192,7 @@ class OfferedCamera:
 
     name: str
     help: str
-    make: Callable[[Convolution3D, Depths], LinearOperator]
+    make: Callable[[Convolution, Depths], LinearOperator]
     refuses: Callable[[Depths], str | None] = lambda _: None
 
 

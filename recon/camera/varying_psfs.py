@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.camera.base import Array
+from recon.camera.convolution import field_of
 from recon.camera.spatially_varying import Part, SpatiallyVarying, Strip, Window
 from recon.errors import InputError
 
@@ -155,7 +156,7 @@ def local_convolution(
     -------
     SpatiallyVarying
         Domain (n_channels, n_z, field height, field width), field = sensor + PSF - 1, centred as
-        :class:`~recon.camera.convolution.PadCropConvolution`.
+        :class:`~recon.camera.convolution.Convolution`.
     """
     if not fields:
         raise InputError("The list of depths is empty: give the PSFs of at least one.")
@@ -180,15 +181,6 @@ def local_convolution(
         n_channels=channels,
         dtype=dtype,
     )
-
-
-def field_of(
-    sensor_shape: tuple[int, int], psf_shape: tuple[int, int]
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return shape and axis of the field that can reach the sensor (as ``PadCropConvolution``)."""
-    height, width = (s + p - 1 for s, p in zip(sensor_shape, psf_shape, strict=True))
-    row, column = (s // 2 + p - 1 - p // 2 for s, p in zip(sensor_shape, psf_shape, strict=True))
-    return (height, width), (row, column)
 
 
 def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[int, int]]:

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from recon.analysis.gram import WindowProblem, condition_number
 from recon.analysis.points import Noise, PointGrid, try_points
 from recon.camera.base import LinearOperator
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera
 from recon.evaluation.scene import SceneSpec, TestScene
 from recon.evaluation.scene_trial import PIXELS, judge_image, scene_of, spec_at
@@ -72,7 +71,7 @@ def precision(method: str, x: float, y: float, seed: int, _size: Size) -> Trial:
     psf = part.problem.depths.central[0]
     solutions = []
     for dtype in (np.float32, np.float64):
-        camera = PadCropConvolution(psf / np.linalg.norm(psf), part.problem.sensor_shape, dtype=dtype)
+        camera = Convolution(psf / np.linalg.norm(psf), part.problem.sensor_shape, dtype=dtype)
         prior = TotalVariation(1.0) + NonNegativity()
         rules = StoppingRules(iterations=int(x), tolerance=0)
         solver = (Admm if method == "admm tv" else Fista)(camera, part.data.astype(dtype), prior)
@@ -146,7 +145,7 @@ def _volume_penalties(method: str, x: float, y: float, seed: int, size: Size) ->
     energy = float(np.sqrt(np.mean(np.sum(psfs.astype(np.float64) ** 2, axis=(2, 3)))))
     noise = float(np.sqrt(np.mean(np.maximum(scene.measurement, 0)) + scene.spec.read_noise_e**2))
     data = (scene.measurement / noise).astype(np.float32)[None]
-    camera = Convolution3D(psfs / np.float32(energy), data.shape[1:])
+    camera = Convolution(psfs / np.float32(energy), data.shape[1:])
     prior: Prior = L1(1.5 * y) + NonNegativity()
     if method.startswith("admm tv"):
         prior = TotalVariation.of_volume(y) + NonNegativity()

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 
 from recon.base.metrics import psnr
 from recon.holography.display import Display
@@ -173,6 +172,8 @@ class PlacedHologram:
 
 def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Array:
     """Return the low-passed image, FFT order, on the smallest grid that holds it."""
+    import scipy.fft  # costs what only who aligns has to wait
+
     from recon.holography import _kernels
 
     height, width = display.mask.shape
@@ -207,6 +208,8 @@ def _seen(slm: Array, display: Display, displacement: Array, pose: Pose) -> Arra
 
 def _propagate(field: Array, display: Display, pose: Pose) -> Array:
     """Take light from the SLM's image to the tilted mask (first order in the tilt's small depth)."""
+    import scipy.fft  # costs what only who aligns has to wait
+
     if not (pose.z_um or pose.pitch_mrad or pose.yaw_mrad):
         return field
     pitch_mm = display.mask_pitch_um * 1e-3

@@ -11,11 +11,10 @@ from recon.base import fft
 from recon.base.namespace import array_namespace
 from recon.camera.base import Array, LinearOperator
 from recon.camera.camera_model import CAMERAS, LOW_RANK_ERROR
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution, field_of
 from recon.camera.factors import BackgroundRemoval, Erasures, PatternedCamera
 from recon.camera.spatially_varying import SpatiallyVarying
-from recon.camera.varying_psfs import FieldOfPsfs, field_of, local_convolution, low_rank
+from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
 from recon.errors import InputError
 from recon.priors import Prior, TotalVariation
 from recon.reconstruction.problem import Problem
@@ -134,7 +133,7 @@ class Part:
         own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
         energy = problem.energy[self.channels if len(problem.energy) > 1 else slice(0, 1)]
         if problem.together:
-            plane = PadCropConvolution(
+            plane = Convolution(
                 psfs[0, own] / energy[:, None, None],
                 problem.sensor_shape,
                 n_channels=self.channels.stop - self.channels.start,
@@ -150,7 +149,7 @@ class Part:
         fields = [FieldOfPsfs(f.psfs[:, own] * scale, f.points) for f in problem.levelled[0].fields]
         return self._varying(fields)
 
-    def _require_memory(self, plane: PadCropConvolution) -> None:
+    def _require_memory(self, plane: Convolution) -> None:
         """Refuse a picture that a given limit has no room for."""
         if self._limit is None:
             return
@@ -159,9 +158,9 @@ class Part:
         if not self.plan.fits:
             raise InputError(f"This picture needs {self.plan}. Bin the images, or allow more.")
 
-    def _convolution(self, psfs: Array) -> Convolution3D:
+    def _convolution(self, psfs: Array) -> Convolution:
         height, width = self.problem.sensor_shape
-        camera = Convolution3D(
+        camera = Convolution(
             psfs,
             (height, width),
             dtype=self.dtype,
@@ -207,13 +206,13 @@ class Part:
         return camera
 
     @cached_property
-    def central(self) -> Convolution3D:
+    def central(self) -> Convolution:
         """The camera with each depth's central PSF everywhere: varying ones are preconditioned by it."""
         problem = self.problem
         psfs = problem.levelled[0].central
         own = self.channels if psfs.shape[1] > 1 else slice(0, 1)
         scale = np.float32(1 / float(problem.energy[0]))
-        return Convolution3D(psfs[:, own] * scale, problem.sensor_shape, dtype=self.dtype)
+        return Convolution(psfs[:, own] * scale, problem.sensor_shape, dtype=self.dtype)
 
     def memory_used(self) -> str | None:
         """Say what was planned, and what had to go to disk; None where nothing was."""
@@ -301,7 +300,7 @@ class Part:
     def peak(self) -> float:
         """``max |A^H b|``; of a convolution plane by plane: no volume for one number."""
         data = self.solved_data
-        if isinstance(self.camera, Convolution3D):
+        if isinstance(self.camera, Convolution):
             return max(float(np.abs(plane).max()) for plane in self.camera.adjoint_planes(data))
         return float(np.max(np.abs(self.camera.adjoint(data))))
 

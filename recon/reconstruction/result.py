@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.camera.varying_psfs import field_of
+from recon.camera.convolution import field_of
 from recon.reconstruction.options import Field
 from recon.solvers.base import IterationRecord, StopReason
 from recon.solvers.douglas_rachford import EmptyPlanes

@@ -135,7 +135,7 @@ def _admm_refuses(problem: Problem) -> str | None:
 
 
 def _admm(part: Part, start: Array | None) -> Runs:
-    from recon.camera.convolution3d import Convolution3D
+    from recon.camera.convolution import Convolution
     from recon.solvers.admm import Admm
     from recon.solvers.splitting import Room, SensorData, Tuning
     from recon.solvers.tv_admm_volume import volume_solver
@@ -143,7 +143,7 @@ def _admm(part: Part, start: Array | None) -> Runs:
     problem, camera = part.problem, part.camera
     if problem.together:
         return Admm(part.picture_operator, part.data, part.prior, initial=_of_picture(start))
-    if not isinstance(camera, Convolution3D):
+    if not isinstance(camera, Convolution):
         return _varying_admm(part, camera, start)
     data = SensorData(part.data, part.valid[0], part.removal)
     prior = part.prior_on(problem.axis_weights, (False, True, True))
@@ -293,11 +293,12 @@ def solver_for(problem: Problem) -> OfferedSolver:
     asked = problem.options.solver
     require_solver(asked)
     if asked == "auto":
-        reasons = {name: offered.accepts(problem) for name, offered in SOLVERS.items()}
-        able = next((name for name, reason in reasons.items() if reason is None), None)
-        if able is None:
-            raise InputError("; ".join(f"{name}: {reason}" for name, reason in reasons.items()) + ".")
-        return SOLVERS[able]
+        reasons = []
+        for name, offered in SOLVERS.items():
+            if (reason := offered.accepts(problem)) is None:
+                return offered
+            reasons.append(f"{name}: {reason}")
+        raise InputError("; ".join(reasons) + ".")
     offered = SOLVERS.named(asked)
     if (reason := offered.accepts(problem)) is not None:
         raise InputError(f"The solver {asked} does not take this: {reason}.")

@@ -22,7 +22,7 @@ import numpy as np
 from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
@@ -52,12 +52,12 @@ class Penalties:
 
 
 class Admm(Solver):
-    """ADMM for a (masked) :class:`~recon.camera.convolution.PadCropConvolution`.
+    """ADMM for a (masked) :class:`~recon.camera.convolution.Convolution`.
 
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution``, with or without ``Erasures`` after it.
+        A ``Convolution`` of a picture, with or without ``Erasures`` after it.
     data : ndarray, ``operator.range_shape``
     prior : Prior
         (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
@@ -112,7 +112,7 @@ class Admm(Solver):
             priors.t_w,
             priors.mu,
         )
-        power = float(np.mean(camera.power))
+        power = float(np.mean(camera.power()))
         differences = 1.0 if penalties.differences is None else penalties.differences
         self._mu_data = penalties.data
         mu = np.array([[differences * power], [penalties.separable * power]])
@@ -196,7 +196,7 @@ class DataSplit:
 
     Parameters
     ----------
-    camera : PadCropConvolution
+    camera : Convolution
     data, weight : ndarray, ``camera.range_shape``
         Measurement, and 1 where it is valid, 0 where erased.
     penalty : float
@@ -219,7 +219,7 @@ class DataSplit:
 
     def __init__(
         self,
-        camera: PadCropConvolution,
+        camera: Convolution,
         data: Array,
         weight: Array,
         penalty: float,
@@ -235,7 +235,7 @@ class DataSplit:
         height, width = camera.grid_shape
         rows, columns = (laplacian_eigenvalues(n).astype(data.dtype) for n in (height, width))
         self.T = fft.rfft(start)
-        fft.multiply(self.T, camera.spectrum)
+        fft.multiply(self.T, camera.spectrum[:, 0])
         self._laplace = rows, columns[: self.T.shape[2]].copy()
         self._grid_sums = np.zeros((height, _picture_kernels.N_GRID_SUMS))
         self._sensor_sums = np.zeros((camera.sensor_shape[0], _picture_kernels.N_SENSOR_SUMS))
@@ -252,7 +252,7 @@ class DataSplit:
 
         Solves ``(mu_v M^T M + mu_u Psi^T Psi + mu_w) y = mu_v M^T R(t) + rhs``.
         """
-        H = self._camera.spectrum[channel % len(self._camera.spectrum)]
+        H = self._camera.channel_spectrum(channel)[0]
         rows, columns = self._laplace
         fft.rfft(y, out=self._Y)
         over_rows(
@@ -306,5 +306,5 @@ def _energy(spectrum: Array, width: int) -> float:
 
 @cache
 def _compile(dtype: np.dtype[Any]) -> None:
-    tiny = PadCropConvolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
+    tiny = Convolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
     Admm(tiny, np.ones((1, 2, 2), dtype), TotalVariation(1.0)).step()

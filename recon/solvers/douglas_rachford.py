@@ -30,8 +30,7 @@ from recon.base import fft
 from recon.base.namespace import require_memory, to_host
 from recon.base.threads import in_blocks
 from recon.camera.base import Array
-from recon.camera.convolution3d import Convolution3D
-from recon.camera.planes import PlaneGroups
+from recon.camera.convolution import Convolution, PlaneGroups
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.solvers.base import IterationRecord
@@ -118,7 +117,7 @@ class DouglasRachford(VolumeSplitting):
 
     Parameters
     ----------
-    operator : Convolution3D
+    operator : Convolution
         One channel.
     data : ndarray, (1, height, width), or SensorData
     prior : Prior
@@ -142,7 +141,7 @@ class DouglasRachford(VolumeSplitting):
 
     def __init__(
         self,
-        operator: Convolution3D,
+        operator: Convolution,
         data: Array | SensorData,
         prior: Prior,
         *,
@@ -175,7 +174,7 @@ class DouglasRachford(VolumeSplitting):
     def _allocate(self) -> None:
         """Make what an iteration works with."""
         require_memory(self.xp, _VOLUMES * self.operator.dtype.itemsize * int(self.z.size))
-        self._power = self.xp.asarray(self.operator.power())
+        self._power = self.xp.asarray(self.operator.power()[0])
 
     def _sweep(self) -> tuple[Array, Array]:
         """Update z; return the transform of what the sensor sees of it, and the sums of :meth:`step`."""
@@ -313,7 +312,7 @@ class SparseDouglasRachford(DouglasRachford):
         self._planes = np.flatnonzero(self.watch.active)
         self._groups = PlaneGroups(len(self._planes))
         whole = self.watch.active.all()
-        self._power = self.operator.power(planes=None if whole else (int(z) for z in self._planes))
+        self._power = self.operator.power(None if whole else (int(z) for z in self._planes))[0]
 
     def _leave_out(self) -> None:
         """Leave out what has been empty for long."""

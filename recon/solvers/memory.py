@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.threads import get_threads
-from recon.camera.planes import GROUPS
+from recon.camera.convolution import GROUPS
 from recon.errors import InputError
 
 GIB = 2**30

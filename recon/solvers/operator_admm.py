@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from recon.base.threads import get_threads
 from recon.camera.base import Array, LinearOperator
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
@@ -42,7 +42,7 @@ class OperatorSystem(SensorSystem):
 
     def __init__(
         self,
-        central: Convolution3D,
+        central: Convolution,
         valid: npt.NDArray[np.bool_] | None,
         background: BackgroundRemoval | None,
         bend: Callable[[Array], Array],
@@ -69,7 +69,7 @@ class OperatorAdmm(Solver):
     operator : LinearOperator
         Domain (1, n_z, height, width), range (1, sensor height, sensor width); without erasures and
         background.
-    central : Convolution3D
+    central : Convolution
         The camera that has the central PSF of each depth everywhere, for the same sensor: what the operator
         is preconditioned with.
     data : ndarray, (1, height, width), or SensorData
@@ -87,7 +87,7 @@ class OperatorAdmm(Solver):
     def __init__(
         self,
         operator: LinearOperator,
-        central: Convolution3D,
+        central: Convolution,
         data: Array | SensorData,
         prior: Prior,
         *,
@@ -116,7 +116,7 @@ class OperatorAdmm(Solver):
         data = SensorData.of(data)
         self.system = OperatorSystem(central, data.valid, data.background, self._bend)
         self.data = self.system.masked(np.array(data.image[0], dtype))
-        self._central_power = central.power()
+        self._central_power = central.power()[0]
         self._lateral = self._lateral_eigenvalues(central, weights)
         self._differences = np.zeros((0,), dtype) if self._psi is None else self._psi.forward(self.x)
         self.e = self.data - self.system.masked(operator.forward(self.x)[0])
@@ -134,7 +134,7 @@ class OperatorAdmm(Solver):
         total = axes[0][:, None, None] + axes[1][:, None] + axes[2] + self._pixels
         return np.asarray(total, self.operator.dtype)
 
-    def _lateral_eigenvalues(self, central: Convolution3D, weights: Array | None) -> Array:
+    def _lateral_eigenvalues(self, central: Convolution, weights: Array | None) -> Array:
         """T as the preconditioner has it: periodic, and without depth."""
         if weights is None:
             return np.full((1, 1), self._pixels, self.operator.dtype)

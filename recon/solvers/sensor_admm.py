@@ -30,7 +30,7 @@ import numpy as np
 from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures, as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
@@ -73,7 +73,7 @@ class SensorAdmm(Solver):
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution``, with or without ``Erasures`` after it.
+        A ``Convolution`` of a picture, with or without ``Erasures`` after it.
     data : ndarray, ``operator.range_shape``
     prior : Prior
         (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
@@ -111,7 +111,7 @@ class SensorAdmm(Solver):
         self.set_data(data)
         self._top, self._left = camera.corner
         self._camera = camera
-        self._spectrum = camera.spectrum
+        self._spectrum = camera.spectrum[:, 0]
         self.relax = relax
         self.data_steps = data_steps
 
@@ -138,7 +138,7 @@ class SensorAdmm(Solver):
         self._laplace_rows, columns = (laplacian_eigenvalues(n).astype(operator.dtype) for n in grid)
         self._laplace_columns = columns[: grid[1] // 2 + 1].copy()
         self._row_sums = np.zeros(grid[0])
-        power = camera.power
+        power = camera.power()
         self._preconditioners = [
             CosinePreconditioner(power[c % len(power)], grid, camera.sensor_shape) for c in range(len(start))
         ]
@@ -333,7 +333,7 @@ class SensorAdmm(Solver):
 
 @cache
 def _compile(dtype: np.dtype[Any]) -> None:
-    tiny = PadCropConvolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
+    tiny = Convolution(np.ones((1, 2, 2)), (2, 2), dtype=dtype)
     valid = np.arange(4).reshape(1, 2, 2) > 0
     masked = Erasures(valid, (1, 2, 2), dtype) @ tiny
     SensorAdmm(masked, np.ones((1, 2, 2), dtype), TotalVariation(1.0), data_steps=2).step()

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from recon.base import fft
 from recon.base.namespace import Namespace, namespace_of, to_host
 from recon.camera.base import Array
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
 from recon.solvers.memory import Storage
@@ -233,7 +233,7 @@ class VolumeSplitting(Solver):
 
     Parameters
     ----------
-    operator : Convolution3D
+    operator : Convolution
         One channel.
     data : ndarray, (1, height, width), or SensorData
     tuning : Tuning
@@ -244,7 +244,7 @@ class VolumeSplitting(Solver):
 
     def __init__(
         self,
-        operator: Convolution3D,
+        operator: Convolution,
         data: Array | SensorData,
         tuning: Tuning | None,
         room: Room | None,

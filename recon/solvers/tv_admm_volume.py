@@ -12,7 +12,7 @@ import numpy as np
 from recon.base import fft
 from recon.base.threads import get_threads, in_blocks
 from recon.camera.base import Array
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
@@ -144,7 +144,7 @@ class LeanTotalVariation(VolumeAdmm):
 
 
 def volume_solver(
-    operator: Convolution3D,
+    operator: Convolution,
     data: Array | SensorData,
     prior: Prior,
     *,

@@ -28,7 +28,7 @@ import numpy as np
 from recon.base import fft
 from recon.base.namespace import require_memory, to_host
 from recon.camera.base import Array
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
@@ -73,7 +73,7 @@ class VolumeAdmm(VolumeSplitting):
 
     Parameters
     ----------
-    operator : Convolution3D
+    operator : Convolution
         One channel.
     data : ndarray, (1, height, width), or SensorData
     prior : Prior
@@ -93,7 +93,7 @@ class VolumeAdmm(VolumeSplitting):
 
     def __init__(
         self,
-        operator: Convolution3D,
+        operator: Convolution,
         data: Array | SensorData,
         prior: Prior,
         *,

@@ -29,7 +29,7 @@ def wiener(operator: LinearOperator, data: Array, regularisation: float | None =
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution``, with or without ``Erasures``.
+        A ``Convolution`` of a picture, with or without ``Erasures``.
     data : ndarray, ``operator.range_shape``
     regularisation : float, optional
         ``r`` above, relative to the PSF's mean power. Default: by generalised cross-validation for all
@@ -45,11 +45,11 @@ def wiener(operator: LinearOperator, data: Array, regularisation: float | None =
     convolution = structure.convolution
     B = fft.rfft(_continue_beyond_sensor(structure, np.asarray(data, operator.dtype)))
     width = convolution.grid_shape[1]
-    power = convolution.power
+    power = convolution.power()
     penalty = (_penalty(convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
     if regularisation is None:
         regularisation = _cross_validated(power, penalty, B)
-    B *= np.conj(convolution.spectrum)
+    B *= np.conj(convolution.spectrum[:, 0])
     B /= power + power.dtype.type(regularisation) * penalty
     solution = fft.irfft(B, width)
     return Outcome(solution, (), StopReason.ONE_STEP, time.perf_counter() - began, float(regularisation))
@@ -61,7 +61,7 @@ class WienerFilter:
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution`` without erasures.
+        A ``Convolution`` of a picture without erasures.
     regularisation : float
         As of :func:`wiener`.
     """
@@ -72,9 +72,9 @@ class WienerFilter:
             raise StructureError("A WienerFilter takes no erasures: see wiener, which fills them.")
         self._structure = structure
         convolution = structure.convolution
-        power = convolution.power
+        power = convolution.power()
         penalty = (_penalty(convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
-        self._filter = np.conj(convolution.spectrum)
+        self._filter = np.conj(convolution.spectrum[:, 0])
         self._filter /= power + power.dtype.type(regularisation) * penalty
 
     def __call__(self, data: Array) -> Array:
@@ -90,7 +90,7 @@ def cross_validated(operator: LinearOperator, data: Array) -> float:
     From every so many rows of frequencies, ``ENOUGH_FREQUENCIES`` in all: a live picture waits for it.
     """
     structure = as_cropped_convolution(operator)
-    power = structure.convolution.power
+    power = structure.convolution.power()
     penalty = (_penalty(structure.convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
     B = fft.rfft(_continue_beyond_sensor(structure, data))
     stride = max(B[0].size // ENOUGH_FREQUENCIES, 1)

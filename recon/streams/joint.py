@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from recon.camera.base import Array, LinearOperator
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.errors import InputError
 from recon.priors.base import Prior
@@ -48,7 +48,7 @@ class JointAdmm(SensorAdmm):
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution`` with a channel a frame, with or without ``Erasures`` after it.
+        A ``Convolution`` with a channel a frame, with or without ``Erasures`` after it.
     data, prior
         As of :class:`~recon.solvers.SensorAdmm`.
     over_time : OverTime
@@ -137,7 +137,7 @@ def solve_together(
     part = Part(problem, slice(0, 1))
     part.weigh(problem.options.tau)
     psfs = problem.depths.central[0] / problem.energy[:, None, None]
-    operator: LinearOperator = PadCropConvolution(psfs, shape, n_channels=len(frames), dtype=part.dtype)
+    operator: LinearOperator = Convolution(psfs, shape, n_channels=len(frames), dtype=part.dtype)
     data = np.stack([problem.with_data(frame).data[0] for frame in frames])
     if not problem.valid.all():
         valid = np.repeat(problem.valid, len(frames), axis=0)

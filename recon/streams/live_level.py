@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from recon.base.blocks import block_mean
 from recon.base.noise import NoiseModel, averaged_noise
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.reconstruction.measurement import channel_noise
 from recon.reconstruction.weights import default_tau
@@ -44,7 +44,7 @@ class FilterLevel:
         self._deviation = np.array(deviation, np.float32)[:, None, None]
         energy = np.sqrt(np.sum(binned_psfs.astype(np.float64) ** 2, axis=(1, 2))).astype(np.float32)
         energy = energy[:, None, None]
-        self.camera = PadCropConvolution(binned_psfs / energy, frame.shape[1:], n_channels=len(frame))
+        self.camera = Convolution(binned_psfs / energy, frame.shape[1:], n_channels=len(frame))
         # One binned pixel holds the light of all its pixels: in units of one, pictures of all binnings agree.
         self._image_scale = self._deviation / energy / np.float32(binning**2)
         self.filter = WienerFilter(self.camera, cross_validated(self.camera, self.data(frame)))

@@ -12,11 +12,10 @@ from calibration_routines import PointSweep
 from calibration_routines.procedure import MM, Routine, routines
 from calibration_routines.psf.sweep_options import PlannedSweep, Taking
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from gui.forms.routines import forms
 from instrument.bench.bench import Bench
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
-from recon.base.declare import option
+from recon.base.declare import option, options_of
 from recon.errors import InputError
 
 TINY = """
@@ -92,12 +91,13 @@ def test_the_terminal_has_it_with_its_options_and_their_words(
 
 
 def test_the_window_has_its_form() -> None:
-    form = forms()[-1]
-    assert (form.name, form.title, form.needs) == ("cross", "Cross", ("stage",))
-    labels = {o.name: o.label for o in form.fields}
+    routine = list(routines.values())[-1]
+    assert (routine.name, routine.title, routine.needs) == ("cross", "Cross", ("stage",))
+    labels = {o.name: o.label for o in options_of(routine.options)}
     assert labels["arm_um"] == "Arm (mm)"
     assert labels["average"] == "Frames a PSF"
-    assert form.make({"z_um": 1e5, "arm_um": 1e3}) == SweepProcedure(CrossSweep(z_um=1e5, arm_um=1e3))
+    made = routine.procedure(routine.options(z_um=1e5, arm_um=1e3))
+    assert made == SweepProcedure(CrossSweep(z_um=1e5, arm_um=1e3))
 
 
 def test_a_name_that_is_taken_is_refused() -> None:

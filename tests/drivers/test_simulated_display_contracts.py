@@ -17,7 +17,7 @@ from drivers.testing.camera import CameraContract
 from drivers.testing.slm import SlmContract
 from drivers.testing.stage import StageContract
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import display_text, parse_config
+from instrument.bench.config_file import parse_config, template
 
 
 class TestDisplayCamera(CameraContract):
@@ -39,7 +39,7 @@ class TestDisplaySlm(SlmContract):
 
 
 def test_the_laser_is_the_scene_and_the_mask_rides_on_the_stage() -> None:
-    text = display_text().replace("shape = [360, 640]", "shape = [32, 40]")
+    text = template("display").replace("shape = [360, 640]", "shape = [32, 40]")
     with Bench(parse_config(text, None)).open() as bench:
         assert bench.stage is not None
         dark = bench.snap().image.mean()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from calibration_routines.display.mask_alignment import AlignmentReport
 from calibration_routines.procedure import Outcome
 from gui.main_window import MainWindow
 from gui.panels.alignment import AlignmentPanel
-from gui.procedure_run import Situation
-from gui.widgets.run_bar import RunBar
-from instrument.bench.config_file import display_text
+from gui.procedure_run import ProcedureRun, RunBar, Situation
+from gui.session import BenchSession
+from instrument.bench.config_file import template
 from recon.holography.pose import NODES, Pose
 
 LEFT = Qt.MouseButton.LeftButton
@@ -36,7 +37,7 @@ SMALL = {
 
 @pytest.fixture
 def bench_text() -> str:
-    text = display_text()
+    text = template("display")
     for key, value in SMALL.items():
         text = re.sub(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
     return text
@@ -81,8 +82,10 @@ def test_an_alignment_shows_spots_and_scores_and_can_be_aborted(qtbot: QtBot, pa
     compile(panel.as_python(), "alignment", "exec")
 
 
-def test_frames_and_time_that_are_bounds_are_told_as_bounds(qtbot: QtBot) -> None:
-    bar = RunBar()
+def test_frames_and_time_that_are_bounds_are_shown_as_bounds(
+    qtbot: QtBot, make_session: Callable[[], BenchSession]
+) -> None:
+    bar = RunBar(ProcedureRun(make_session()), "Start")
     qtbot.addWidget(bar)
     bar.show_situation(Situation("aligning the mask", 20, 100, at_most=True, seconds=20, seconds_left=80))
     assert "20 of at most 100" in bar.words.text()

@@ -11,8 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from gui.panels.charts import ChartsPanel
-from gui.widgets.chart_view import describe
+from gui.panels.charts import ChartsPanel, describe
 from instrument.evaluation.chart import read_chart
 from instrument.files.errors import FileError
 from instrument.files.images import read_image

@@ -215,7 +215,7 @@ def test_a_picture_goes_on_the_slm_through_its_table_and_off_again(
     SlmCorrection(np.arange(256) * (3.9 * np.pi / 256)).save(tmp_path / "table.json", {})
     table = load_slm_correction(tmp_path / "table.json")
     _type(qtbot, slm.table_file, str(tmp_path / "table.json"))
-    assert slm.use_table.isChecked()
+    qtbot.waitUntil(slm.use_table.isChecked, timeout=WAIT_MS)
     qtbot.mouseClick(slm.load_button, LEFT)
     qtbot.waitUntil(lambda: np.array_equal(device.displayed, table.apply(levels)), timeout=WAIT_MS)
     qtbot.mouseClick(slm.blank_button, LEFT)
@@ -230,7 +230,7 @@ def test_wrong_files_are_refused_at_their_fields(
     qtbot.waitUntil(lambda: bool(slm.file.property("refused")), timeout=WAIT_MS)
     assert "(60, 80)" in slm.file.toolTip()
     _type(qtbot, slm.table_file, str(tmp_path / "nothing.json"))
-    assert "no such file" in slm.table_file.toolTip()
+    qtbot.waitUntil(lambda: "no such file" in slm.table_file.toolTip(), timeout=WAIT_MS)
     assert not slm.use_table.isEnabled()
     assert window.session.is_open("slm")
 

@@ -11,32 +11,32 @@ import pytest
 from calibration_routines.display.mask_alignment import AlignmentProcedure
 from calibration_routines.optics.beads import BeadProcedure
 from calibration_routines.plan_procedures import PlanProcedure
-from calibration_routines.procedure import Outcome, Outlook, Size
+from calibration_routines.procedure import Outcome, Outlook, Procedure, Routine, Size, routines
 from calibration_routines.psf.sweep_options import AxialSweep
 from calibration_routines.psf.sweep_procedure import SweepProcedure
-from gui.forms.routines import PLAN, forms
+from gui.panels.sweeps import PLAN
 from gui.procedure_run import script
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import display_text, led_microscope_text
+from instrument.bench.config_file import template
 from instrument.files.errors import BenchError, SettingsError
+from recon.base.declare import options_of
 
-ROUTINES = {form.name: form for form in (*forms(), *forms("align"))}
-AXIAL, LATERAL, VOLUME, PHOTOGRAPH, ANGULAR, DPC, BEADS, SLM, ALIGNMENT = ROUTINES.values()
+AXIAL, LATERAL, VOLUME, PHOTOGRAPH, ANGULAR, DPC, BEADS, SLM, ALIGNMENT = routines.values()
 STARTS = {"z_min_um": 60e3, "z_max_um": 150e3, "z_um": 100e3, "objective_na": 0.1, "magnification": 4.0}
 
 
-def values_of(form: Any, **changed: Any) -> dict[str, Any]:
-    values = form.defaults()
-    return {
-        name: STARTS.get(name, value) if value is None else value for name, value in values.items()
-    } | changed
+def make(routine: Routine, **changed: Any) -> Procedure:
+    """What a form makes of its defaults, of values that follow from a bench, and of changes."""
+    defaults = {o.name: None if o.default is MISSING else o.default for o in options_of(routine.options)}
+    values = {n: STARTS.get(n, value) if value is None else value for n, value in defaults.items()}
+    return routine.procedure(routine.options(**(values | changed)))
 
 
-@pytest.mark.parametrize("form", [*ROUTINES.values(), PLAN], ids=lambda form: form.name)
+@pytest.mark.parametrize("form", [*routines.values(), PLAN], ids=lambda form: form.name)
 def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
-    procedure = form.make(values_of(form))
-    assert procedure == form.make(values_of(form))
-    for field in form.fields:
+    procedure = make(form)
+    assert procedure == make(form)
+    for field in options_of(form.options):
         assert field.label
         assert field.declaration.help
         assert field.default not in (None, MISSING) or field.declaration.default_words or field.name in STARTS
@@ -44,7 +44,7 @@ def test_a_form_names_its_settings_as_the_code_does(form: Any) -> None:
 
 
 def test_settings_reach_the_request_in_its_units() -> None:
-    procedure = AXIAL.make(values_of(AXIAL, planes=3, average=2))
+    procedure = make(AXIAL, planes=3, average=2)
     assert procedure == SweepProcedure(AxialSweep(z_min_um=60e3, z_max_um=150e3, planes=3, average=2))
 
 
@@ -60,16 +60,16 @@ def test_settings_reach_the_request_in_its_units() -> None:
 )
 def test_a_mistake_names_its_field(form: Any, changed: dict[str, Any], field: str) -> None:
     with pytest.raises(SettingsError) as refused:
-        form.make(values_of(form, **changed))
+        make(form, **changed)
     assert [name for name, _ in refused.value.problems] == [field]
 
 
 def test_the_example_plan_is_a_plan_and_a_wrong_one_is_refused_in_words() -> None:
-    procedure = PLAN.make(PLAN.defaults())
+    procedure = make(PLAN)
     assert isinstance(procedure, PlanProcedure)
     assert len(procedure.plan) > 0
     with pytest.raises(BenchError, match="parts"):
-        PLAN.make(PLAN.defaults() | {"text": 'label = "empty"'})
+        make(PLAN, text='label = "empty"')
 
 
 BENCH = """
@@ -99,9 +99,9 @@ positions = { kind = "points", points_um = [[0, 0, 8e4], [0, 0, 9e4]] }
 def bench_for(form: Any) -> str:
     """A small bench that has what a routine needs."""
     if form is DPC:
-        return led_microscope_text().replace("pixels = 384", "pixels = 96")
+        return template("led_microscope").replace("pixels = 384", "pixels = 96")
     if form is SLM:
-        return display_text().replace("[360, 640]", "[100, 140]")
+        return template("display").replace("[360, 640]", "[100, 140]")
     return BENCH
 
 
@@ -127,7 +127,7 @@ def test_the_python_of_a_form_runs(
 ) -> None:
     bench = tmp_path / "bench.toml"
     bench.write_text(bench_for(form))
-    lines = script(form.make(values_of(form, **changed)), bench)
+    lines = script(make(form, **changed), bench)
     names: dict[str, Any] = {}
     exec(lines, names)
     done = names["done"]
@@ -149,7 +149,7 @@ def test_the_python_of_what_takes_minutes_asks_for_what_the_form_says(
     form: Any, kind: Any, changed: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = tmp_path / "bench.toml"
-    bench.write_text(display_text().replace("[360, 640]", "[100, 140]") if form is ALIGNMENT else BENCH)
+    bench.write_text(template("display").replace("[360, 640]", "[100, 140]") if form is ALIGNMENT else BENCH)
     asked: list[Any] = []
 
     def carry_out(procedure: Any, opened: Bench) -> Outcome:
@@ -159,6 +159,6 @@ def test_the_python_of_what_takes_minutes_asks_for_what_the_form_says(
 
     monkeypatch.setattr(kind, "outlook", lambda *_: Outlook(("looked",)))
     monkeypatch.setattr(kind, "carry_out", carry_out)
-    procedure = form.make(values_of(form, **changed))
+    procedure = make(form, **changed)
     exec(script(procedure, bench), {})
     assert asked == [procedure]

@@ -54,7 +54,7 @@ def test_a_hue_that_was_dimmed_to_the_faintest_comes_back(
 ) -> None:
     array = window.session.bench.led_array
     assert array is not None
-    window.session.device_job(
+    window.session.jobs.device(
         "orange", lambda _: array.set_pattern(LedPattern("LED 3", ((3, (250, 120, 10)),))), {"led_array"}
     )
     qtbot.waitUntil(lambda: dict(array.pattern.levels) == {3: (250, 120, 10)}, timeout=WAIT_MS)

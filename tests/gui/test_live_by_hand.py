@@ -16,7 +16,7 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.live import LivePanel
-from gui.widgets import record_bar
+from gui.widgets import camera_controls
 from instrument.files.errors import FileError
 from instrument.runs.acquire import free_bytes
 from instrument.runs.run import Run
@@ -30,7 +30,7 @@ LEFT = Qt.MouseButton.LeftButton
 def live(qtbot: QtBot, window: MainWindow) -> LivePanel:
     panel = window.show_panel("live")
     assert isinstance(panel, LivePanel)
-    qtbot.waitUntil(lambda: panel._shown is not None and panel.form.state is not None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.picture.frame is not None and panel.form.state is not None, timeout=WAIT_MS)
     qtbot.waitUntil(lambda: not window.session.jobs.jobs, timeout=WAIT_MS)
     window.activateWindow()
     return panel
@@ -100,12 +100,12 @@ def test_a_photograph_waits_for_the_exposure_that_is_still_being_typed(qtbot: Qt
 
 
 def test_a_region_is_drawn_with_the_mouse(qtbot: QtBot, window: MainWindow, live: LivePanel) -> None:
-    qtbot.mouseClick(live.region_button, LEFT)
-    before = live.view.box.viewRange()
-    graphics = live.view.graphics
+    qtbot.mouseClick(live.picture.region_button, LEFT)
+    before = live.picture.view.box.viewRange()
+    graphics = live.picture.view.graphics
 
     def at(column: float, row: float) -> QPoint:
-        place = graphics.mapFromScene(live.view.box.mapViewToScene(QPointF(column, row)))
+        place = graphics.mapFromScene(live.picture.view.box.mapViewToScene(QPointF(column, row)))
         return graphics.viewport().mapTo(window, place)
 
     handle = window.windowHandle()
@@ -115,12 +115,12 @@ def test_a_region_is_drawn_with_the_mouse(qtbot: QtBot, window: MainWindow, live
         QTest.mouseMove(handle, at(*(a + share * (b - a) for a, b in zip(start, end, strict=True))))
         qtbot.wait(30)
     QTest.mouseRelease(handle, LEFT, Qt.KeyboardModifier.NoModifier, at(*end))
-    assert live.view.box.viewRange() == before, "the picture was moved instead"
-    rectangle = live.region_box.rectangle
+    assert live.picture.view.box.viewRange() == before, "the picture was moved instead"
+    rectangle = live.picture.region_box.rectangle
     assert rectangle is not None
     assert rectangle == pytest.approx((20, 30, 40, 20), abs=1.0)
-    qtbot.mouseClick(live.region_button, LEFT)
-    assert live.view.drag_taker is None
+    qtbot.mouseClick(live.picture.region_button, LEFT)
+    assert live.picture.view.drag_taker is None
 
 
 def test_a_long_line_of_figures_does_not_move_the_picture(qtbot: QtBot, live: LivePanel) -> None:
@@ -134,8 +134,8 @@ def test_a_long_line_of_figures_does_not_move_the_picture(qtbot: QtBot, live: Li
 
 def test_what_is_under_the_mouse_is_of_the_frame_that_is_shown(qtbot: QtBot, live: LivePanel) -> None:
     live.under_mouse.setText("x 319  y 239  value 4095")  # the mouse has gone since
-    shown = live._shown
-    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    shown = live.picture.frame
+    qtbot.waitUntil(lambda: live.picture.frame is not shown, timeout=WAIT_MS)
     assert live.under_mouse.text() == ""
 
 
@@ -199,7 +199,7 @@ def test_a_server_that_is_silent_holds_up_nothing_but_the_gauge(
         return _Usage(100, 50, 50)
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
-    monkeypatch.setattr(record_bar, "_SILENT_S", 0.0)
+    monkeypatch.setattr(camera_controls, "_SILENT_S", 0.0)
     bar._look_at_disk()
     qtbot.waitUntil(lambda: bool(asked), timeout=WAIT_MS)
     bar._look_at_disk()  # the timer's next turn: asks no second time

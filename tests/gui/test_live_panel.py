@@ -26,7 +26,7 @@ WAIT_MS = 60_000
 def live(qtbot: QtBot, window: MainWindow) -> LivePanel:
     panel = window.show_panel("live")
     assert isinstance(panel, LivePanel)
-    qtbot.waitUntil(lambda: panel._shown is not None and panel.form.state is not None, timeout=WAIT_MS)
+    qtbot.waitUntil(lambda: panel.picture.frame is not None and panel.form.state is not None, timeout=WAIT_MS)
     qtbot.waitUntil(lambda: not window.session.jobs.jobs, timeout=WAIT_MS)
     return panel
 
@@ -40,12 +40,12 @@ def _type(qtbot: QtBot, field: object, text: str) -> None:
 
 def test_it_opens_running_with_the_scene_lit(qtbot: QtBot, live: LivePanel) -> None:
     qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
-    shown = live._shown
-    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    shown = live.picture.frame
+    qtbot.waitUntil(lambda: live.picture.frame is not shown, timeout=WAIT_MS)
     qtbot.waitUntil(
         lambda: "camera" in live.status.text() and "dropped 0" in live.status.text(), timeout=WAIT_MS
     )
-    qtbot.waitUntil(lambda: float(live._shown.image.mean()) > 50, timeout=WAIT_MS)  # type: ignore[union-attr]
+    qtbot.waitUntil(lambda: float(live.picture.frame.image.mean()) > 50, timeout=WAIT_MS)  # type: ignore[union-attr]
 
 
 def test_exposure_typed_reaches_the_camera_and_is_read_back(qtbot: QtBot, live: LivePanel) -> None:
@@ -71,17 +71,21 @@ def test_a_wrong_exposure_is_refused_at_the_field(qtbot: QtBot, live: LivePanel)
 def test_binning_pauses_the_stream_and_goes_on(qtbot: QtBot, live: LivePanel) -> None:
     live.form.widgets["binning"].setCurrentIndex(1)
     qtbot.waitUntil(
-        lambda: live._shown is not None and live._shown.image.shape == (120, 160), timeout=WAIT_MS
+        lambda: live.picture.frame is not None and live.picture.frame.image.shape == (120, 160),
+        timeout=WAIT_MS,
     )
 
 
 def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -> None:
-    qtbot.mouseClick(live.region_button, Qt.MouseButton.LeftButton)
-    live.region_box.item.setPos((40, 60))
-    live.region_box.item.setSize((80, 100))
-    qtbot.mouseClick(live.apply_region, Qt.MouseButton.LeftButton)
+    qtbot.mouseClick(live.picture.region_button, Qt.MouseButton.LeftButton)
+    live.picture.region_box.item.setPos((40, 60))
+    live.picture.region_box.item.setSize((80, 100))
+    qtbot.mouseClick(live.picture.apply_region, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.as_tuple() == (60, 40, 100, 80), timeout=WAIT_MS)
-    qtbot.waitUntil(lambda: live._shown is not None and live._shown.image.shape == (100, 80), timeout=WAIT_MS)
+    qtbot.waitUntil(
+        lambda: live.picture.frame is not None and live.picture.frame.image.shape == (100, 80),
+        timeout=WAIT_MS,
+    )
     qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
     qtbot.mouseClick(live.whole_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: live.session.bench.camera.roi.height == 240, timeout=WAIT_MS)
@@ -97,9 +101,9 @@ def test_a_region_dragged_is_sent_to_the_camera(qtbot: QtBot, live: LivePanel) -
 
 
 def test_a_region_a_line_and_the_cross_hair_by_keys_alone(qtbot: QtBot, live: LivePanel) -> None:
-    picture, box = live.view.graphics, live.region_box
+    picture, box = live.picture.view.graphics, live.picture.region_box
     alt, shift = Qt.KeyboardModifier.AltModifier, Qt.KeyboardModifier.ShiftModifier
-    qtbot.keyClick(live.region_button, Qt.Key.Key_Space)
+    qtbot.keyClick(live.picture.region_button, Qt.Key.Key_Space)
     assert picture.hasFocus()
     before = box.rectangle
     assert before is not None
@@ -114,25 +118,26 @@ def test_a_region_a_line_and_the_cross_hair_by_keys_alone(qtbot: QtBot, live: Li
     sent = (camera.roi.left, camera.roi.top, camera.roi.width, camera.roi.height)
     assert sent == pytest.approx((left - 10, top + 10, width + 10, height), abs=8)  # the sensor's steps
     qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)
-    qtbot.keyClick(live.profile_button, Qt.Key.Key_Space)
-    first = live.profile_line.ends
+    qtbot.keyClick(live.picture.profile_button, Qt.Key.Key_Space)
+    first = live.picture.profile_line.ends
     assert first is not None
     qtbot.keyClick(picture, Qt.Key.Key_Down)
     qtbot.keyClick(picture, Qt.Key.Key_Left, alt)
-    moved = live.profile_line.ends
+    moved = live.picture.profile_line.ends
     assert moved is not None
     assert np.subtract(moved, first) == pytest.approx(np.array([(0, 10), (-10, 10)]), abs=1e-6)
-    qtbot.keyClick(live.profile_button, Qt.Key.Key_Space)
-    qtbot.keyClick(live.cross_button, Qt.Key.Key_Space)
-    assert live.cross_hair.pixel is not None
-    column, row = live.cross_hair.pixel
+    qtbot.keyClick(live.picture.profile_button, Qt.Key.Key_Space)
+    qtbot.keyClick(live.picture.cross_button, Qt.Key.Key_Space)
+    assert live.picture.cross_hair.pixel is not None
+    column, row = live.picture.cross_hair.pixel
     qtbot.keyClick(picture, Qt.Key.Key_Up)
     qtbot.keyClick(picture, Qt.Key.Key_Right, shift)
-    assert live.cross_hair.pixel == (column + 10, row - 1)
+    assert live.picture.cross_hair.pixel == (column + 10, row - 1)
+    qtbot.waitUntil(lambda: not live.session.jobs.jobs, timeout=WAIT_MS)  # the region
 
 
 def test_zoom_and_pan_by_keys(qtbot: QtBot, live: LivePanel) -> None:
-    picture, box = live.view.graphics, live.view.box
+    picture, box = live.picture.view.graphics, live.picture.view.box
     whole = box.viewRange()
     qtbot.keyClick(picture, Qt.Key.Key_Plus)
     zoomed = box.viewRange()
@@ -171,8 +176,8 @@ def test_a_recording_by_its_key_shows_what_it_records(
     live.session.run_finished.connect(finished.append)
     qtbot.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: "frames" in live.record_bar.note.text(), timeout=WAIT_MS)
-    shown = live._shown
-    qtbot.waitUntil(lambda: live._shown is not shown, timeout=WAIT_MS)
+    shown = live.picture.frame
+    qtbot.waitUntil(lambda: live.picture.frame is not shown, timeout=WAIT_MS)
     assert "GB free" in live.record_bar.gauge.format()
     qtbot.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: bool(finished), timeout=WAIT_MS)
@@ -184,7 +189,7 @@ def test_a_recording_by_its_key_shows_what_it_records(
 
 def test_a_recording_that_is_ended_before_it_began_does_not_begin(qtbot: QtBot, live: LivePanel) -> None:
     release = threading.Event()
-    live.session.device_job("another", lambda _: release.wait(30), {"camera"})
+    live.session.jobs.device("another", lambda _: release.wait(30), {"camera"})
     live.record()
     live.record()
     release.set()
@@ -225,8 +230,8 @@ def test_leds_that_are_not_the_source_are_not_called_so(qtbot: QtBot, live: Live
     assert taken["light"] == "as-is"
     assert "bright field" in taken["led_pattern"]
     code = live.as_python()
-    pattern = bench.led_array.pattern
-    assert f"bench.led_array.set_pattern({pattern!r})" in code
+    assert "bench.led_array.set_pattern(LedPattern(" in code
+    assert all(str(level) in code for level in bench.led_array.pattern.levels)
     compile(code, "copied", "exec")
 
 
@@ -242,23 +247,23 @@ def test_stop_during_a_recording_leaves_it_dark(qtbot: QtBot, window: MainWindow
 
 
 def test_profile_and_cross_hair_follow_the_frame(qtbot: QtBot, live: LivePanel) -> None:
-    qtbot.mouseClick(live.profile_button, Qt.MouseButton.LeftButton)
-    qtbot.waitUntil(lambda: live._profile_curve.getData()[0] is not None, timeout=WAIT_MS)
-    assert len(live._profile_curve.getData()[0]) > 200
-    qtbot.mouseClick(live.cross_button, Qt.MouseButton.LeftButton)
-    live.view.clicked.emit(7, 9)
+    qtbot.mouseClick(live.picture.profile_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: live.picture._profile_curve.getData()[0] is not None, timeout=WAIT_MS)
+    assert len(live.picture._profile_curve.getData()[0]) > 200
+    qtbot.mouseClick(live.picture.cross_button, Qt.MouseButton.LeftButton)
+    live.picture.view.clicked.emit(7, 9)
     qtbot.waitUntil(lambda: "x 7  y 9" in live.status.text(), timeout=WAIT_MS)
 
 
 def test_levels_follow_percentiles_of_the_raw_data(qtbot: QtBot, live: LivePanel) -> None:
     qtbot.waitUntil(lambda: live.session.bench.scene_lit, timeout=WAIT_MS)
-    live.stretch.setCurrentText("1 – 99 %")
-    qtbot.waitUntil(lambda: live._levels[1] < 4000, timeout=WAIT_MS)
-    frame = live._shown
+    live.picture.stretch.setCurrentText("1 – 99 %")
+    qtbot.waitUntil(lambda: live.picture.levels[1] < 4000, timeout=WAIT_MS)
+    frame = live.picture.frame
     assert frame is not None
-    live.histogram.region.setRegion((10.0, 200.0))
-    assert live.stretch.currentText() == "by hand"
-    assert live._levels == (10.0, 200.0)
+    live.picture.histogram.region.setRegion((10.0, 200.0))
+    assert live.picture.stretch.currentText() == "by hand"
+    assert live.picture.levels == (10.0, 200.0)
 
 
 def test_a_frame_that_is_held_is_stretched_as_well(
@@ -268,14 +273,14 @@ def test_a_frame_that_is_held_is_stretched_as_well(
     qtbot.waitUntil(lambda: not live.session.live.is_running, timeout=WAIT_MS)
     live.look()
     live.count()
-    frame, drawn = live._shown, []
+    frame, drawn = live.picture.frame, []
     assert frame is not None
-    real = live.view.show_image
-    monkeypatch.setattr(live.view, "show_image", lambda *given: (drawn.append(given), real(*given)))
-    live.stretch.setCurrentText("full range")
-    assert live._levels == (0.0, frame.full_scale)
-    live.histogram.region.setRegion((10.0, 200.0))
-    assert live._shown is frame
+    real = live.picture.view.show_image
+    monkeypatch.setattr(live.picture.view, "show_image", lambda *given: (drawn.append(given), real(*given)))
+    live.picture.stretch.setCurrentText("full range")
+    assert live.picture.levels == (0.0, frame.full_scale)
+    live.picture.histogram.region.setRegion((10.0, 200.0))
+    assert live.picture.frame is frame
     levels = [given[1:3] for given in drawn]
     assert levels[0] == (0.0, frame.full_scale)
     assert levels[-1] == (10.0, 200.0)

@@ -47,11 +47,11 @@ def test_escape_stops_a_move_and_turns_the_light_off(qtbot: QtBot, window: MainW
     assert bench.stage is not None
     assert bench.led_array is not None
     stage = bench.stage
-    homed = session.device_job("home", lambda _: stage.home(), {"stage"})
+    homed = session.jobs.device("home", lambda _: stage.home(), {"stage"})
     qtbot.waitUntil(lambda: homed.is_over, timeout=WAIT_MS)
     bench.source_on()
     far = stage.limits["x_um"][1]
-    move = session.device_job("move", lambda _: stage.move_to({"x_um": far}), {"stage"})
+    move = session.jobs.device("move", lambda _: stage.move_to({"x_um": far}), {"stage"})
     qtbot.waitUntil(lambda: stage.is_moving, timeout=WAIT_MS)
     with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
         qtbot.keyClick(window, Qt.Key.Key_Escape)
@@ -234,7 +234,7 @@ def test_closing_asks_before_a_short_job_is_broken_off_and_not_before_a_listing(
     session = window.session
     gate = threading.Event()
     session.jobs.watch("Listing", lambda _: gate.wait(WAIT_MS / 1000))
-    job = session.device_job("Homing the stage", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
+    job = session.jobs.device("Homing the stage", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
     qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
     window.close()
     assert window.question is not None

@@ -6,7 +6,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from gui.widgets.number_edit import NumberEdit
+from gui.widgets.entry import NumberEdit
 
 
 def _field(qtbot: QtBot, unit: str = "ms", value: float | None = 10.0, **limits: float) -> NumberEdit:

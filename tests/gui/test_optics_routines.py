@@ -10,13 +10,13 @@ from pytestqt.qtbot import QtBot
 
 from gui.main_window import MainWindow
 from gui.panels.sweeps import SweepsPanel
-from instrument.bench.config_file import led_microscope_text
+from instrument.bench.config_file import template
 from instrument.files.calibration_file import load_calibration
 
 LEFT = Qt.MouseButton.LeftButton
 WAIT_MS = 120_000
 """Against a hang, not a slow machine."""
-MICROSCOPE = led_microscope_text().replace("pixels = 384", "pixels = 96")
+MICROSCOPE = template("led_microscope").replace("pixels = 384", "pixels = 96")
 SLIDES = """
 [bench]
 data_folder = "runs"
@@ -46,7 +46,7 @@ def carry_out(qtbot: QtBot, window: MainWindow, name: str, **numbers: str) -> Sw
     """Choose a routine, fill in its form, start it, and wait for its end."""
     panel = window.show_panel("sweeps")
     assert isinstance(panel, SweepsPanel)
-    panel.choice.setCurrentIndex([form.name for form in panel.forms].index(name))
+    panel.choice.setCurrentIndex([routine.name for routine in panel.routines].index(name))
     for field_name, text in numbers.items():
         field: Any = panel.view.widgets[field_name]
         if not field.isVisible():

@@ -19,7 +19,7 @@ from gui.panels.reconstructions import ReconstructionsPanel
 from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.dialogues import Question
-from gui.widgets.number_edit import NumberEdit
+from gui.widgets.entry import NumberEdit
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
@@ -428,7 +428,8 @@ def test_no_voxel_is_read_in_the_windows_thread(
     qtbot.waitUntil(lambda: view.projections is not None, timeout=WAIT_MS)
     qtbot.mouseClick(view.slices_button, Qt.MouseButton.LeftButton)
     view.go_to(5, 9, 8)
-    qtbot.waitUntil(lambda: [view.slices[a].index for a in "zyx"] == [5, 9, 8], timeout=WAIT_MS)
+    at = {"z": 5, "y": 9, "x": 8}
+    qtbot.waitUntil(lambda: {a: s.index for a, s in view.slices.items()} == at, timeout=WAIT_MS)
     assert threads
     assert threading.main_thread().name not in threads
 
@@ -445,9 +446,7 @@ def test_another_volume_ends_the_reading_of_the_first(
     assert panel.result.path.name == "b.npy"
     assert panel.volume.projections.front.max() == 2
     panel.shutdown()
-    qtbot.waitUntil(
-        lambda: not [t for t in threading.enumerate() if t.name == "volume slices"], timeout=WAIT_MS
-    )
+    qtbot.waitUntil(lambda: not panel.jobs.jobs, timeout=WAIT_MS)
 
 
 def test_the_red_theme_shows_nothing_but_red(

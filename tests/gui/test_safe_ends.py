@@ -31,7 +31,7 @@ def test_what_a_job_lights_in_the_middle_of_stop_is_turned_off(
         bench.source_on()
 
     monkeypatch.setattr(bench, "stop", slowly)
-    job = session.device_job("between two commands", work, {"stage"})
+    job = session.jobs.device("between two commands", work, {"stage"})
     job.ended.connect(job_is_over.set)
     qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
     with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
@@ -51,7 +51,7 @@ def test_stop_goes_on_until_a_late_job_has_ended(
         assert go_on.wait(WAIT_MS / 1000)
         session.bench.source_on()
 
-    job = session.device_job("Slow device", work, {"stage"})
+    job = session.jobs.device("Slow device", work, {"stage"})
     qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
     with qtbot.waitSignal(session.stopped, timeout=WAIT_MS):
         session.stop()
@@ -83,8 +83,8 @@ def test_what_fails_in_the_midst_of_stop_keeps_nothing_from_being_safe(
         assert over.wait(WAIT_MS / 1000)
         context.check()
 
-    job = session.device_job("with a broken callback", first, {"stage"})
-    asking = session.device_job("by hand", lambda _: session._ask("Please light the scene."), {"slm"})
+    job = session.jobs.device("with a broken callback", first, {"stage"})
+    asking = session.jobs.device("by hand", lambda _: session._ask("Please light the scene."), {"slm"})
     qtbot.waitUntil(lambda: goes_on.is_set() and bool(requests), timeout=WAIT_MS)
     requests[0].withdrawn = gone
     session.bench.source_on()
@@ -108,7 +108,7 @@ def test_what_is_asked_just_after_the_end_is_refused_and_not_shown(
         assert ended.wait(WAIT_MS / 1000)
         session._ask("Please light the scene.")
 
-    job = session.device_job("by hand", work, {"slm"})
+    job = session.jobs.device("by hand", work, {"slm"})
     qtbot.waitUntil(lambda: job.state is JobState.RUNNING, timeout=WAIT_MS)
     getattr(session, end)()
     ended.set()

@@ -41,7 +41,7 @@ def test_the_live_view_is_whole_on_a_small_screen(qtbot: QtBot, small: MainWindo
         live.live_button,
         live.light_buttons.buttons()[-1],
         live.form.widgets["exposure_ms"],
-        live.view,
+        live.picture.view,
         live.record_bar.button,
         live.record_bar.gauge,
     )
@@ -50,8 +50,8 @@ def test_the_live_view_is_whole_on_a_small_screen(qtbot: QtBot, small: MainWindo
     for widget in shown:
         place = QRect(widget.mapTo(small, QPoint(0, 0)), widget.size())
         assert inside.contains(place), widget
-    assert live.view.width() > 400
-    assert live.view.height() > 250
+    assert live.picture.view.width() > 400
+    assert live.picture.view.height() > 250
     for name in ("live_reconstruction", "stage", "led_array", "slm", "log"):
         panel = small.show_panel(name)
         assert panel.isVisible(), name

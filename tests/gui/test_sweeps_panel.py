@@ -252,7 +252,7 @@ def test_closing_during_a_run_asks_and_ends_it_safely(
 
 
 def test_a_plan_is_typed_checked_and_carried_out(qtbot: QtBot, panel: SweepsPanel) -> None:
-    panel.choose("plan")
+    panel.choice.setCurrentText("Plan")
     text: Any = panel.view.widgets["text"]
     text.selectAll()
     for line in ('label = "two"', "[[parts]]", 'label = "psf"', 'light = "sauce"'):
@@ -274,11 +274,11 @@ def test_a_plan_is_typed_checked_and_carried_out(qtbot: QtBot, panel: SweepsPane
 
 
 def test_every_routine_can_be_reached_by_the_keyboard(qtbot: QtBot, panel: SweepsPanel) -> None:
-    for number, form in enumerate(panel.forms):
+    for number, routine in enumerate(panel.routines):
         panel.choice.setFocus()
         assert panel.choice.currentIndex() == number
         for widget in panel.view.widgets.values():
-            assert widget.focusPolicy() & Qt.FocusPolicy.TabFocus, form.name
+            assert widget.focusPolicy() & Qt.FocusPolicy.TabFocus, routine.name
             assert widget.accessibleName()
             assert widget.toolTip() or isinstance(widget, QWidget)
         wait_for_check(qtbot, panel)
@@ -290,7 +290,7 @@ def test_a_sweep_that_waits_says_for_what_and_can_be_aborted(
 ) -> None:
     wait_for_check(qtbot, panel)
     gate = threading.Event()
-    job = window.session.device_job("Homing by hand", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
+    job = window.session.jobs.device("Homing by hand", lambda _: gate.wait(WAIT_MS / 1000), {"stage"})
     press(qtbot, panel.run_bar.start_button)
     qtbot.waitUntil(lambda: "aiting for: Homing by hand" in panel.run_bar.words.text(), timeout=WAIT_MS)
     press(qtbot, panel.run_bar.abort_button)

@@ -55,12 +55,12 @@ def choose(qtbot: QtBot, panel: SweepsPanel, name: str) -> None:
     qtbot.mouseClick(panel.choice, LEFT)
     popup = panel.choice.view()
     qtbot.waitUntil(popup.isVisible)
-    row = [form.name for form in panel.forms].index(name)
+    row = [routine.name for routine in panel.routines].index(name)
     place = popup.visualRect(panel.choice.model().index(row, 0)).center()
     qtbot.wait(QApplication.doubleClickInterval() + 50)  # a list takes no click sooner
     qtbot.mouseMove(popup.viewport(), place)
     qtbot.mouseClick(popup.viewport(), LEFT, pos=place)
-    qtbot.waitUntil(lambda: panel.form.name == name)
+    qtbot.waitUntil(lambda: panel.routine.name == name)
 
 
 @pytest.mark.slow

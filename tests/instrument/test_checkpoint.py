@@ -9,7 +9,7 @@ import tifffile
 from instrument.cli import main
 from instrument.files.errors import FileError
 from instrument.reconstruction.checkpointing import CheckpointFolder, digest
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import Fista, SensorAdmm, StoppingRules
 
@@ -111,7 +111,7 @@ def test_it_is_removed_where_nothing_is_left_to_do(files, run):
 
 def solver(kind=SensorAdmm):
     rng = np.random.default_rng(1)
-    camera = PadCropConvolution(rng.random((1, 5, 6)), (8, 9))
+    camera = Convolution(rng.random((1, 5, 6)), (8, 9))
     return kind(camera, rng.random((1, 8, 9)).astype(np.float32), TotalVariation(0.1) + NonNegativity())
 
 

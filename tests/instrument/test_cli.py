@@ -335,7 +335,7 @@ HEAVY = ("numba", "matplotlib", "zarr", "scipy", "dask", "PySide6")
 
 @pytest.mark.parametrize(
     "name",
-    ["new", "check", "devices", "snap", "run", "list", "export", "reconstruct", "chart", "hologram"],
+    ["new", "check", "devices", "snap", "run", "list", "export", "reconstruct", "chart", "hologram", "show"],
 )
 def test_a_commands_help_imports_no_heavy_library(name: str) -> None:
     code = (

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instrument.bench.config_file import default_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import bench_display, prepare_target
 from instrument.files.errors import BenchError, FileError
@@ -24,8 +24,8 @@ from recon.holography.judge import compare
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DIFFUSERBENCH_DEBUG", raising=False)
-    small = default_text().replace("shape = [1080, 1920]", "shape = [96, 128]")
-    assert small != default_text()
+    small = template().replace("shape = [1080, 1920]", "shape = [96, 128]")
+    assert small != template()
     Path("bench.toml").write_text(small.replace("expansion = 16 ", "expansion = 4 "))
     y, x = np.mgrid[:80, :120]
     picture = np.where((y - 40) ** 2 + (x - 60) ** 2 < 500, 220, 60 + x // 2)

@@ -8,8 +8,7 @@ import pytest
 from recon import InputError, Measurement, Problem, reconstruct
 from recon.base.metrics import psnr
 from recon.camera.base import estimate_norm
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import PatternedCamera
 from recon.reconstruction.result import window_of
 
@@ -19,7 +18,7 @@ SHAPE = (24, 30)
 def camera_of(lit: np.ndarray, dtype: type) -> PatternedCamera:
     """One PSF, lit by patterns."""
     window, _ = window_of("sensor", SHAPE, SHAPE)
-    return PatternedCamera(Convolution3D(psf()[None, None], SHAPE, dtype=dtype), lit, window)
+    return PatternedCamera(Convolution(psf()[None, None], SHAPE, dtype=dtype), lit, window)
 
 
 def psf() -> np.ndarray:
@@ -65,8 +64,8 @@ def test_adjoint_norm_and_the_plain_sum() -> None:
 
 def test_one_pattern_of_ones_is_the_ordinary_camera() -> None:
     ones = np.ones((1, *SHAPE))
-    x = np.random.default_rng(3).random(PadCropConvolution(psf()[None], SHAPE).domain_shape, np.float32)
-    plain = PadCropConvolution(psf()[None], SHAPE).forward(x)
+    x = np.random.default_rng(3).random(Convolution(psf()[None], SHAPE).domain_shape, np.float32)
+    plain = Convolution(psf()[None], SHAPE).forward(x)
     np.testing.assert_allclose(camera_of(ones, np.float32).forward(x[:, None]), plain, rtol=1e-4)
     measured = cast(scene())
     settings = {"iterations": 150, "tau": 1e-3, "noise": 1.0, "prior": "tv-haar"}

@@ -14,7 +14,7 @@ from calibration_routines.display.mask_alignment import AlignmentFailedError, Al
 from calibration_routines.display.slm_calibration import measure_flatness, measure_look_up_table
 from drivers.simulated.display import DisplayWorld
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import display_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.display.hologram import bench_display, load_alignment
 from instrument.files.images import write_image
@@ -36,7 +36,7 @@ SMALL = {
 
 
 def small(**changes: str) -> str:
-    text = display_text()
+    text = template("display")
     for key, value in (SMALL | changes).items():
         text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
         assert count == 1, key

@@ -13,7 +13,7 @@ import pytest
 from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSetup, dpc_optics
 from drivers.simulated.led_microscope import LedMicroscopeWorld, led_image
 from instrument.bench.bench import Bench, open_bench
-from instrument.bench.config_file import led_microscope_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from instrument.cli import main
 from instrument.files.errors import BenchError
 from instrument.runs.runner import RunStatus
@@ -30,7 +30,7 @@ from recon.errors import InputError
 from tests.mocks.listeners import Following
 
 SETUP = DpcSetup(objective_na=0.1, magnification=4.0)
-SMALL = led_microscope_text().replace("pixels = 384", "pixels = 160")
+SMALL = template("led_microscope").replace("pixels = 384", "pixels = 160")
 
 
 def small_bench(text: str = SMALL) -> Bench:

@@ -13,7 +13,7 @@ import pytest
 from drivers.device import Device, DriverOptions, port_claim
 from drivers.registry.claim import Claim, DeviceBusyError
 from instrument.bench.bench import Bench
-from instrument.bench.config_file import default_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from tests.mocks.devices import MockWorld
 
 pytestmark = pytest.mark.usefixtures("mock_drivers", "own_locks")
@@ -103,5 +103,5 @@ def test_devices_are_claimed_by_driver_and_options_unless_the_driver_knows_bette
 
     same = [Some.claims(Options(serial=serial)) for serial in ("a", "a", "b")]
     assert same[0] == same[1] != same[2]
-    simulated = parse_config(default_text(), None)
+    simulated = parse_config(template(), None)
     assert all(device.driver.claims(device.options) == () for device in simulated.devices.values())

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from drivers.registry.registry import KINDS, driver_names, load_driver
 from instrument.bench.config import DEVICE_TABLES, PLAIN_TABLES
-from instrument.bench.config_file import default_text, parse_config
+from instrument.bench.config_file import parse_config, template
 from instrument.bench.config_reference import reference
 from instrument.cli import COMMANDS
 from instrument.cli.reference import page as options_page
@@ -41,13 +41,13 @@ def test_the_configuration_reference_explains_every_key() -> None:
 
 
 def test_the_default_configuration_is_the_simulated_bench() -> None:
-    config = parse_config(default_text(), None)
+    config = parse_config(template(), None)
     assert {device.driver_name for device in config.devices.values()} == {"simulated"}
     assert set(config.devices) == set(DEVICE_TABLES)
 
 
 def test_the_default_configuration_shows_every_key() -> None:
-    text, config = default_text(), parse_config(default_text(), None)
+    text, config = template(), parse_config(template(), None)
     models = [*PLAIN_TABLES.values(), *DEVICE_TABLES.values()]
     models += [device.driver.Options for device in config.devices.values()]  # type: ignore[list-item]
     models += [shared.part.Options for shared in config.shared.values()]  # type: ignore[list-item]
@@ -58,7 +58,7 @@ def test_the_default_configuration_shows_every_key() -> None:
 def test_every_commented_key_of_the_default_configuration_is_understood() -> None:
     """A line that starts ``# key = value`` may lose its ``# ``, one at a time or all together."""
     commented = re.compile(r"^# (?=\w+ = )", re.MULTILINE)
-    text = default_text()
+    text = template()
     assert len(commented.findall(text)) > 10
     parse_config(commented.sub("", text), None)
     for match in commented.finditer(text):

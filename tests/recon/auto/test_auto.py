@@ -332,7 +332,7 @@ def test_a_strong_background_is_noticed_and_none_is_added_to_one_that_was_given(
 @pytest.mark.parametrize("factor", [2, 3])
 def test_binned_and_enlarged_keep_place_and_light(n, factor):
     rng = np.random.default_rng(0)
-    from recon.camera.convolution import PadCropConvolution
+    from recon.camera.convolution import Convolution
 
     psf = np.zeros((1, n, n), np.float32)
     psf[0, n // 2, n // 2] = 1
@@ -342,7 +342,7 @@ def test_binned_and_enlarged_keep_place_and_light(n, factor):
     # A point two blocks' worth off the axis: the binned camera finds it at its binned place.
     small_psf, small = (block_mean(i, factor, about_axis=True) for i in (psf, image))
     m = small.shape[0]
-    camera = PadCropConvolution(small_psf / small_psf.sum(), (m, m))
+    camera = Convolution(small_psf / small_psf.sum(), (m, m))
     x = np.zeros(camera.domain_shape, np.float32)
     x[0, camera.centre[0] + 1, camera.centre[1]] = 1
     seen = camera.forward(x)[0]

@@ -8,8 +8,9 @@ import pytest
 from recon.blind import BlindSettings, calibrate_from_beads
 from recon.blind.polish import first_psf, offset_of
 from recon.blind.psf_step import BeadMixer, limit_rank, solve_psfs
+from recon.camera.convolution import field_of
 from recon.camera.registration import displacement, shifted
-from recon.camera.varying_psfs import FieldOfPsfs, field_of, interpolation_weights, local_convolution
+from recon.camera.varying_psfs import FieldOfPsfs, interpolation_weights, local_convolution
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser
 from recon.optics.grid import PixelGrid, mixed_spectrum

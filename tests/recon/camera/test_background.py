@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.fft import dctn
 
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.priors import L1, NonNegativity
 from recon.solvers import StoppingRules
@@ -42,7 +42,7 @@ def test_background_is_recovered():
     psfs = np.zeros((3, 1, 24, 24))
     for z in range(3):
         psfs[z, 0].flat[rng.choice(24 * 24, 30, replace=False)] = 1
-    camera = Convolution3D(psfs, (32, 32), dtype=np.float64)
+    camera = Convolution(psfs, (32, 32), dtype=np.float64)
     truth = np.zeros(camera.domain_shape)
     truth[0, 1, 24:27, 26:29] = truth[0, 0, 30:34, 21:24] = 1
     y, x = np.mgrid[:32, :32] / 32

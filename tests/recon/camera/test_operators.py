@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import convolve2d
 
 from recon.camera.base import LinearOperator, estimate_norm
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 
 
@@ -38,7 +38,7 @@ CASES = [
 @pytest.mark.parametrize(("psf_shape", "sensor_shape", "n_channels"), CASES)
 def test_convolution_adjoint(psf_shape, sensor_shape, n_channels, dtype):
     psfs = np.random.default_rng(1).random(psf_shape)
-    operator = PadCropConvolution(psfs, sensor_shape, n_channels=n_channels, dtype=dtype)
+    operator = Convolution(psfs, sensor_shape, n_channels=n_channels, dtype=dtype)
     assert dot_test(operator) < (1e-5 if dtype == np.float32 else 1e-13)
     assert operator.forward(np.ones(operator.domain_shape, dtype)).dtype == dtype
 
@@ -47,7 +47,7 @@ def test_convolution_adjoint(psf_shape, sensor_shape, n_channels, dtype):
 def test_convolution_equals_direct_sum(psf_shape, sensor_shape, n_channels):
     rng = np.random.default_rng(2)
     psfs = rng.random(psf_shape)
-    operator = PadCropConvolution(psfs, sensor_shape, n_channels=n_channels, dtype=np.float64)
+    operator = Convolution(psfs, sensor_shape, n_channels=n_channels, dtype=np.float64)
     height, width = operator.field_shape
     x = np.zeros(operator.domain_shape)
     x[:, :height, :width] = rng.random((n_channels, height, width))
@@ -59,7 +59,7 @@ def test_convolution_equals_direct_sum(psf_shape, sensor_shape, n_channels):
 
 
 def test_pixels_beyond_the_field_do_not_reach_the_sensor():
-    operator = PadCropConvolution(np.ones((1, 6, 6)), (6, 6), dtype=np.float64)
+    operator = Convolution(np.ones((1, 6, 6)), (6, 6), dtype=np.float64)
     height, width = operator.field_shape
     assert operator.grid_shape > operator.field_shape
     x = np.ones(operator.domain_shape)
@@ -72,7 +72,7 @@ def test_pixels_beyond_the_field_do_not_reach_the_sensor():
 )
 def test_a_point_on_the_axis_casts_the_psf_with_centre_on_centre(psf_shape, sensor_shape):
     psf = np.random.default_rng(3).random(psf_shape)
-    operator = PadCropConvolution(psf[None], sensor_shape, dtype=np.float64)
+    operator = Convolution(psf[None], sensor_shape, dtype=np.float64)
     x = np.zeros(operator.domain_shape)
     x[0, operator.centre[0], operator.centre[1]] = 1
     image = operator.forward(x)[0]
@@ -86,7 +86,7 @@ def test_a_point_on_the_axis_casts_the_psf_with_centre_on_centre(psf_shape, sens
 
 def test_norm_bound_is_above_the_norm():
     psfs = np.random.default_rng(4).random((2, 5, 6))
-    operator = PadCropConvolution(psfs, (6, 7), dtype=np.float64)
+    operator = Convolution(psfs, (6, 7), dtype=np.float64)
     norm = np.linalg.norm(matrix(operator), 2)
     assert norm <= operator.norm_bound < 1.5 * norm
     assert estimate_norm(operator, iterations=300) == pytest.approx(norm, rel=1e-3)
@@ -94,7 +94,7 @@ def test_norm_bound_is_above_the_norm():
 
 def test_erasures_compose_with_the_camera():
     rng = np.random.default_rng(5)
-    camera = PadCropConvolution(rng.random((1, 4, 5)), (5, 6), n_channels=2, dtype=np.float64)
+    camera = Convolution(rng.random((1, 4, 5)), (5, 6), n_channels=2, dtype=np.float64)
     valid = rng.random((5, 6)) > 0.5
     erased = Erasures(valid, camera.range_shape, np.float64) @ camera
     assert dot_test(erased) < 1e-13
@@ -105,17 +105,17 @@ def test_erasures_compose_with_the_camera():
 
 
 def test_composition_refuses_what_does_not_fit():
-    camera = PadCropConvolution(np.ones((1, 4, 5)), (5, 6))
+    camera = Convolution(np.ones((1, 4, 5)), (5, 6))
     with pytest.raises(ValueError, match=r"takes .1, 6, 5., the inner one gives .1, 5, 6."):
         Erasures(np.ones((6, 5), bool), (1, 6, 5)) @ camera
-    with pytest.raises(ValueError, match="2 PSFs do not serve 3 channels"):
-        PadCropConvolution(np.ones((2, 4, 5)), (5, 6), n_channels=3)
+    with pytest.raises(ValueError, match="PSFs of 2 channels do not serve 3"):
+        Convolution(np.ones((2, 4, 5)), (5, 6), n_channels=3)
 
 
 def test_a_larger_grid_changes_no_measurement():
     rng = np.random.default_rng(3)
     psf = rng.random((1, 9, 11)).astype(np.float32)
-    plain, wide = (PadCropConvolution(psf, (12, 10), grid_shape=grid) for grid in (None, (25, 24)))
+    plain, wide = (Convolution(psf, (12, 10), grid_shape=grid) for grid in (None, (25, 24)))
     x = np.zeros(plain.domain_shape, np.float32)
     height, width = plain.field_shape
     x[:, :height, :width] = rng.random((height, width))
@@ -123,12 +123,12 @@ def test_a_larger_grid_changes_no_measurement():
     larger[:, :height, :width] = x[:, :height, :width]
     np.testing.assert_allclose(plain.forward(x), wide.forward(larger), rtol=1e-5)
     with pytest.raises(ValueError, match="does not hold"):
-        PadCropConvolution(psf, (12, 10), grid_shape=(19, 24))
+        Convolution(psf, (12, 10), grid_shape=(19, 24))
 
 
 def two_cameras(dtype=np.float64):
     rng = np.random.default_rng(7)
-    first, second = (PadCropConvolution(rng.random((2, 4, 5)), (6, 5), dtype=dtype) for _ in range(2))
+    first, second = (Convolution(rng.random((2, 4, 5)), (6, 5), dtype=dtype) for _ in range(2))
     return first, second, Erasures(rng.random((2, 6, 5)) > 0.3, (2, 6, 5), dtype)
 
 
@@ -186,9 +186,7 @@ def test_an_operator_is_called_as_scipy_calls_it():
 
 def test_what_does_not_fit_is_refused_by_shape():
     camera, _, erasures = two_cameras()
-    with pytest.raises(
-        ValueError, match=r"PadCropConvolution takes arrays of shape \(2, 9, 10\), not \(3,\)"
-    ):
+    with pytest.raises(ValueError, match=r"Convolution takes arrays of shape \(2, 9, 10\), not \(3,\)"):
         camera(np.zeros(3))
     with pytest.raises(ValueError, match="takes arrays of shape"):
         camera.H @ np.zeros(camera.domain_shape)

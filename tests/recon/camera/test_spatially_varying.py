@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.camera.base import estimate_norm
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.varying_psfs import (
     FieldOfPsfs,
     interpolation_weights,
@@ -80,7 +80,7 @@ def test_full_rank_equals_the_local_model(points):
 def test_one_point_is_the_camera_of_one_psf():
     f = field(GRID[:1])
     operator = local_convolution([f], (9, 11), dtype=np.float64)
-    camera = PadCropConvolution(f.psfs[0], (9, 11), dtype=np.float64)
+    camera = Convolution(f.psfs[0], (9, 11), dtype=np.float64)
     height, width = operator.domain_shape[2:]
     x = np.zeros(camera.domain_shape)
     x[0, :height, :width] = np.random.default_rng(4).random((height, width))

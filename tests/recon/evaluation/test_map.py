@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.errors import InputError
 from recon.evaluation.map_trials import _OffBalance
 from recon.evaluation.maps import MAPS, map_named, run_map
@@ -67,7 +67,7 @@ def test_the_catalogue_is_in_order() -> None:
 
 
 def test_penalties_off_balance_are_those_of_the_solver_times_a_factor() -> None:
-    operator = PadCropConvolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
+    operator = Convolution(np.eye(8, dtype=np.float32)[None] / 3, (8, 8))
     data = np.random.default_rng(1).random((1, 8, 8)).astype(np.float32)
     prior = TotalVariation(0.1) + NonNegativity()
     own = SensorAdmm(operator, data, prior)._mu

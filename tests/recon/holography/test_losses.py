@@ -126,14 +126,14 @@ def test_a_registered_loss_is_found_by_the_chart(registered):
 
 
 def test_a_registered_loss_is_found_by_the_terminal(registered, capsys, tmp_path: Path, monkeypatch):
-    from instrument.bench.config_file import default_text
+    from instrument.bench.config_file import template
     from instrument.cli import main
     from instrument.files.images import write_image
     from instrument.files.slm_image import read_slm_image
 
     monkeypatch.delitem(sys.modules, "instrument.cli.display", raising=False)
     monkeypatch.chdir(tmp_path)
-    small = default_text().replace("shape = [1080, 1920]", "shape = [96, 128]")
+    small = template().replace("shape = [1080, 1920]", "shape = [96, 128]")
     Path("bench.toml").write_text(small.replace("expansion = 16 ", "expansion = 4 "))
     write_image("picture.png", (RNG.random((80, 80)) * 255).astype(np.uint8))
     assert main(["hologram", "--help"]) == 0

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.registry import Registry
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.errors import InputError, StructureError
@@ -57,7 +56,7 @@ class PositiveRidge(Ridge):
 
 def problem(n_channels=2):
     rng = np.random.default_rng(0)
-    camera = PadCropConvolution(rng.random((n_channels, 5, 6)), (9, 8), dtype=np.float64)
+    camera = Convolution(rng.random((n_channels, 5, 6)), (9, 8), dtype=np.float64)
     x = np.maximum(rng.standard_normal(camera.domain_shape), 0)
     data = camera.forward(x) + 0.1 * rng.standard_normal(camera.range_shape)
     return Erasures(rng.random((1, 9, 8)) > 0.1, data.shape, np.float64) @ camera, data
@@ -181,7 +180,7 @@ def test_names_are_objects_in_one_registry():
 
 def volume_problem():
     rng = np.random.default_rng(1)
-    camera = Convolution3D(rng.random((3, 1, 5, 6)), (9, 8), dtype=np.float64)
+    camera = Convolution(rng.random((3, 1, 5, 6)), (9, 8), dtype=np.float64)
     x = np.maximum(rng.standard_normal(camera.domain_shape), 0)
     data = camera.forward(x) + 0.1 * rng.standard_normal(camera.range_shape)
     valid = rng.random((9, 8)) > 0.1
@@ -192,7 +191,7 @@ def varying_problem():
     rng = np.random.default_rng(2)
     points = np.array([(y, x) for y in (-4.0, 4.0) for x in (-4.0, 4.0)])
     fields = [FieldOfPsfs(rng.random((4, 1, 5, 6)), points) for _ in range(2)]
-    central = Convolution3D(np.stack([f.psfs[0] for f in fields]), (9, 8), dtype=np.float64)
+    central = Convolution(np.stack([f.psfs[0] for f in fields]), (9, 8), dtype=np.float64)
     camera = local_convolution(fields, (9, 8), grid_shape=central.grid_shape, dtype=np.float64)
     data = camera.forward(np.maximum(rng.standard_normal(camera.domain_shape), 0))
     valid = rng.random((9, 8)) > 0.1

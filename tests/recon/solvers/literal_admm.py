@@ -9,12 +9,19 @@ from typing import ClassVar
 
 import numpy as np
 
+from recon.base import fft
 from recon.camera.base import Array, LinearOperator
+from recon.camera.convolution import Convolution
 from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import Differences
 from recon.solvers.base import IterationRecord, Solver
 from recon.solvers.prior_splits import split_prior
+
+
+def circular(camera: Convolution, x: Array) -> Array:
+    """Return what a sensor as large as the grid would see: the circular convolution ``M x``."""
+    return fft.irfft(fft.rfft(x) * camera.spectrum[:, 0], camera.grid_shape[1])
 
 
 class LiteralAdmm(Solver):
@@ -23,7 +30,7 @@ class LiteralAdmm(Solver):
     Parameters
     ----------
     operator : LinearOperator
-        A ``PadCropConvolution``, with or without ``Erasures``; its dtype is that of all arithmetic
+        A ``Convolution``, with or without ``Erasures``; its dtype is that of all arithmetic
         (NumPy's FFTs keep single precision).
     data : ndarray, ``operator.range_shape``
     prior : Prior
@@ -58,13 +65,14 @@ class LiteralAdmm(Solver):
 
         # D of A.4 as a mask on the whole grid, and b on the same grid.
         self.D = np.zeros(shape, dtype)
-        self.D[convolution.sensor_window] = structure.weight
+        window = (..., *convolution.sensor_window)
+        self.D[window] = structure.weight
         self.b = np.zeros(shape, dtype)
-        self.b[convolution.sensor_window] = np.where(structure.weight > 0, data, 0)
+        self.b[window] = np.where(structure.weight > 0, data, 0)
 
         point = np.zeros(shape, dtype)
         point[:, 0, 0] = 1
-        self.M = np.fft.fft2(convolution.circular(point))
+        self.M = np.fft.fft2(circular(convolution, point))
         psi_psi = np.fft.fft2(self.psi.adjoint(self.psi.forward(point))).real
         self.denominator = self.mu_1 * np.abs(self.M) ** 2 + self.mu_2 * psi_psi + self.mu_3
         self.y = np.zeros(shape, dtype)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.camera.base import Array
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.solvers.base import IterationRecord, Solver
 
 
@@ -25,7 +25,7 @@ class LiteralAdmm(Solver):
 
     Parameters
     ----------
-    operator : Convolution3D
+    operator : Convolution
         One channel.
     data : ndarray, (1, height, width)
     weight : float
@@ -47,7 +47,7 @@ class LiteralAdmm(Solver):
 
     def __init__(
         self,
-        operator: Convolution3D,
+        operator: Convolution,
         data: Array,
         weight: float,
         *,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from recon.base import fft
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, Differences, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, Penalties, StoppingRules, StopReason
 from recon.solvers.prior_splits import split_prior
-from tests.recon.solvers.literal_admm import LiteralAdmm
+from tests.recon.solvers.literal_admm import LiteralAdmm, circular
 
 PRIORS = {
     "tv": TotalVariation(0.05, tolerance=1e-8) + NonNegativity(),
@@ -27,7 +27,7 @@ def problem(n_channels=1, erased=False, dtype=np.float64):
     rng = np.random.default_rng(0)
     psfs = rng.random((n_channels, 7, 8)) * (rng.random((n_channels, 7, 8)) > 0.7)
     psfs[:, 3, 4] += 2
-    camera = PadCropConvolution(psfs, (9, 10), dtype=dtype)
+    camera = Convolution(psfs, (9, 10), dtype=dtype)
     scene = np.zeros(camera.domain_shape, dtype)
     scene[:, 5:9, 6:11] = 1
     operator = camera
@@ -66,11 +66,12 @@ def test_is_the_textbook_s_admm_step_by_step(name, relax):
     tv, separable, _ = split_prior(PRIORS[name])
     camera, size = operator.inner, int(np.prod(operator.domain_shape))
     points = np.eye(size).reshape(size, *operator.domain_shape)
-    M = np.stack([camera.circular(p).ravel() for p in points], axis=1)
+    M = np.stack([circular(camera, p).ravel() for p in points], axis=1)
     psi = Differences(operator.domain_shape, (1.0, 1.0), dtype=np.float64)
     Psi = np.stack([psi.forward(p).ravel() for p in points], axis=1)
     mask, b = np.zeros(operator.domain_shape), np.zeros(operator.domain_shape)
-    mask[camera.sensor_window], b[camera.sensor_window] = operator.outer.valid, data
+    window = (..., *camera.sensor_window)
+    mask[window], b[window] = operator.outer.valid, data
     mask, b = mask.ravel(), b.ravel()
     weight = tv.weight if tv else 0.0
 
@@ -79,7 +80,7 @@ def test_is_the_textbook_s_admm_step_by_step(name, relax):
         length = np.linalg.norm(pair, axis=0) if tv and tv.isotropic else np.abs(pair)
         return (pair * np.maximum(1 - weight / mu / np.maximum(length, 1e-300), 0)).ravel()
 
-    power = float(np.mean(camera.power))
+    power = float(np.mean(camera.power()))
     splits = [
         (M, 0.5, lambda t, mu: (b + mu * t) / (mask + mu)),
         (Psi, 0.8 * power, prox_u),

@@ -7,8 +7,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution, low_rank
 from recon.priors import L1, NonNegativity, TotalVariation
@@ -33,16 +32,16 @@ TV = TotalVariation(0.02, tolerance=1e-6) + NonNegativity()
 
 
 def picture_camera():
-    camera = PadCropConvolution(PICTURE_PSF, SENSOR, dtype=np.float64)
+    camera = Convolution(PICTURE_PSF, SENSOR, dtype=np.float64)
     return Erasures(VALID, camera.range_shape, np.float64) @ camera
 
 
 def volume_camera():
-    return Convolution3D(VOLUME_PSFS, SENSOR, dtype=np.float64)
+    return Convolution(VOLUME_PSFS, SENSOR, dtype=np.float64)
 
 
 def central():
-    return Convolution3D(FIELD[0].psfs[:1], SENSOR, dtype=np.float64)
+    return Convolution(FIELD[0].psfs[:1], SENSOR, dtype=np.float64)
 
 
 def varying(kind):

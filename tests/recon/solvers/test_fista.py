@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import L1, NonNegativity, Zero
 from recon.solvers import Fista, StoppingRules, StopReason
 
@@ -18,7 +18,7 @@ def problem():
     rng = np.random.default_rng(0)
     psf = rng.random((1, 4, 5)) * (rng.random((1, 4, 5)) > 0.6)
     psf[0, 1, 2] += 4
-    operator = PadCropConvolution(psf, (6, 5), dtype=np.float64)
+    operator = Convolution(psf, (6, 5), dtype=np.float64)
     x = np.zeros(operator.domain_shape)
     x[0, 4, 5], x[0, 6, 3] = 1, 2
     data = operator.forward(x) + 0.01 * rng.standard_normal(operator.range_shape)

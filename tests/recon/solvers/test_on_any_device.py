@@ -10,7 +10,7 @@ import recon
 from recon.base import threads
 from recon.base.metrics import psnr
 from recon.base.namespace import array_namespace, require_memory
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.errors import InputError
 from recon.priors import L1, NonNegativity, TotalVariation
@@ -42,7 +42,7 @@ def one_thread():
 def problem(dtype=np.float64, n_z=5):
     rng = np.random.default_rng(0)
     psfs = (rng.standard_normal((n_z, 1, 10, 9)) + 0.2).astype(dtype)
-    operator = Convolution3D(psfs, SENSOR, dtype=dtype)
+    operator = Convolution(psfs, SENSOR, dtype=dtype)
     x = np.zeros(operator.domain_shape, dtype)
     x[0, n_z // 2, 3:7, 4:7] = 1
     x[0, min(1, n_z - 1), 5:8, 2:6] += 2
@@ -184,9 +184,9 @@ def test_a_volume_on_the_device_is_that_of_the_host(monkeypatch, prior):
     calibration = recon.Calibration(
         psfs, np.stack([0 * np.ones(3), 0 * np.ones(3), np.arange(1.0, 4)], axis=1)
     )
-    x = np.zeros((1, 3, *Convolution3D(psfs, (16, 18)).grid_shape), np.float32)
+    x = np.zeros((1, 3, *Convolution(psfs, (16, 18)).grid_shape), np.float32)
     x[0, 1, 14:18, 15:20] = 5
-    measurement = Convolution3D(psfs, (16, 18)).forward(x)[0] + rng.normal(0, 0.05, (16, 18))
+    measurement = Convolution(psfs, (16, 18)).forward(x)[0] + rng.normal(0, 0.05, (16, 18))
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "cupy", None)
         with pytest.raises(InputError, match="needs CuPy"):

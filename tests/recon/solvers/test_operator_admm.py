@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base import fft, threads
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval, Erasures
 from recon.camera.varying_psfs import FieldOfPsfs, local_convolution
 from recon.priors import L1, NonNegativity, TotalVariation
@@ -30,7 +30,7 @@ def problem(n_z=2, seed=0):
     field = (SENSOR[0] + 6, SENSOR[1] + 7)
     grid = (fft.fast_length(field[0]), fft.fast_length(field[1]))
     camera = local_convolution(fields, SENSOR, grid_shape=grid, dtype=np.float64)
-    central = Convolution3D(np.stack([f.psfs[4] for f in fields]), SENSOR, dtype=np.float64)
+    central = Convolution(np.stack([f.psfs[4] for f in fields]), SENSOR, dtype=np.float64)
     x = np.zeros(camera.domain_shape)
     x[0, 0, 8:12, 9:12], x[0, -1, 6:9, 12] = 1.0, 2.0
     data = camera.forward(x)
@@ -123,7 +123,7 @@ def test_needs_a_tenth_of_the_iterations_of_fista():
     rng = np.random.default_rng(6)
     fields = [FieldOfPsfs(rng.random((1, 1, 7, 8)) * (1 + 0.2 * rng.random((9, 1, 1, 1))), POINTS)]
     camera = local_convolution(fields, SENSOR, dtype=np.float64)
-    central = Convolution3D(fields[0].psfs[4:5], SENSOR, dtype=np.float64)
+    central = Convolution(fields[0].psfs[4:5], SENSOR, dtype=np.float64)
     x = np.zeros(camera.domain_shape)
     x[0, 0, 4:14, 4:12] = rng.random((10, 8))
     data = camera.forward(x) + 0.01 * rng.standard_normal(camera.range_shape)

@@ -10,8 +10,7 @@ import scipy.fft
 
 from recon.base import fft
 from recon.base.metrics import psnr
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.camera.factors import Erasures
 from recon.priors import L1, Box, HaarTotalVariation, NonNegativity, TotalVariation, Zero
 from recon.solvers import Admm, Fista, SensorAdmm, StoppingRules, StopReason, cosine_preconditioner
@@ -35,7 +34,7 @@ def problem(n_channels=1, *, erased=False, dtype=np.float64, sensor=(9, 10), sha
     psfs = rng.random((1 if shared_psf else n_channels, 7, 8))
     psfs *= rng.random(psfs.shape) > 0.7
     psfs[:, 3, 4] += 2
-    camera = PadCropConvolution(psfs, sensor, n_channels=n_channels, dtype=dtype)
+    camera = Convolution(psfs, sensor, n_channels=n_channels, dtype=dtype)
     scene = np.zeros(camera.domain_shape, dtype)
     scene[:, 5:9, 6:11] = 1
     data = (camera.forward(scene) + 0.02 * rng.standard_normal(camera.range_shape)).astype(dtype)
@@ -93,7 +92,7 @@ def test_a_dense_scene_converges_in_few_iterations(shoot):
     # at its lowest frequencies than elsewhere.
     shot = shoot(91, 111, snr=100)
     energy = float(np.linalg.norm(shot.psf))
-    camera = PadCropConvolution((shot.psf / energy)[None], shot.psf.shape)
+    camera = Convolution((shot.psf / energy)[None], shot.psf.shape)
     data = (shot.measurement / shot.noise)[None].astype(np.float32)
     prior = TotalVariation(0.5) + NonNegativity()
     (row, column), (height, width) = camera.centre, camera.sensor_shape
@@ -111,8 +110,10 @@ def test_a_dense_scene_converges_in_few_iterations(shoot):
 
 def test_numbers_do_not_depend_on_units():
     operator, data = problem()
-    brighter = PadCropConvolution(
-        3 * fft.irfft(operator.spectrum.copy(), operator.grid_shape[1])[:, :7, :8], (9, 10), dtype=np.float64
+    brighter = Convolution(
+        3 * fft.irfft(operator.spectrum[:, 0].copy(), operator.grid_shape[1])[:, :7, :8],
+        (9, 10),
+        dtype=np.float64,
     )
     x = run(operator, data, PRIORS["tv"], 20, 0).solution
     twice = run(operator, 2 * data, TotalVariation(0.1) + NonNegativity(), 20, 0).solution
@@ -194,7 +195,7 @@ def test_refuses_what_it_has_no_fast_way_for():
     operator, data = problem()
     with pytest.raises(TypeError, match="HaarTotalVariation"):
         SensorAdmm(operator, data, HaarTotalVariation(0.1))
-    volume = Convolution3D(np.ones((2, 1, 3, 3)), (4, 5), dtype=np.float64)
+    volume = Convolution(np.ones((2, 1, 3, 3)), (4, 5), dtype=np.float64)
     with pytest.raises(TypeError, match="ista"):
         SensorAdmm(volume, np.zeros((1, 4, 5)), Zero())
 
@@ -211,7 +212,7 @@ def system_matrix(camera, mu):
 
 
 def preconditioner_matrix(camera, mu):
-    preconditioner = CosinePreconditioner(camera.power[0], camera.grid_shape, camera.sensor_shape)
+    preconditioner = CosinePreconditioner(camera.power()[0], camera.grid_shape, camera.sensor_shape)
     preconditioner.set_penalties(*mu)
     units = np.eye(np.prod(camera.sensor_shape)).reshape(-1, *camera.sensor_shape)
     return np.stack([preconditioner.apply(u, np.empty_like(u)).ravel() for u in units], axis=1)
@@ -219,7 +220,7 @@ def preconditioner_matrix(camera, mu):
 
 def smooth_camera(sensor, psf_shape):
     rng = np.random.default_rng(1)
-    return PadCropConvolution(1 + rng.random((1, *psf_shape)), sensor, dtype=np.float64)
+    return Convolution(1 + rng.random((1, *psf_shape)), sensor, dtype=np.float64)
 
 
 @pytest.mark.parametrize("psf_shape", [(9, 12), (4, 5), (15, 17)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base import threads
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.priors import L1, NonNegativity, TotalVariation
 from recon.solvers import Fista, StoppingRules, StopReason
 from recon.solvers.douglas_rachford import SparseDouglasRachford
@@ -21,7 +21,7 @@ def problem(n_z=5, psf=(10, 9), sensor=(12, 11), dtype=np.float64, seed=0):
     """PSFs of both signs: without a dominating mean, plain methods converge as well."""
     rng = np.random.default_rng(seed)
     psfs = rng.standard_normal((n_z, 1, *psf)) + 0.2
-    operator = Convolution3D(psfs.astype(dtype), sensor, dtype=dtype)
+    operator = Convolution(psfs.astype(dtype), sensor, dtype=dtype)
     x = np.zeros(operator.domain_shape, dtype)
     x[0, n_z // 2, 3:7, 4:7] = 1
     x[0, min(1, n_z - 1), 5:8, 2:6] += 2
@@ -253,7 +253,7 @@ def thin_scene(n_z=12):
     """Light in two planes of a dozen only."""
     rng = np.random.default_rng(3)
     psfs = rng.standard_normal((n_z, 1, 12, 12)) + 0.2
-    operator = Convolution3D(psfs, (14, 14), dtype=np.float64)
+    operator = Convolution(psfs, (14, 14), dtype=np.float64)
     x = np.zeros(operator.domain_shape)
     x[0, 3, 10:13, 9], x[0, 8, 12, 12] = 1.0, 2.0
     data = operator.forward(x)

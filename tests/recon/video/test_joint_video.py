@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from recon import InputError
-from recon.camera.convolution import PadCropConvolution
+from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm
 from recon.streams.joint import JointAdmm, OverTimeName, solve_together
@@ -73,11 +73,11 @@ def test_low_rank_plus_sparse_settles_at_the_minimum_and_tells_the_parts() -> No
     assert np.abs(rest).max() == pytest.approx(0.3, rel=1e-2)
 
 
-def problem(n_frames: int = 4) -> tuple[PadCropConvolution, np.ndarray]:
+def problem(n_frames: int = 4) -> tuple[Convolution, np.ndarray]:
     rng = np.random.default_rng(1)
     psf = rng.random((1, 12, 14)) ** 6
     psf /= np.linalg.norm(psf)
-    camera = PadCropConvolution(psf, (12, 14), n_channels=n_frames, dtype=np.float64)
+    camera = Convolution(psf, (12, 14), n_channels=n_frames, dtype=np.float64)
     scene = np.zeros(camera.domain_shape)
     scene[:, 8:14, 9:16] = 5
     scene[2:, 10:12, 11:13] += 6
@@ -130,7 +130,7 @@ def test_time_helps_where_frames_are_alike() -> None:
     psf = (rng.random((24, 28)) ** 8).astype(np.float32)
     scene = np.zeros((24, 28), np.float32)
     scene[8:14, 9:16] = 1
-    wide = PadCropConvolution(psf[None], (24, 28))
+    wide = Convolution(psf[None], (24, 28))
     whole = np.zeros(wide.domain_shape, np.float32)
     top, left = wide.centre[0] - 12, wide.centre[1] - 14
     whole[0, top : top + 24, left : left + 28] = scene

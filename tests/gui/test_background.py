@@ -6,7 +6,7 @@ import threading
 
 from pytestqt.qtbot import QtBot
 
-from gui.background_reading import NewestOnly
+from gui.background import NewestOnly
 from gui.jobs import JobRunner
 
 WAIT_MS = 60_000

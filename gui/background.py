@@ -1,16 +1,72 @@
-"""Keeps a live reconstruction on whatever stream the live view's camera runs."""
+"""Work beside the window: files read in quiet jobs, and a live reconstruction on whatever stream runs."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 from drivers.common.stream import FrameStream
 from drivers.errors import DeviceError
+from gui.jobs import Job, JobRunner
 from instrument.files.errors import BenchError, in_words
 from instrument.live.live import LiveResult, LiveStatus, LiveView
 from instrument.live.live_camera import LiveCamera
 from recon.errors import InputError
 from recon.streams.live import LiveReconstructor
+
+Read = Callable[[], Any]
+Done = Callable[[Any], object]
+
+
+class NewestOnly:
+    """Reads one thing at a time, in quiet jobs; what was not begun gives way to a newer one of its kind.
+
+    What was read while something newer was asked for is shown all the same, so that a slider that is pulled
+    shows something, unless ``forget`` came in between.
+
+    Parameters
+    ----------
+    jobs : JobRunner
+    title : str
+    failed : callable, optional
+        Called with the reason, in words, where something could not be read.
+    """
+
+    def __init__(self, jobs: JobRunner, title: str, failed: Callable[[str], object] | None = None) -> None:
+        self._jobs = jobs
+        self._title = title
+        self._failed = failed
+        self._job: Job | None = None
+        self._wanted: dict[str, tuple[Read, Done]] = {}
+        self._epoch = 0
+
+    def ask(self, read: Read, done: Done, kind: str = "") -> None:
+        """Have ``read`` called in a job's thread, then ``done`` with its result in the window's."""
+        self._wanted[kind] = (read, done)
+        if self._job is None:
+            self._begin()
+
+    def forget(self, last: Read | None = None) -> None:
+        """Drop what was asked for, begun or not; ``last`` is called in a job's thread after what is read."""
+        self._wanted.clear()
+        self._epoch += 1
+        if last is not None:
+            self.ask(last, lambda _: None)
+
+    def _begin(self) -> None:
+        if not self._wanted:
+            return
+        (read, done), epoch = self._wanted.pop(next(iter(self._wanted))), self._epoch
+        self._job = job = self._jobs.watch(self._title, lambda _: read())
+        job.succeeded.connect(lambda value: done(value) if epoch == self._epoch else None)
+        if self._failed is not None:
+            job.failed.connect(self._failed)
+        job.ended.connect(self._ended)
+
+    def _ended(self) -> None:
+        self._job = None
+        self._begin()
 
 
 class LiveFollower:

@@ -6,8 +6,7 @@ from scipy.signal import convolve2d
 
 from recon.base import threads
 from recon.camera.base import estimate_norm
-from recon.camera.convolution import PadCropConvolution
-from recon.camera.convolution3d import Convolution3D
+from recon.camera.convolution import Convolution
 from recon.errors import InputError
 
 
@@ -29,13 +28,13 @@ def dot_test(operator, rtol, seed=0):
 )
 def test_adjoint(psf_shape, sensor, n_z, channels, dtype, rtol):
     psfs = np.random.default_rng(1).random((n_z, 1, *psf_shape)).astype(dtype)
-    dot_test(Convolution3D(psfs, sensor, n_channels=channels, dtype=dtype), rtol)
+    dot_test(Convolution(psfs, sensor, n_channels=channels, dtype=dtype), rtol)
 
 
 def test_equals_a_sum_of_full_convolutions():
     rng = np.random.default_rng(2)
     psfs = rng.random((3, 2, 5, 6))
-    operator = Convolution3D(psfs, (7, 8), dtype=np.float64)
+    operator = Convolution(psfs, (7, 8), dtype=np.float64)
     x = np.zeros(operator.domain_shape)
     height, width = operator.field_shape
     x[..., :height, :width] = rng.random((2, 3, height, width))
@@ -49,8 +48,8 @@ def test_equals_a_sum_of_full_convolutions():
 def test_one_depth_is_the_camera_of_one_depth():
     rng = np.random.default_rng(3)
     psf = rng.random((1, 1, 6, 5))
-    flat = PadCropConvolution(psf[0], (8, 9), dtype=np.float64)
-    deep = Convolution3D(psf, (8, 9), dtype=np.float64)
+    flat = Convolution(psf[0], (8, 9), dtype=np.float64)
+    deep = Convolution(psf, (8, 9), dtype=np.float64)
     x = rng.random(flat.domain_shape)
     np.testing.assert_allclose(deep.forward(x[:, None]), flat.forward(x), rtol=1e-12)
     assert deep.centre == flat.centre
@@ -58,13 +57,13 @@ def test_one_depth_is_the_camera_of_one_depth():
 
 
 def test_norm_bound_holds():
-    operator = Convolution3D(np.random.default_rng(4).random((4, 1, 8, 8)), (8, 8), dtype=np.float64)
+    operator = Convolution(np.random.default_rng(4).random((4, 1, 8, 8)), (8, 8), dtype=np.float64)
     assert 0.3 * operator.norm_bound < estimate_norm(operator) <= operator.norm_bound
 
 
 def test_threads_do_not_change_a_bit():
     rng = np.random.default_rng(5)
-    operator = Convolution3D(rng.random((13, 1, 9, 8)).astype(np.float32), (9, 8))
+    operator = Convolution(rng.random((13, 1, 9, 8)).astype(np.float32), (9, 8))
     x = rng.random(operator.domain_shape).astype(np.float32)
     before = threads.get_threads()
     try:
@@ -79,4 +78,4 @@ def test_threads_do_not_change_a_bit():
 
 def test_refuses_an_empty_depth_list():
     with pytest.raises(InputError, match="list of depths is empty"):
-        Convolution3D(np.zeros((0, 1, 4, 4), np.float32), (4, 4))
+        Convolution(np.zeros((0, 1, 4, 4), np.float32), (4, 4))

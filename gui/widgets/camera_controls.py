@@ -1,0 +1,318 @@
+"""What the live view does with the camera: its settings, as it reads them back, and recordings."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
+
+from drivers.camera import Camera, Roi
+from gui.forms.fields import Behaviour, ChoiceField, NumberField
+from gui.forms.options_form import OptionsForm
+from gui.jobs import BusyError, Job, JobContext
+from gui.panel import Panel
+from gui.widgets.building import button, every, fill, in_row, label
+from gui.widgets.dialogues import TextWindow
+from gui.widgets.entry import Entry, NumberEdit
+from instrument.bench.camera_settings import CameraOptions, CameraState, read_camera
+from instrument.bench.photograph import Lit
+from instrument.files.errors import FileError, duration, size
+from instrument.plan.abilities import SPARE_BYTES
+from instrument.runs.acquire import free_bytes, there_now
+from instrument.runs.recorder import Recorder, RecordingStatus, prepare_recording
+from instrument.runs.run import Run
+from recon.base.declare import options_of
+
+_READ_BACK_MS = 3000
+_WHILE_RUNNING = ("exposure_ms", "gain")
+"""What is set while the stream runs; for the others it pauses."""
+_SET = tuple(o.name for o in options_of(CameraOptions))
+
+
+class CameraForm(QWidget):
+    """Exposure, gain, binning, format, black level, region, temperature.
+
+    Parameters
+    ----------
+    panel : Panel
+        Where refusals are shown.
+    """
+
+    def __init__(self, panel: Panel) -> None:
+        super().__init__(panel)
+        self._panel = panel
+        self._session = panel.session
+        self.state: CameraState | None = None
+        self.form = OptionsForm(
+            [CameraOptions],
+            {
+                "binning": Behaviour(offers=lambda: self._offered("binnings")),
+                "pixel_format": Behaviour(offers=lambda: self._offered("pixel_formats")),
+            },
+        )
+        self.widgets = self.form.widgets
+        self.form.refused.connect(panel.refused)
+        self.form.settled.connect(self._settled)
+        self.temperature = label("–")
+        self.temperature.setToolTip("Of the sensor or camera, degrees Celsius, where it has a thermometer")
+        self._temperature_name = label("Temperature")
+        tip = "Everything that the camera reports of itself"
+        self.all_button = button("All settings …", tip, self._show_all)
+        fill(self, self.form, in_row(self._temperature_name, (self.temperature, 1), self.all_button))
+        self._session.device_changed.connect(self._device_changed)
+        self._timer = every(self, _READ_BACK_MS, self.read_back)
+        self._device_changed("camera")
+
+    def shutdown(self) -> None:
+        """End the timer."""
+        self._timer.stop()
+
+    def read_back(self) -> None:
+        """Ask the camera for all settings, unless something else uses it."""
+        if not self._session.is_open("camera") or self._session.jobs.is_busy("camera"):
+            return
+        job = self._session.jobs.device(
+            "Reading the camera", lambda _: read_camera(self._session.bench.camera), {"camera"}, quiet=True
+        )
+        job.succeeded.connect(self._show)
+
+    def set_region(self, region: Roi | None) -> Job | None:
+        """Send a region (None: the whole sensor) to the camera."""
+        return self._set("roi", region)
+
+    def _offered(self, name: str) -> list[str]:
+        return [] if self.state is None else [str(word) for word in getattr(self.state, name)]
+
+    def _settled(self, name: str) -> None:
+        """Send what was typed or chosen, unless it is in force."""
+        if self.state is None:
+            return
+        value = self.form.value(name)
+        if value != getattr(self.state, name):
+            self._set(name, value)
+
+    def _set(self, name: str, value: Any) -> Job | None:
+        def work(camera: Camera) -> CameraState:
+            getattr(camera, f"set_{name}")(value)
+            return read_camera(camera)
+
+        words = f"{self.form.fields[name].bare_label} of the camera"
+        try:
+            job = self._session.camera_job(words, work, idle=name not in _WHILE_RUNNING)
+        except BusyError as error:
+            self._refuse(name, str(error))
+            return None
+        job.succeeded.connect(lambda state: self._taken(name, state))
+        job.failed.connect(lambda why: self._refuse(name, why))
+        return job
+
+    def _taken(self, name: str, state: CameraState) -> None:
+        self._panel.accepted()
+        widget = self.widgets[name]
+        if isinstance(widget, QLineEdit):
+            widget.setModified(False)
+        self._show(state)
+
+    def _refuse(self, name: str, why: str) -> None:
+        widget = self.widgets[name]
+        if isinstance(widget, NumberEdit | Entry):
+            widget.setModified(True)
+            widget.refuse(why)  # what was typed stays to be corrected
+        else:
+            self._show(self.state)
+            self.form.refuse(name, why)
+            self._panel.refused(None, why)
+
+    def _device_changed(self, kind: str) -> None:
+        if kind == "camera":
+            self.setEnabled(self._session.is_open("camera"))
+            self.read_back()
+
+    def _show(self, state: CameraState | None) -> None:
+        """Show what was read back."""
+        if state is None:
+            return
+        self.state = state
+        for name, limits in (("exposure_ms", state.exposure_limits_ms), ("gain", state.gain_limits)):
+            number = self.form.fields[name]
+            assert isinstance(number, NumberField)
+            number.set_limits(*limits)
+        for name, offered in (("binning", "binnings"), ("pixel_format", "pixel_formats")):
+            choice = self.form.fields[name]
+            assert isinstance(choice, ChoiceField)
+            if not choice.is_being_edited:
+                choice.offer(self._offered(offered))
+        present = {name: getattr(state, name) for name in _SET}
+        self.form.show_present(present | {"roi": ", ".join(map(str, state.roi.as_tuple()))})
+        has_thermometer = state.temperature_c is not None
+        self.temperature.setVisible(has_thermometer)
+        self._temperature_name.setVisible(has_thermometer)
+        if has_thermometer:
+            self.temperature.setText(f"{state.temperature_c:.1f} °C")
+
+    def _show_all(self) -> None:
+        if self.state is not None:
+            lines = "\n".join(f"{name} = {value}" for name, value in sorted(self.state.settings.items()))
+            TextWindow("Settings of the camera, as read back", lines, self).show()
+
+
+_DISK_MS = 5000
+_SILENT_S = 4.0
+"""A disk that takes longer is called silent."""
+
+
+class RecordBar(QWidget):
+    """Record button, length, label, disk gauge.
+
+    Parameters
+    ----------
+    panel : Panel
+        The live view.
+    """
+
+    def __init__(self, panel: Panel) -> None:
+        super().__init__(panel)
+        self._panel = panel
+        self._session = panel.session
+        self._recorder: Recorder | None = None
+        self.job: Job | None = None
+        self._looking: Job | None = None
+        self._asked_s = 0.0
+        tip = "Record every frame to the disk; again ends it (Ctrl+R)"
+        self.button = button("● Record", tip, self.toggle)
+        self.seconds = NumberEdit("s", 10.0, minimum=0.01, tip="How long to record, seconds")
+        self.seconds.setFixedWidth(80)
+        self.seconds.refused.connect(lambda why: panel.refused(None, why))
+        self.label = QLineEdit("recording")
+        self.label.setToolTip("Becomes part of the run folder's name")
+        self.label.setFixedWidth(120)
+        self.gauge = QProgressBar()
+        self.gauge.setToolTip("How full the disk is")
+        self.gauge.setFixedWidth(150)
+        self.gauge.setRange(0, 1000)
+        self.gauge.setFormat("…")
+        self.note = label()
+        fill(self, self.button, self.seconds, self.label, self.gauge, (self.note, 1), across=True)
+        self._timer = every(self, _DISK_MS, self._look_at_disk)
+        self._look_at_disk()
+
+    def shutdown(self) -> None:
+        """End the timer."""
+        self._timer.stop()
+
+    def toggle(self) -> None:
+        """Start a recording, or end the one that runs."""
+        if self.job is not None:
+            if self._recorder is not None:
+                self._recorder.stop()
+            else:  # it waits for the camera, or has just begun
+                self.job.cancel()
+            return
+        if not self._session.is_open("camera"):
+            self._panel.refused(self.button, "The camera is not connected.")
+            return
+        if not self.seconds.submit():
+            self.seconds.setFocus()
+            return
+        session = self._session
+        seconds, label = self.seconds.value, self.label.text().strip() or "recording"
+
+        def work(context: JobContext) -> Run:
+            lit = Lit.now(session.bench)
+            recorder = prepare_recording(
+                session.bench, session.runs_folder, label=label, seconds=seconds, on_progress=context.report
+            )
+            self._recorder = recorder
+            with session.live.watching(recorder.newest):
+                run = recorder.execute()
+            context.check()
+            lit.put_back(session.bench)
+            return run
+
+        job = self._panel.begin(lambda: session.exclusive_job("Recording", work), self.button)
+        if job is None:
+            return
+        self.job = job
+        self.button.setText("■ End")
+        job.progressed.connect(self._show)
+        job.succeeded.connect(self._done)
+        job.ended.connect(self._ended)
+
+    def _show(self, status: RecordingStatus) -> None:
+        left_s = max(0, status.free_bytes - SPARE_BYTES) / max(status.bytes_per_s, 1.0)
+        words = [
+            f"{status.written} frames",
+            f"{status.frames_per_s:.1f}/s",
+            f"{status.bytes_per_s / 1e6:.0f} MB/s",
+            f"disk lasts {duration(left_s)}",
+        ]
+        if status.dropped_by_device:
+            words.append(f"{status.dropped_by_device} dropped by the camera")
+        if status.not_written:
+            words.append(f"{status.not_written} lost: the disk is too slow")
+        self.note.setText(" · ".join(words))
+
+    def _done(self, run: Run) -> None:
+        self.note.setText(f"{len(run.records)} frames in {run.path.name}")
+        self._session.log("info", f"Recorded {len(run.records)} frames: {run.path}")
+        self._session.run_finished.emit(run.path)
+
+    def _ended(self) -> None:
+        self.job, self._recorder = None, None
+        self.button.setText("● Record")
+        self._look_at_disk()
+
+    def _look_at_disk(self) -> None:
+        """Ask how full the disk is, in a job: one of a server that is silent would hold the window up."""
+        if self._looking is not None:
+            if time.monotonic() - self._asked_s > _SILENT_S:
+                self._not_known(f"{self._session.runs_folder}: its disk has not answered yet.")
+            return
+        folder = self._session.runs_folder
+        self._asked_s = time.monotonic()
+        self._looking = job = self._session.jobs.watch("Looking at the disk", lambda _: _disk_of(folder))
+        job.succeeded.connect(self._show_disk)
+        job.failed.connect(self._not_known)
+        job.ended.connect(self._looked)
+
+    def _looked(self) -> None:
+        self._looking = None
+
+    def _show_disk(self, disk: _Disk) -> None:
+        if disk.problem:
+            self._not_known(disk.problem)
+            return
+        self.gauge.setValue(round(1000 * disk.full))
+        self.gauge.setFormat(f"{size(disk.free)} free")
+        self.gauge.setToolTip(f"How full the disk is that holds {self._session.runs_folder}")
+
+    def _not_known(self, why: str) -> None:
+        self.gauge.setValue(0)
+        self.gauge.setFormat("disk not known")
+        self.gauge.setToolTip(why)
+
+
+@dataclass(frozen=True, slots=True)
+class _Disk:
+    """A disk's full share and free bytes, or why they are not known."""
+
+    full: float = 0.0
+    free: int = 0
+    problem: str = ""
+
+
+def _disk_of(folder: Path) -> _Disk:
+    try:
+        free = free_bytes(folder)
+        total = shutil.disk_usage(there_now(folder)).total
+    except OSError as error:  # no such place, a drive taken away
+        return _Disk(problem=f"{folder}: {error.strerror or error}")
+    except FileError as error:
+        return _Disk(problem=str(error))
+    if not total:  # as some file systems of servers and user space have it
+        return _Disk(problem=f"{folder}: its file system gives no size.")
+    return _Disk(1 - free / total, free)

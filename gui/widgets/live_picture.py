@@ -1,0 +1,326 @@
+"""The live picture: the camera's frame with its levels, and what lies over it: cross-hair, line, region."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pyqtgraph as pg
+from PySide6.QtCore import QObject, QPointF, QSignalBlocker, Signal
+from PySide6.QtWidgets import QWidget
+
+from drivers.frame import Frame
+from gui.theme import NAMES, colours
+from gui.widgets.building import button, choice, fill, in_row
+from gui.widgets.image_view import ImageView
+from gui.widgets.plots import HistogramPlot, curve_pen, plot_widget
+from instrument.live.frame_view import histogram, line_profile, percentiles
+
+
+class CrossHair(QObject):
+    """Two lines through a pixel; a click moves them.
+
+    Signals
+    -------
+    moved : int, int
+        Column and row.
+    """
+
+    moved = Signal(int, int)
+
+    def __init__(self, view: ImageView) -> None:
+        super().__init__(view)
+        self._view = view
+        pen = pg.mkPen(colours().accent, width=1)
+        self._lines: tuple[Any, Any] = (pg.InfiniteLine(angle=90, pen=pen), pg.InfiniteLine(angle=0, pen=pen))
+        self.pixel: tuple[int, int] | None = None
+        self.enabled = False
+        for line in self._lines:
+            line.setVisible(False)
+            view.box.addItem(line, ignoreBounds=True)
+        view.clicked.connect(self.move_to)
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide it; shown first in the middle."""
+        self.enabled = enabled
+        for line in self._lines:
+            line.setVisible(enabled)
+        if enabled and self.pixel is None and self._view.image is not None:
+            height, width = self._view.image.shape[:2]
+            self.move_to(width // 2, height // 2)
+
+    def step(self, across: float, down: float) -> None:
+        """Move it by so many pixels, at least one, and not out of the image."""
+        if self.pixel is None or self._view.image is None:
+            return
+        height, width = self._view.image.shape[:2]
+        column, row = (
+            place + (int(math.copysign(max(1, round(abs(by))), by)) if by else 0)
+            for place, by in zip(self.pixel, (across, down), strict=True)
+        )
+        self.move_to(min(max(column, 0), width - 1), min(max(row, 0), height - 1))
+
+    def move_to(self, column: int, row: int) -> None:
+        """Move it to a pixel."""
+        if self.enabled:
+            self.pixel = (column, row)
+            self._lines[0].setValue(column + 0.5)
+            self._lines[1].setValue(row + 0.5)
+            self.moved.emit(column, row)
+
+
+_STEP_PX = 10.0
+"""A step of the arrow keys for lines and regions; Ctrl makes it a pixel. The cross-hair goes by pixels."""
+_LEAST_PX = 2.0
+
+
+class _Overlay:
+    """Something that is dragged over the image; ``item`` is None while it is hidden."""
+
+    def __init__(self, view: ImageView) -> None:
+        self._view = view
+        self.item: Any = None
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide it; each time it is shown where it begins."""
+        if enabled and self.item is None and self._view.image is not None:
+            height, width = self._view.image.shape[:2]
+            self.item = self._made(width, height)
+            self._view.box.addItem(self.item)
+        elif not enabled and self.item is not None:
+            self._view.box.removeItem(self.item)
+            self.item = None
+
+    def _made(self, width: int, height: int) -> Any:
+        raise NotImplementedError
+
+
+class ProfileLine(_Overlay):
+    """A line whose ends are dragged, first across the middle; ``ends`` in pixels."""
+
+    def _made(self, width: int, height: int) -> Any:
+        ends = [[0.1 * width, 0.5 * height], [0.9 * width, 0.5 * height]]
+        return pg.LineSegmentROI(ends, pen=pg.mkPen(colours().warning, width=1.5))
+
+    def step(self, across: float, down: float, *, end_only: bool) -> None:
+        """Move the line by steps of the arrow keys, or only its second end."""
+        if self.item is None:
+            return
+        ends = [
+            self.item.mapToParent(self.item.mapFromItem(handle["item"], 0, 0)) for handle in self.item.handles
+        ]
+        for end in ends[1:] if end_only else ends:
+            end.setX(end.x() + _STEP_PX * across)
+            end.setY(end.y() + _STEP_PX * down)
+        for handle, end in zip(self.item.handles, ends, strict=True):
+            self.item.movePoint(handle["item"], end)
+
+    @property
+    def ends(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Start and end, x and y in pixels; None while hidden."""
+        if self.item is None:
+            return None
+        (_, a), (_, b) = self.item.getSceneHandlePositions()
+        first, second = self._view.box.mapSceneToView(a), self._view.box.mapSceneToView(b)
+        return (first.x(), first.y()), (second.x(), second.y())
+
+
+class RegionBox(_Overlay):
+    """A rectangle dragged with the mouse: anew on the frame, or by its handles; ``rectangle`` in pixels.
+
+    First over the middle half.
+    """
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Show or hide it; while it is shown, dragging on the frame draws it."""
+        super().set_enabled(enabled)
+        self._view.drag_taker = None if self.item is None else self.draw
+
+    def _made(self, width: int, height: int) -> Any:
+        box: Any = pg.RectROI(
+            [0.25 * width, 0.25 * height],
+            [0.5 * width, 0.5 * height],
+            pen=pg.mkPen(colours().ok, width=1.5),
+            sideScalers=True,
+        )
+        box.addScaleHandle([0, 0], [1, 1])
+        return box
+
+    def draw(self, start: QPointF, now: QPointF) -> None:
+        """Make it the rectangle between two places of the frame, in pixels, cut off at the frame's edges."""
+        if self.item is None or self._view.image is None:
+            return
+        height, width = self._view.image.shape[:2]
+        left, right = sorted(min(max(place.x(), 0.0), width) for place in (start, now))
+        top, bottom = sorted(min(max(place.y(), 0.0), height) for place in (start, now))
+        if right - left >= 1 and bottom - top >= 1:
+            self.item.setPos((left, top))
+            self.item.setSize((right - left, bottom - top))
+
+    def step(self, across: float, down: float, *, size_only: bool) -> None:
+        """Move the rectangle by steps of the arrow keys, or its lower right corner."""
+        if self.item is None:
+            return
+        dx, dy = _STEP_PX * across, _STEP_PX * down
+        if size_only:
+            width, height = self.item.size()
+            self.item.setSize((max(_LEAST_PX, width + dx), max(_LEAST_PX, height + dy)))
+        else:
+            self.item.setPos(self.item.pos() + pg.Point(dx, dy))
+
+    @property
+    def rectangle(self) -> tuple[float, float, float, float] | None:
+        """Left, top, width, height in pixels; None while hidden."""
+        if self.item is None:
+            return None
+        place, size = self.item.pos(), self.item.size()
+        return place.x(), place.y(), size.x(), size.y()
+
+
+LEVELS = {"full range": None, "0.1 – 99.9 %": (0.1, 99.9), "1 – 99 %": (1.0, 99.0), "by hand": None}
+"""Percentiles of the counts shown darkest and brightest."""
+
+
+class LivePicture(QWidget):
+    """A frame with tools above it, the profile along a line below, and its histogram.
+
+    ``histogram`` stands beside it: the panel has a place for it.
+
+    Signals
+    -------
+    region_sent
+        The region is to be sent to the camera.
+
+    Attributes
+    ----------
+    frame : Frame or None
+        What is shown.
+    levels : (float, float)
+        Counts shown darkest and brightest.
+    """
+
+    region_sent = Signal()
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.frame: Frame | None = None
+        self._measured: Frame | None = None
+        self.levels = (0.0, 1.0)
+        self.view = ImageView()
+        self.view.keys.moved.connect(lambda across, down: self._by_keys(across, down, alt=False))
+        self.view.keys.resized.connect(lambda across, down: self._by_keys(across, down, alt=True))
+        self.view.keys.acted.connect(lambda send: self.region_sent.emit() if send else None)
+        self.histogram = HistogramPlot()
+        self.histogram.levels_dragged.connect(self._levels_by_hand)
+        self.cross_hair = CrossHair(self.view)
+        self.profile_line = ProfileLine(self.view)
+        self.region_box = RegionBox(self.view)
+        self.profile_plot = plot_widget("along the line", "counts", x_unit="pixels")
+        self._profile_curve = self.profile_plot.plot([], [], pen=curve_pen(1))
+        self.profile_plot.setMaximumHeight(170)
+        self.profile_plot.hide()
+        self.colour_map = choice(NAMES, "Colour map; saturated pixels have a colour of their own")
+        self.colour_map.setCurrentText(self.view.colour_map)
+        self.colour_map.currentTextChanged.connect(self.view.set_colour_map)
+        tip = "Counts shown darkest and brightest: full range, percentiles, or dragged"
+        self.stretch = choice(LEVELS, tip)
+        self.stretch.setCurrentIndex(1)
+        self.stretch.currentTextChanged.connect(lambda _: self._stretch_chosen())
+        self.cross_button = button(
+            "✛", "Cross-hair: a click moves it, and arrow keys in the picture", checkable=True
+        )
+        self.profile_button = button(
+            "Profile", "Counts along a line: drag its ends, or arrow keys (Alt: one end)", checkable=True
+        )
+        self.region_button = button(
+            "Region",
+            "Drag a region of interest, or arrow keys (Alt: its size; Return sends it)",
+            checkable=True,
+        )
+        self.apply_region = button("Send", "Send the region to the camera", self.region_sent)
+        self.apply_region.hide()
+        for switch, what in (
+            (self.cross_button, (self.cross_hair.set_enabled,)),
+            (self.profile_button, (self.profile_line.set_enabled, self.profile_plot.setVisible)),
+            (self.region_button, (self.region_box.set_enabled, self.apply_region.setVisible)),
+        ):
+            for switched in what:
+                switch.toggled.connect(switched)
+            switch.toggled.connect(lambda _: self._arrows_for())
+        fit = button("Fit", "Show the whole image (wheel zooms, dragging moves)", self.view.whole)
+        tools = in_row(
+            self.colour_map,
+            self.stretch,
+            self.cross_button,
+            self.profile_button,
+            self.region_button,
+            self.apply_region,
+            fit,
+            None,
+            spacing=6,
+        )
+        fill(self, tools, (self.view, 1), self.profile_plot)
+
+    def show_frame(self, frame: Frame) -> None:
+        """Show a frame with the levels in use."""
+        self.frame = frame
+        self.view.show_image(frame.image, *self.levels, frame.full_scale)
+
+    def measure(self) -> None:
+        """Make histogram, levels and profile of the frame that is shown, once."""
+        if self.frame is not None and self.frame is not self._measured:
+            self._measure(self.frame)
+
+    def restyle(self) -> None:
+        """Take over the theme's colour map and plot colours."""
+        self.colour_map.setCurrentText(colours().colour_map)
+        self.histogram.restyle()
+
+    def under_cross(self) -> str:
+        """Return place and value under the cross-hair in words; empty where there is none."""
+        pixel, image = self.cross_hair.pixel, self.view.image
+        if not self.cross_hair.enabled or pixel is None or image is None:
+            return ""
+        inside = pixel[1] < image.shape[0] and pixel[0] < image.shape[1]
+        return f"✛ {self.view.describe(*pixel)}" if inside else ""
+
+    # Inside --------------------------------------------------------------------------------------
+    def _measure(self, frame: Frame) -> None:
+        self._measured = frame
+        counts = histogram(frame.image)
+        wanted = LEVELS[self.stretch.currentText()]
+        if wanted is not None:
+            self.levels = percentiles(counts, *wanted)
+        elif self.stretch.currentText() == "full range":
+            self.levels = (0.0, float(frame.full_scale))
+        self.histogram.show_counts(counts, frame.full_scale, *self.levels)
+        if (ends := self.profile_line.ends) is not None:
+            self._profile_curve.setData(*line_profile(frame.image, *ends))
+
+    def _stretch_chosen(self) -> None:
+        if self.frame is not None:  # at once, and where the frame is held as well
+            self._measure(self.frame)
+            self.show_frame(self.frame)
+
+    def _levels_by_hand(self, low: float, high: float) -> None:
+        self.levels = (low, high)
+        with QSignalBlocker(self.stretch):
+            self.stretch.setCurrentText("by hand")
+        if self.frame is not None:
+            self.show_frame(self.frame)
+
+    def _by_keys(self, across: float, down: float, *, alt: bool) -> None:
+        """Move region, line or cross-hair, the first of them that is shown."""
+        if self.region_box.item is not None:
+            self.region_box.step(across, down, size_only=alt)
+        elif self.profile_line.item is not None:
+            self.profile_line.step(across, down, end_only=alt)
+        elif self.cross_hair.enabled:
+            self.cross_hair.step(across, down)
+
+    def _arrows_for(self) -> None:
+        """Give the arrow keys of the picture to what lies over it."""
+        over = self.region_button, self.profile_button, self.cross_button
+        self.view.arrows_pan = not any(button.isChecked() for button in over)
+        if not self.view.arrows_pan:
+            self.view.setFocus()

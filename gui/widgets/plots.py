@@ -1,0 +1,266 @@
+"""Plots in the program's looks; histograms of an image with the levels it is shown with, to be dragged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyqtgraph as pg
+from PySide6.QtCore import QSignalBlocker, Qt, Signal
+from PySide6.QtWidgets import QGraphicsItem, QWidget
+
+from gui.theme import NAMES, colours
+from gui.widgets.building import button, choice, fill, narrow
+from gui.widgets.entry import NumberEdit
+from instrument.live.frame_view import grouped
+from instrument.reconstruction.result_file import white_level
+
+# Images are (row, column) here as everywhere else in the project.
+pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
+
+
+def plot_widget(
+    x_label: str = "", y_label: str = "", *, x_unit: str = "", y_unit: str = "", grid: bool = True
+) -> Any:
+    """Return a ``pyqtgraph.PlotWidget`` in the theme's colours, with labelled axes.
+
+    pyqtgraph has no type annotations, hence ``Any``.
+    """
+    plot = pg.PlotWidget()
+    restyle(plot)
+    plot.setLabel("bottom", _label(x_label, x_unit))
+    plot.setLabel("left", _label(y_label, y_unit))
+    plot.showGrid(x=grid, y=grid, alpha=0.15)
+    plot.setMenuEnabled(False)
+    for axis in ("bottom", "left"):
+        plot.getAxis(axis).enableAutoSIPrefix(False)  # units are in the labels as people here say them
+    return plot
+
+
+def restyle(plot: Any) -> None:
+    """Give a plot the colours of the theme in use."""
+    now = colours()
+    plot.setBackground(now.panel)
+    for axis in ("bottom", "left"):
+        plot.getAxis(axis).setPen(now.line)
+        plot.getAxis(axis).setTextPen(now.dim)
+
+
+def curve_pen(number: int = 0, width: float = 1.5) -> Any:
+    """Return the pen of the ``number``-th curve of a plot."""
+    return pg.mkPen(curve_colour(number), width=width)
+
+
+def curve_colour(number: int) -> str:
+    """Return the colour of the ``number``-th curve of a plot."""
+    names = colours().curves
+    return names[number % len(names)]
+
+
+def dots(colour: Any, size: int = 5) -> dict[str, Any]:
+    """Return what draws filled dots at the points of a curve; ``colour`` is one, or a brush for each."""
+    brush = colour if isinstance(colour, list) or colour is None else pg.mkBrush(colour)
+    return {"symbol": "o", "symbolSize": size, "symbolPen": None, "symbolBrush": brush}
+
+
+def legend(names: Mapping[int, str]) -> str:
+    """Return the names of curves by their numbers, each with its colour, as rich text."""
+    return " &nbsp; ".join(
+        f'<span style="color:{curve_colour(number)}">●</span> {name}' for number, name in names.items()
+    )
+
+
+def _label(text: str, unit: str) -> str:
+    return f"{text} ({unit})" if unit else text
+
+
+_MOST_PIXELS = 250_000
+"""The histogram is that of about so many pixels, evenly spaced over the image."""
+_BINS = 128
+
+
+class LevelsBar(QWidget):
+    """A histogram, two levels, a colour map.
+
+    Signals
+    -------
+    changed
+        Levels or colour map are others now.
+    """
+
+    changed = Signal()
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.low = NumberEdit(tip="Value shown darkest")
+        self.high = NumberEdit(tip="Value shown brightest")
+        self.low.submitted.connect(self._typed)
+        self.high.submitted.connect(self._typed)
+        tip = "From zero to the brightest pixels but one in a thousand, as in the preview file"
+        self.auto = button("Auto", tip, self.to_automatic)
+        self.map = narrow(choice(NAMES, "Colour map of grey images"), 4)
+        self.map.setCurrentText(colours().colour_map)
+        self.map.currentTextChanged.connect(lambda _: self.changed.emit())
+        self.plot: Any = pg.PlotWidget(background=colours().panel)
+        self.plot.setFixedHeight(44)
+        self.plot.setMinimumWidth(50)
+        self.plot.hideAxis("left")
+        self.plot.hideAxis("bottom")
+        self.plot.setMouseEnabled(x=False, y=False)
+        self.plot.setMenuEnabled(False)
+        self.plot.hideButtons()
+        self.plot.setToolTip(
+            "Histogram (logarithmic count); drag the edges to set what is darkest and brightest"
+        )
+        self._curve = self.plot.plot([0, 1], [0], stepMode="center", fillLevel=0, brush=colours().line)
+        self.region: Any = pg.LinearRegionItem((0, 1), pen=colours().accent, brush=(255, 255, 255, 16))
+        self.region.sigRegionChanged.connect(self._dragged)
+        self.plot.addItem(self.region)
+        for field in (self.low, self.high):
+            field.setMinimumWidth(48)
+            field.setMaximumWidth(90)
+        fill(self, self.low, (self.plot, 3), self.high, self.auto, self.map, across=True)
+        self._levels = (0.0, 1.0)
+        self._automatic = (0.0, 1.0)
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """The values shown darkest and brightest."""
+        return self._levels
+
+    @property
+    def colour_map(self) -> str:
+        """The name of the colour map."""
+        return self.map.currentText()
+
+    def set_levels(self, low: float, high: float) -> None:
+        """Set both levels; the higher one must be above the lower."""
+        with QSignalBlocker(self.region):
+            self.region.setRegion((low, high))
+        self._take(low, high)
+
+    def to_automatic(self) -> None:
+        """Go back to zero and the white level of the preview file."""
+        self.set_levels(*self._automatic)
+
+    def set_image(self, image: npt.NDArray[Any], *, keep_levels: bool = False) -> None:
+        """Show the histogram of an image, and choose its levels unless they are to be kept."""
+        step = max(1, round((image.size / _MOST_PIXELS) ** 0.5))
+        sample = np.asarray(image[::step, ::step], np.float32)
+        lowest, highest = float(sample.min()), float(sample.max())
+        self._automatic = (min(0.0, highest - 1.0) if highest <= 0 else 0.0, white_level(sample))
+        counts, bins = np.histogram(sample, _BINS, (lowest, highest if highest > lowest else lowest + 1.0))
+        edges = bins.astype(float)  # pyqtgraph's limits overflow in float32
+        self._curve.setData(edges, np.log1p(counts))
+        margin = 0.02 * (edges[-1] - edges[0])
+        low, high = min(edges[0], self._automatic[0]), max(edges[-1], self._automatic[1])
+        self.plot.setXRange(float(low - margin), float(high + margin), padding=0)
+        if not keep_levels:
+            self.to_automatic()
+
+    def restyle(self) -> None:
+        """Take over the colours and the colour map of the theme in use."""
+        now = colours()
+        self._curve.setBrush(now.line)
+        for line in self.region.lines:
+            line.setPen(now.accent)
+        self.map.setCurrentText(now.colour_map)
+
+    def _typed(self, _value: float) -> None:
+        assert self.low.value is not None
+        assert self.high.value is not None
+        self.set_levels(self.low.value, self.high.value)
+
+    def _dragged(self) -> None:
+        self._take(*self.region.getRegion())
+
+    def _take(self, low: float, high: float) -> None:
+        self._levels = (low, high)
+        self.low.set_value(float(f"{low:.4g}"))
+        self.high.set_value(float(f"{high:.4g}"))
+        self.low.set_limits(-np.inf, high)
+        self.high.set_limits(low, np.inf)
+        self.changed.emit()
+
+
+_LIVE_BINS = 256
+_SHADE = 18
+"""Opacity of the counts between the levels, of 255."""
+
+
+class HistogramPlot(QWidget):
+    """Pixels over counts, logarithmic; the sensor's full scale is marked.
+
+    Signals
+    -------
+    levels_dragged : float, float
+        The levels that were dragged with the mouse.
+    """
+
+    levels_dragged = Signal(float, float)
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.plot = plot_widget("counts", "pixels", grid=False)
+        self.plot.setAntialiasing(False)
+        for axis in ("bottom", "left"):  # their texts cost more than the curve, and seldom change
+            self.plot.getAxis(axis).setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
+        self.plot.setMouseEnabled(x=False, y=False)
+        self.plot.hideButtons()
+        self.plot.setLogMode(y=True)
+        self.plot.disableAutoRange()
+        self.curve: Any = self.plot.plot([], [], pen=curve_pen(0), fillLevel=0.0)
+        self._fill()
+        self.region: Any = pg.LinearRegionItem()
+        self.region.sigRegionChanged.connect(self._dragged)
+        self.plot.addItem(self.region)
+        self.full_scale: Any = pg.InfiniteLine(angle=90)
+        self.full_scale.setToolTip("full scale of the sensor")
+        self.plot.addItem(self.full_scale)
+        self._style_lines()
+        self._ranges = (0, 0.0)
+        self.setToolTip("Histogram of the raw data. Drag the borders to choose levels; red: full scale")
+        self.setMinimumHeight(130)
+        self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        fill(self, self.plot)
+
+    def show_counts(self, counts: npt.NDArray[np.float32], full_scale: int, low: float, high: float) -> None:
+        """Show a histogram of all counts (``instrument.live.frame_view.histogram``) and the levels in use."""
+        bins = grouped(counts, full_scale, _LIVE_BINS)
+        step = (full_scale + 1) / _LIVE_BINS
+        self.curve.setData(np.arange(_LIVE_BINS) * step, np.maximum(bins, 0.5))
+        decades = float(np.ceil(np.log10(max(float(bins.max()), 10.0))))
+        if (full_scale, decades) != self._ranges:
+            self._ranges = (full_scale, decades)
+            self.plot.setXRange(0, full_scale * 1.02, padding=0)
+            self.plot.setYRange(-0.3, decades, padding=0)
+            self.full_scale.setValue(full_scale)
+        with QSignalBlocker(self.region):
+            self.region.setRegion((low, high))
+
+    def restyle(self) -> None:
+        """Take over the theme in use."""
+        self.curve.setPen(curve_pen(0))
+        self._fill()
+        self._style_lines()
+
+    def _style_lines(self) -> None:
+        now = colours()
+        shade = pg.mkColor(now.text)
+        shade.setAlpha(_SHADE)
+        self.region.setBrush(shade)
+        for line in self.region.lines:
+            line.setPen(pg.mkPen(now.warning))
+            line.setHoverPen(pg.mkPen(now.text))
+        self.full_scale.setPen(pg.mkPen(now.error, width=1.5))
+
+    def _fill(self) -> None:
+        colour = pg.mkColor(colours().accent)
+        colour.setAlpha(60)
+        self.curve.setBrush(pg.mkBrush(colour))
+
+    def _dragged(self) -> None:
+        low, high = self.region.getRegion()
+        self.levels_dragged.emit(float(low), float(max(high, low + 1)))
