@@ -294,7 +294,7 @@ class JobRunner(QObject):
 
     # Inside --------------------------------------------------------------------------------------
     def _require_free(self, lanes: Collection[str]) -> None:
-        """Raise BusyError where a job would wait for the whole bench, or for one that goes on until stopped."""
+        """Raise BusyError where a job would wait for the whole bench, or for an endless one."""
         if (holder := self.exclusive_job) is not None:
             raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
         for job in self._jobs.values():
