@@ -234,7 +234,7 @@ def photograph(
                 computed.target,
                 CaptureOptions(average=average),
             )
-            bench.safe_state()
+            bench.stop()
     except EndedEarlyError as error:
         raise JobCancelledError from error
     write_capture(out, seen)

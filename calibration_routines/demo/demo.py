@@ -198,7 +198,7 @@ def _run(
         try:
             measured = _measure(bench, place, settings, audience, stage)
         finally:
-            bench.safe_state()
+            bench.stop()
             journal.note(left=_state_of(bench))
         viewer = Viewer(_world(bench), settings, measured)
     with stage("compile kernels (kept)"):

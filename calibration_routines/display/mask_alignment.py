@@ -291,7 +291,7 @@ class AlignmentProcedure(Procedure):
 
         report = MaskAlignment(io, display, settings, progress=on_progress, on_look=listener.look).run()
         alignment = _alignment(report, bench, display.mask.shape)
-        bench.safe_state()
+        bench.stop()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
         from instrument.display.hologram_files import (

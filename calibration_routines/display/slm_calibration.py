@@ -217,7 +217,7 @@ class SlmProcedure(Checked, Procedure):
             bring_mask(bench, place.stage_position)
             display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
             found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=on_frame)
-        bench.safe_state()
+        bench.stop()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)
         return Outcome(

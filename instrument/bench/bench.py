@@ -298,11 +298,9 @@ class Bench:
 
     # Safety ------------------------------------------------------------------------------------
     def stop(self) -> None:
-        """Stop whatever runs and make the bench safe, from any thread; see ``safe_state``."""
-        self.safe_state()
+        """Make the bench safe, from any thread and whatever runs.
 
-    def safe_state(self) -> None:
-        """Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
+        Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
 
         Raises
         ------

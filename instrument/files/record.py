@@ -129,7 +129,7 @@ class RecordFormat:
             for old in range(major, self.major):
                 fields = self.migrate[old](fields)
         if self.fields is not None:
-            self.tell_unknown(path, [name for name in fields if name not in self.fields])
+            self.warn_unknown(path, [name for name in fields if name not in self.fields])
         elif (major, minor) > (self.major, self.minor):
             _say(path, f"is of version {version}, newer than this program's: what is new in it is left out.")
         return fields
@@ -145,10 +145,10 @@ class RecordFormat:
         unknown: Unknown = {}
         with self.damaged(path):
             value = value_of(kind, fields, unknown)
-        self.tell_unknown(path, list(unknown))
+        self.warn_unknown(path, list(unknown))
         return value
 
-    def tell_unknown(self, path: Path, names: Sequence[str]) -> None:
+    def warn_unknown(self, path: Path, names: Sequence[str]) -> None:
         """Say once that a file has fields which this program does not know."""
         if names:
             _say(path, f"holds {', '.join(map(repr, names))}, which this program does not know: left out.")

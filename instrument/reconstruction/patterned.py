@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import BenchError, FileError
-from instrument.plan.illumination import DARK, PATTERN
+from instrument.plan.model import DARK, PATTERN
 from instrument.reconstruction.job import Job, find_calibration
 from instrument.reconstruction.preparation import reduce
 from instrument.reconstruction.request import refocused
@@ -48,7 +48,7 @@ class PatternedRequest:
     Attributes
     ----------
     run : Path
-        Of a plan of :func:`instrument.plan.illumination.illumination_plan`, the scene in place.
+        Of a plan of :func:`instrument.plan.model.illumination_plan`, the scene in place.
     sheet : Path
         A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
         (n_patterns, height, width) on the calibration's pixels.

@@ -117,7 +117,7 @@ class Run:
                 gaps.append(Gap.from_json(line))
             else:
                 events.append(line)
-        RUN_STATE.tell_unknown(
+        RUN_STATE.warn_unknown(
             path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
         )
         self.gaps = tuple(gaps)
@@ -180,7 +180,7 @@ class Run:
             return None
         with RUN_STATE.damaged(path):
             plan, unknown = Plan.with_unknown(self._json(PLAN), path)
-        RUN_STATE.tell_unknown(path, unknown)
+        RUN_STATE.warn_unknown(path, unknown)
         return plan.with_slm_images(lambda image: self.path / image)
 
     @cached_property

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import make_folder, sync_folder, write_bytes, write_json
+from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap
@@ -182,18 +183,10 @@ class RunWriter:
             try:
                 if plan is not None:
                     write_bytes(draft / PLAN, plan_with_copies(plan, draft).to_json().encode())
-                write_json(draft / BENCH, bench.config)
-                write_bytes(draft / BENCH_TOML, bench.toml.encode())
-                origin = {
-                    **provenance(),
-                    "simulated": bench.simulated,
-                    "devices": dict(bench.devices),
-                    "pixel_pitch_um": bench.pixel_pitch_um,
-                    "camera": dict(bench.camera),
-                    "stage": dict(bench.stage),
-                    "calibrations": list(calibrations),
-                }
-                write_json(draft / PROVENANCE, origin)
+                facts = plain(bench)
+                write_json(draft / BENCH, facts.pop("config"))
+                write_bytes(draft / BENCH_TOML, facts.pop("toml").encode())
+                write_json(draft / PROVENANCE, {**provenance(), **facts, "calibrations": list(calibrations)})
                 state = {
                     "label": label,
                     "simulated": bench.simulated,

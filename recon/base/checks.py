@@ -75,20 +75,22 @@ def check_psf(psfs: npt.NDArray[np.float32]) -> tuple[str, ...]:
                 f"{where} is constant ({high:g} everywhere), so it holds no pattern to decode. "
                 "Check the exposure (too long?) and that this is the right file."
             )
-        if float(np.sum(psf, dtype=np.float64)) <= 0:
+        total = float(np.sum(psf, dtype=np.float64))
+        if total <= 0:
             raise InputError(
                 f"{where} sums to a negative number: too much background was subtracted. "
                 "Check the dark frame."
             )
         share = saturated_share(psf)
-        light = share * psf.size * high / float(np.sum(psf, dtype=np.float64))
+        light = share * psf.size * high / total
         if light > SATURATED_LIGHT:
             warnings.append(
                 f"{where} looks saturated: {share:.2%} of its pixels, with {light:.0%} of its light, are at "
                 f"exactly its maximum {high:g}. "
                 "The picture will be blurred; calibrate again with a shorter exposure."
             )
-        negative = float(-np.sum(psf[psf < 0], dtype=np.float64) / np.sum(np.abs(psf), dtype=np.float64))
+        below = float(np.sum(psf[psf < 0], dtype=np.float64)) if low < 0 else 0.0
+        negative = -below / (total - 2 * below)
         if negative > 0.1:
             warnings.append(
                 f"{where} is negative in {negative:.0%} of its absolute sum: check the background subtracted."

@@ -6,6 +6,7 @@ refusals and the reference pages are made from these declarations; nobody repeat
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import difflib
 import enum
@@ -97,7 +98,7 @@ class Declaration:
         return tuple(self.choices() if callable(self.choices) else self.choices)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Option:
     """A declared field: its name, type, default and declaration."""
 
@@ -106,7 +107,7 @@ class Option:
     default: Any
     declaration: Declaration
 
-    @property
+    @functools.cached_property
     def kinds(self) -> tuple[Any, ...]:
         """The types that its value may have, without None."""
         inside = typing.get_args(self.type)
@@ -285,8 +286,8 @@ def _options_of(cls: type) -> tuple[Option, ...]:
 
 def mistakes(options: object) -> list[str]:
     """Return everything that is wrong with an options object, one sentence each."""
-    given = ((o, getattr(options, o.name)) for o in options_of(options))
-    found = (o.mistake(value) for o, value in given if value is not o.default)
+    values = ((o, getattr(options, o.name)) for o in options_of(options))
+    found = (o.mistake(value) for o, value in values if value is not o.default)
     return [mistake for mistake in found if mistake is not None]
 
 
@@ -314,6 +315,14 @@ def with_overrides(options: _T, overrides: Mapping[str, Any]) -> _T:
                 hint = f" It is called {new!r}."
             raise InputError(f"{type(options).__name__} has no option {name!r}.{hint}")
     return dataclasses.replace(options, **overrides) if overrides else options  # type: ignore[type-var]
+
+
+def settled(options: _T, **values: Any) -> _T:
+    """Return options with some values that the program itself chose: they are not checked again."""
+    made = copy.copy(options)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 def changed(options: object) -> Iterator[tuple[Option, Any]]:

@@ -84,11 +84,11 @@ class Registry(Mapping[str, T], Generic[T]):
         InputError
             When nothing has, with the names that there are.
         """
+        if name in self:
+            return self[name]
         import difflib
 
         known = self._all()
-        if name in known:
-            return known[name]
         if name in self._broken:
             raise InputError(f"The {self.what} {name!r} {self._broken[name]}")
         near = difflib.get_close_matches(str(name), known, 1)
@@ -101,7 +101,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         """Return what has a name; KeyError where nothing has."""
-        return self._all()[name]
+        own = self._known_own()
+        return own[name] if name in own else self._foreign[name]
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over names."""

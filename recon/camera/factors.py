@@ -296,16 +296,20 @@ class PatternedCamera(LinearOperator):
     def forward(self, x: Array, out: Array | None = None) -> Array:
         """Return the frames of a scene (1, n_z, grid height, grid width)."""
         out = np.empty(self.range_shape, self.dtype) if out is None else out
-        for frame, pattern in zip(out, self._patterns, strict=True):
-            frame[...] = self.camera.forward(pattern * x)[0]
+        lit = np.empty(self.domain_shape, self.dtype)
+        for frame, pattern in zip(out[:, None], self._patterns, strict=True):
+            seen = self.camera.forward(np.multiply(pattern, x, out=lit), frame)
+            if seen is not frame:
+                frame[...] = seen
         return out
 
     def adjoint(self, y: Array, out: Array | None = None) -> Array:
         """Apply the camera's adjoint to each frame, weigh it with its pattern, and add up."""
-        out = np.zeros(self.domain_shape, self.dtype) if out is None else out
+        out = np.empty(self.domain_shape, self.dtype) if out is None else out
         out[...] = 0
-        for frame, pattern in zip(y, self._patterns, strict=True):
-            out += pattern * self.camera.adjoint(frame[None])
+        for frame, pattern in zip(y[:, None], self._patterns, strict=True):
+            back = self.camera.adjoint(frame)
+            out += np.multiply(pattern, back, out=back)
         return out
 
     @property

@@ -70,6 +70,9 @@ def registered_field(calibration: Calibration, group: Group) -> tuple[Array, Fie
     InputError
         When a PSF can be registered neither by its image nor by its source's place.
     """
+    if len(group) == 1:
+        alone = calibration.psfs[group]
+        return alone[0], FieldOfPsfs(alone, [(0.0, 0.0)]), []
     central = _nearest_to_axis(calibration, group)
     reference = calibration.psfs[central]
     found, warnings = [], []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from recon.base.registry import Registry
@@ -65,7 +66,7 @@ class NamedPrior:
             )
         return made
 
-    @property
+    @cached_property
     def exact(self) -> bool:
         """Whether its prox is: a splitting with another would settle elsewhere."""
         return all(term.exact for term in self(1.0).terms())

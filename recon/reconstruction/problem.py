@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base.checks import as_channels, check_psf, require_options
+from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.errors import InputError
 from recon.priors import PRIORS, Prior, TotalVariation
@@ -130,9 +131,9 @@ class Problem:
                 )
             psfs = as_channels(calibration, "PSF")
             calibration = Calibration(psfs[None], np.full((1, 3), np.nan))
-            options = replace(options, model="convolution")
+            options = settled(options, model="convolution")
         if measurement.patterns is not None and options.model == "auto":
-            options = replace(options, model="convolution")
+            options = settled(options, model="convolution")
         calibration, depths, doubts = depths_of(calibration, options)
         lone = measurement.patterns is not None
         require_same_channels(calibration.psfs, counts.data[:1] if lone else counts.data)
@@ -192,7 +193,10 @@ class Problem:
         data = counts / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
-        return replace(self, measurement=measurement, data=data)
+        other = replace(self, measurement=measurement, data=data)
+        for name in {"energy", "levelled"} & set(self.__dict__):  # they are the PSFs', which stay
+            other.__dict__[name] = self.__dict__[name]
+        return other
 
     # What it is --------------------------------------------------------------------------------------
     @property
@@ -220,7 +224,7 @@ class Problem:
         """Height and width of the measurement."""
         return self.data.shape[1], self.data.shape[2]
 
-    @property
+    @cached_property
     def solver(self) -> OfferedSolver:
         """The solver that was asked for, or the first that is for such problems."""
         return solver_for(self)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -88,7 +89,12 @@ def given(
     """Tell facts about the measurement, by name, from options."""
     known = {name: value for name, value in overrides.items() if name in FACTS}
     asked = {name: value for name, value in overrides.items() if name not in FACTS}
-    return known, with_overrides(options or ReconstructionOptions(), asked)
+    return known, with_overrides(options or _defaults(), asked)
+
+
+@functools.cache
+def _defaults() -> ReconstructionOptions:
+    return ReconstructionOptions()
 
 
 def judged(result: Reconstruction, problem: Problem, *, started: bool = False) -> Reconstruction:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.base.declare import settled
 from recon.errors import InputError
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.part import Part, parts_of
@@ -86,7 +87,7 @@ def solve(
     while True:
         left = None if limit is None else limit - spent
         result = _solve(
-            replace(problem, options=replace(problem.options, time_s=left)),
+            replace(problem, options=settled(problem.options, time_s=left)),
             None if warm is None else reduced_start(problem, warm),
             None if on_progress is None else _shown(problem, on_progress),
             cancel,

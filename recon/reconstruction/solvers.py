@@ -293,11 +293,12 @@ def solver_for(problem: Problem) -> OfferedSolver:
     asked = problem.options.solver
     require_solver(asked)
     if asked == "auto":
-        reasons = {name: offered.accepts(problem) for name, offered in SOLVERS.items()}
-        able = next((name for name, reason in reasons.items() if reason is None), None)
-        if able is None:
-            raise InputError("; ".join(f"{name}: {reason}" for name, reason in reasons.items()) + ".")
-        return SOLVERS[able]
+        reasons = []
+        for name, offered in SOLVERS.items():
+            if (reason := offered.accepts(problem)) is None:
+                return offered
+            reasons.append(f"{name}: {reason}")
+        raise InputError("; ".join(reasons) + ".")
     offered = SOLVERS.named(asked)
     if (reason := offered.accepts(problem)) is not None:
         raise InputError(f"The solver {asked} does not take this: {reason}.")

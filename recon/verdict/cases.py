@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +115,17 @@ class Cases:
     severities: Floats
     scenes: npt.NDArray[np.int_]
     maps: tuple[str, ...]
+
+    @cached_property
+    def typical(self) -> Floats | None:
+        """The median of the good cases' places, (n_features,); None where there are too few."""
+        good = self.places[self.severities < 0.7]
+        return None if len(good) < 5 else np.asarray(np.median(good, axis=0))
+
+    @cached_property
+    def n_scenes(self) -> int:
+        """How many mixed scenes they come from."""
+        return len(set(self.scenes.tolist()) - {-1})
 
     def without(self, scene: int) -> Cases:
         """Return the cases but for those of a mixed scene, to judge that scene by the others."""

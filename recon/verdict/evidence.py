@@ -6,8 +6,8 @@ Nothing here knows the truth. Everything is relative, so that it means the same 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -95,8 +95,8 @@ class Evidence:
 
     def as_json(self) -> dict[str, float]:
         """Return the numbers by name, but for those that were not measured."""
-        values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        return {name: float(value) for name, value in values if value is not None}
+        measured = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+        return {name: float(value) for name, value in measured if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,9 +230,9 @@ def _ambiguity(psf: Array) -> float:
 
 def averaged(channels: list[Evidence]) -> Evidence:
     """Return the mean over channels, the worst of what must not average."""
-    known = [c.as_json() for c in channels]
-    numbers: Mapping[str, list[float]] = {k: [c[k] for c in known] for k in known[0]}
-    mean = {k: float(np.mean(v)) for k, v in numbers.items()}
+    rows = [c.as_json() for c in channels]
+    numbers = {name: [row[name] for row in rows] for name in rows[0]}
+    mean = {name: sum(values) / len(values) for name, values in numbers.items()}
     worst = {k: max(numbers[k]) for k in ("unexplained", "saturated", "unsettled", "load")}
     return Evidence(**{**mean, **worst, "planes": int(numbers["planes"][0])})  # type: ignore[arg-type]
 

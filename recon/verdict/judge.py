@@ -274,9 +274,8 @@ def verdict_on(evidence: Evidence, method: str, cases: Cases | None = None) -> V
     else:
         settled = numbers["unsettled"] < UNSETTLED
         region = Region.INSIDE if reliable and settled else Region.NEAR
-    mixed = len(set(cases.scenes.tolist()) - {-1})
     sources = [f"maps {', '.join(cases.maps)}"] if cases.maps else []
-    sources += [f"{mixed} mixed scenes"] if mixed else []
+    sources += [f"{cases.n_scenes} mixed scenes"] if cases.n_scenes else []
     basis = f"{count} nearest of {len(cases.severities)} simulated cases ({'; '.join(sources)})"
     if region is Region.UNKNOWN:  # those stresses first without which cases would be nearest
 
@@ -323,15 +322,14 @@ def _relieved(
     cases: Cases, place: Floats, numbers: Mapping[str, float], gain_of: Callable[[Floats], float]
 ) -> tuple[Finding, ...]:
     """Return the stresses that are worse than in good cases, by what is gained where one is as in those."""
-    good = cases.places[cases.severities < 0.7]
-    if len(good) < 5:
+    if cases.typical is None:
         return ()
     findings = []
     for index, name in enumerate(cases.weights):
         if name not in STRESSES:
             continue
         better, words, help_ = STRESSES[name]
-        typical = float(np.median(good[:, index]))
+        typical = float(cases.typical[index])
         if (place[index] - typical) * better >= 0:
             continue  # as good as in a good case already
         relieved = place.copy()

@@ -12,8 +12,8 @@ import tifffile
 from instrument.cli import main
 from instrument.files.calibration_file import save_calibration
 from instrument.files.errors import BenchError, FileError
-from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
-from instrument.plan.model import load_plan
+from instrument.plan.model import illumination_plan, load_plan
+from instrument.plan.patterns import group_lights, groups_from_text
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
 from recon import Calibration
 from recon.base.metrics import psnr
