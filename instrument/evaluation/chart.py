@@ -393,12 +393,13 @@ def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
             "Name another folder with --out.",
         )
     try:
-        points = [_point(p) for p in record["points"]]
+        points = [point_of(p) for p in record["points"]]
     except TypeError as error:
         raise FileError(path, f"is no chart of this program ({error}).", "Name another folder.") from error
     return points, dict(record["failed"]), set(record["missing"])
 
 
-def _point(record: dict[str, Any]) -> Point:
+def point_of(record: dict[str, Any]) -> Point:
+    """Return a point of a chart's record."""
     values: dict[str, Any] = {k: float("nan") if v is None else v for k, v in record.items()}
     return Point(**{**values, "held_out_parts": tuple(values.get("held_out_parts", ()))})
