@@ -236,12 +236,6 @@ class Bench:
         mount.stage.move_to(mount.target(x_um, y_um, z_um))
         return mount.position_um
 
-    def stage_target(
-        self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
-    ) -> dict[str, float]:
-        """Return the stage position that brings the point source to a place; errors as ``place_source``."""
-        return self.source_mount.target(x_um, y_um, z_um)
-
     def source_on(self) -> None:
         """Light the point source; confirmed when this returns."""
         self._lights.switch_source(lit=True)
