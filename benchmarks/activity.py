@@ -29,8 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from recon.base import fft as project_fft
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.streams.baseline import aligned, baseline, change, fading, motion
-from recon.streams.regions import find_regions
+from recon.streams.activity import aligned, baseline, change, fading, find_regions, motion
 from recon.streams.video import BLOCK, VideoSolver, stream_problem
 
 SHAPE = (128, 160)

@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
-from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from instrument.reconstruction.video_work import cluster, in_process, on_cluster
 from recon.base import fft as project_fft
 from recon.base.metrics import psnr
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
@@ -88,13 +88,13 @@ def independent(camera, frames, truths):
     solver = VideoSolver(camera)
     found = {count: [0.0, 0.0] for count in COLD}
     for frame, truth in zip(frames, truths, strict=True):
-        problem = camera.with_data(frame)
         began_s = time.process_time()
-        solver.running.begin(problem)
+        solver.begin()
+        solver.take(frame)
         seconds = time.process_time() - began_s
         for count in range(1, COLD[-1] + 1):
             began_s = time.process_time()
-            solver.running.advance()
+            solver.advance(0.0)
             seconds += time.process_time() - began_s
             if count in found:
                 found[count][0] += quality(solver.picture(), truth) / len(frames)

@@ -15,11 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
-from calibration_routines.display.hologram_photograph import (
-    Photographed,
-    photograph_hologram,
-    write_capture,
-)
+from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext

@@ -212,10 +212,7 @@ class BenchSession(QObject):
     def switch_light(self, light: LightState, *, quiet: bool = False) -> Job:
         """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         return self.jobs.device(
-            f"Light: {light}",
-            lambda _: switch_light(self.bench, light),
-            {"led_array", "light"},
-            quiet=quiet,
+            f"Light: {light}", lambda _: switch_light(self.bench, light), {"led_array", "light"}, quiet=quiet
         )
 
     def exclusive_job(self, title: str, work: Work) -> Job:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,31 +11,28 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QHideEvent
-from PySide6.QtWidgets import (
-    QComboBox,
-    QHBoxLayout,
-    QLabel,
-    QLineEdit,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QLineEdit, QPushButton, QVBoxLayout, QWidget
 
 from gui.background import LiveFollower
+from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
+from gui.widgets.building import scrolled
 from gui.widgets.dialogues import choose_path, elided
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState, light_of
 from instrument.files.calibration_file import is_calibration, load_calibration, newest_calibration
-from instrument.files.errors import duration
-from instrument.live.live import LiveResult, full_picture
+from instrument.files.errors import BenchError, duration
+from instrument.live.live import LiveResult
 from instrument.reconstruction.job import find_calibration
+from recon.base.declare import Imports, expression, options_of
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS
 from recon.streams.live import LiveReconstructor
+from recon.streams.live_picture import LiveOptions
 from recon.types import Calibration
 
 _LOOK_MS = 50
@@ -43,6 +40,7 @@ _BUDGET_MS = 80.0
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
 _PROGRESS_S = 0.5
 _NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
+_ALL_DEPTHS = "all depths"
 _WHITE = 99.8
 """Percentile of a picture that is shown white."""
 
@@ -52,7 +50,10 @@ class _Loaded:
     path: Path
     calibration: Calibration
     reconstructor: LiveReconstructor
-    z_um: float | None
+
+    @property
+    def z_um(self) -> float | None:
+        return self.reconstructor.options.z_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,10 @@ class _SoFar:
 
 
 class LiveReconstructionPanel(Panel):
-    """Reconstructs the live view's newest frame again and again; never slows the camera."""
+    """Reconstructs the live view's newest frame again and again; never slows the camera.
+
+    The options are those of every reconstruction that apply to live pictures, folded away behind a button.
+    """
 
     title = "Live reconstruction"
 
@@ -90,7 +94,7 @@ class LiveReconstructionPanel(Panel):
         self.browse_button.setToolTip("Choose a calibration folder")
         self.browse_button.clicked.connect(self._browse)
         self.plane = QComboBox()
-        self.plane.setToolTip("Depth of the scene: which PSF of the calibration is used")
+        self.plane.setToolTip("Depth of the scene: which PSFs of the calibration are used")
         self.plane.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.plane.activated.connect(self._rebuild)
         self.run_button = QPushButton("▶ Preview")
@@ -102,15 +106,23 @@ class LiveReconstructionPanel(Panel):
         self.refine_button.setToolTip("Reconstruct the newest frame with the full solver; again ends it")
         self.refine_button.clicked.connect(self.refine)
         self.budget = NumberEdit(
-            "ms",
-            _BUDGET_MS,
-            minimum=5.0,
-            maximum=5000.0,
-            tip="Time for one picture: quality gives way",
+            "ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip="Time for one picture: quality gives way"
         )
         self.budget.setFixedWidth(80)
         self.budget.submitted.connect(self._set_budget)
         self.budget.refused.connect(lambda why: self.refused(None, why))
+        declared = (*options_of(ReconstructionOptions), *options_of(LiveOptions))
+        own = ("z_um", "budget_ms")
+        self.options = OptionsForm([o for o in declared if o.name not in own], folded=(*FOLDED, "Computing"))
+        self.options.show_for("live picture")
+        self.options.settled.connect(lambda _: self._rebuild())
+        self.options.refused.connect(self.refused)
+        folded = scrolled(self.options)
+        folded.hide()
+        self.options_button = QPushButton("Options")
+        self.options_button.setCheckable(True)
+        self.options_button.setToolTip("Prior, solver, camera model, background; how frames are binned")
+        self.options_button.toggled.connect(folded.setVisible)
         self.status = QLabel(_NO_CALIBRATION)
         self.status.setWordWrap(True)
         self.status.setObjectName("dim")
@@ -121,6 +133,7 @@ class LiveReconstructionPanel(Panel):
         second = QHBoxLayout()
         second.addWidget(self.run_button)
         second.addWidget(self.refine_button)
+        second.addWidget(self.options_button)
         second.addStretch(1)
         second.addWidget(QLabel("within"))
         second.addWidget(self.budget)
@@ -130,6 +143,7 @@ class LiveReconstructionPanel(Panel):
         layout.addWidget(self.view, 1)
         layout.addWidget(self.status)
         layout.addLayout(second)
+        layout.addWidget(folded, 1)
         session.run_finished.connect(self._run_finished)
         self._timer = QTimer(self)
         self._timer.timeout.connect(self.look)
@@ -141,15 +155,18 @@ class LiveReconstructionPanel(Panel):
         """Return lines that reconstruct live with the same calibration."""
         path = self.session.config.path
         calibration = "calibration" if self.loaded is None else str(self.loaded.path)
-        return (
-            "from instrument.bench.bench import open_bench\n"
-            "from instrument.live.live import live_view\n\n"
-            f"with open_bench({str(path) if path else None!r}) as bench:\n"
-            f"    settings = dict(z_um={self.z_um!r}, budget_ms={self.budget.value!r})\n"
-            f"    with live_view(bench, {calibration!r}, **settings) as live:\n"
-            "        for result in live:\n"
-            "            print(result.picture.quality, result.latency_ms)\n"
+        imports = Imports({("instrument.bench.bench", "open_bench"), ("instrument.live.live", "live_view")})
+        options, live = (expression(asked, imports, indent="    ") for asked in self._asked(self.z_um))
+        lines = (
+            "",
+            f"with open_bench({str(path) if path else None!r}) as bench:",
+            f"    options = {options}",
+            f"    settings = {live}",
+            f"    with live_view(bench, {calibration!r}, options, settings) as live:",
+            "        for result in live:",
+            "            print(result.picture.quality, result.latency_ms)",
         )
+        return "\n".join((*imports.lines(), *lines, ""))
 
     def shutdown(self) -> None:
         """End the timer, the preview and a refinement."""
@@ -160,7 +177,7 @@ class LiveReconstructionPanel(Panel):
 
     @property
     def z_um(self) -> float | None:
-        """The depth chosen, micrometres; None where the calibration has one PSF."""
+        """The depth chosen, micrometres; None for all, and where the calibration has one PSF."""
         value = self.plane.currentData()
         return None if value is None else float(value)
 
@@ -198,13 +215,15 @@ class LiveReconstructionPanel(Panel):
             self._build(self.loaded.path, self.loaded.calibration, self.z_um)
 
     def _build(self, path: Path, calibration: Calibration, z_um: float | None) -> None:
-        budget_ms = self.budget.value or _BUDGET_MS
+        try:
+            asked = self._asked(z_um)
+        except BenchError as error:
+            self.refused(None, str(error))
+            return
 
         def work(_: JobContext) -> _Loaded:
             self.follower.stop()
-            return _Loaded(
-                path, calibration, LiveReconstructor(calibration, z_um=z_um, budget_ms=budget_ms), z_um
-            )
+            return _Loaded(path, calibration, LiveReconstructor(calibration, *asked))
 
         job = self.session.jobs.compute("Preparing the preview", work)
         job.quiet = True
@@ -212,6 +231,11 @@ class LiveReconstructionPanel(Panel):
         job.succeeded.connect(lambda value: self._ready(job, value))
         job.failed.connect(lambda why: self._not_ready(job, why))
         job.ended.connect(lambda: self._not_loading(job))
+
+    def _asked(self, z_um: float | None) -> tuple[ReconstructionOptions, LiveOptions]:
+        """Return the options as they stand here; BenchError where one cannot be read."""
+        live = replace(self.options.make(LiveOptions), budget_ms=self.budget.value or _BUDGET_MS)
+        return replace(self.options.make(ReconstructionOptions), z_um=z_um), live
 
     def _not_ready(self, job: Job, why: str) -> None:
         """Say why, and what goes on: the preview of before."""
@@ -242,13 +266,14 @@ class LiveReconstructionPanel(Panel):
 
     def _show_depths(self, loaded: _Loaded) -> None:
         """List the depths of the calibration in use, with the one that is used."""
-        depths = _depths_um(loaded.calibration)
+        depths: list[float | None] = list(_depths_um(loaded.calibration))
+        depths += [None] if depths else []
         if [self.plane.itemData(i) for i in range(self.plane.count())] != depths:
             self.plane.clear()
             for z_um in depths:
-                self.plane.addItem(f"z {z_um / 1e3:.4g} mm", z_um)
-        if loaded.z_um is not None:
-            self.plane.setCurrentIndex(self.plane.findData(loaded.z_um))
+                self.plane.addItem(_ALL_DEPTHS if z_um is None else f"z {z_um / 1e3:.4g} mm", z_um)
+        if depths:
+            self.plane.setCurrentIndex(depths.index(loaded.z_um))
         self.plane.setVisible(bool(depths))
 
     def _browse(self) -> None:
@@ -338,7 +363,7 @@ class LiveReconstructionPanel(Panel):
             self._holds = False
             self.refine_button.setText("Refine")
             return
-        frame, loaded, z_um = self.session.live.newest(), self.loaded, self.z_um
+        frame, loaded = self.session.live.newest(), self.loaded
         if loaded is None:
             self.refused(self.file, "Choose a calibration first.")
             return
@@ -347,7 +372,9 @@ class LiveReconstructionPanel(Panel):
             return
         image = np.array(frame.image)  # a copy: the ring's buffer is wanted back
 
-        def work(context: JobContext) -> Reconstruction:
+        reconstructor = loaded.reconstructor
+
+        def work(context: JobContext) -> tuple[Reconstruction, npt.NDArray[np.float32]]:
             self.follower.stop()
             shown_s = time.monotonic()
 
@@ -357,9 +384,10 @@ class LiveReconstructionPanel(Panel):
                     shown_s = time.monotonic()
                     left = max(ITERATIONS - record.iteration, 0)
                     left_s = left * record.seconds / record.iteration
-                    context.report(_SoFar(record.iteration, left_s, np.array(present())))
+                    context.report(_SoFar(record.iteration, left_s, reconstructor.shown(present()).copy()))
 
-            return full_picture(image, loaded.calibration, z_um=z_um, callback=watch, cancel=context.cancel)
+            result = reconstructor.full(image, on_progress=watch, cancel=context.cancel)
+            return result, reconstructor.shown(result.volume)
 
         job = self.session.jobs.compute("Refining the newest frame", work)
         self._refining = job
@@ -377,9 +405,9 @@ class LiveReconstructionPanel(Panel):
         self.status.setText(f"Refining: iteration {so_far.iteration} of at most {ITERATIONS}, {left}")
 
     def _refined(self, value: object) -> None:
-        result = cast(Reconstruction, value)
+        result, shown = cast(tuple[Reconstruction, npt.NDArray[np.float32]], value)
         self._holds = True
-        self._show_picture(result.image)
+        self._show_picture(shown)
         reason = f", {result.stop_reason}"
         elided(
             self.status,

@@ -8,7 +8,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QWidget
@@ -24,7 +23,7 @@ from gui.procedure_run import Situation
 from gui.session import BenchSession
 from gui.widgets.building import fill, label, split, tabs
 from gui.widgets.dialogues import elided
-from gui.widgets.image_view import ImageView
+from gui.widgets.image_view import ImageView, usual_levels
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
@@ -33,8 +32,6 @@ from instrument.plan.model import load_plan, plan_toml
 from recon.base.declare import option
 
 Image = npt.NDArray[Any]
-_LEVELS = (0.1, 99.9)
-"""Percentiles that frames are stretched to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,8 +164,7 @@ class SweepsPanel(ProcedurePanel):
         elided(self.frame_words, ", ".join(words))
 
     def _show_image(self, image: Image, full_scale: int | None = None) -> None:
-        low, high = np.percentile(image[::4, ::4], _LEVELS)
-        self.frame.show_image(image, float(low), float(max(high, low + 1)), full_scale)
+        self.frame.show_image(image, *usual_levels(image), full_scale)
 
     def _read_plan(self) -> None:
         """Show the plan of a file that was chosen."""

@@ -15,7 +15,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.volumes import is_zarr_name
 from instrument.reconstruction.activity import ActivitySettings, find_activity, write_activity
 from instrument.reconstruction.options import InputOptions, SourceOptions
-from instrument.reconstruction.video_output import VideoPictures
+from instrument.reconstruction.video_files import VideoPictures
 from instrument.runs.run import STATE
 from recon.base.declare import option
 from recon.reconstruction.options import ReconstructionOptions

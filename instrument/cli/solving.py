@@ -23,8 +23,7 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_block import BlockReport
-from instrument.reconstruction.video_workers import require_crew
+from instrument.reconstruction.video_work import BlockReport, require_crew
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solve import ITERATIONS

@@ -5,69 +5,23 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.common.stream import FrameStream
 from drivers.frame import Frame, FrameMetadata
 from instrument.bench.bench import Bench
 from instrument.files.calibration_file import load_calibration
 from instrument.reconstruction.job import find_calibration
-from instrument.reconstruction.preparation import bin_image
-from recon import Measurement, reconstruct
-from recon.errors import InputError
-from recon.reconstruction.result import Reconstruction
-from recon.solvers.base import IterationRecord
-from recon.streams.live import LivePicture, LiveReconstructor
+from recon.reconstruction.options import ReconstructionOptions
+from recon.streams.live import LiveReconstructor
+from recon.streams.live_picture import LiveOptions, LivePicture
 from recon.types import Calibration
-
-
-def full_picture(
-    image: npt.NDArray[Any],
-    calibration: Calibration,
-    *,
-    z_um: float | None = None,
-    callback: Callable[[IterationRecord, Callable[[], npt.NDArray[np.float32]]], None] | None = None,
-    cancel: threading.Event | None = None,
-) -> Reconstruction:
-    """Reconstruct a frame with the default solver, at the calibration's pixels.
-
-    Parameters
-    ----------
-    image : ndarray, (height, width) or (height, width, n_channels)
-        Counts, of the calibration's pixels or a whole multiple of them, which is then binned to them.
-    calibration : Calibration
-        Its background is subtracted.
-    z_um, callback, cancel
-        As of :func:`recon.reconstruct`.
-
-    Raises
-    ------
-    InputError
-        When frame and calibration do not fit each other.
-    """
-    height, width = calibration.psfs.shape[-2:]
-    factor = max(1, image.shape[0] // height)
-    if (image.shape[0] // factor, image.shape[1] // factor) != (height, width):
-        raise InputError(
-            f"The frame is {image.shape[0]} x {image.shape[1]} pixels, the calibration {height} x {width}: "
-            "a whole multiple is expected. Set the camera's region and binning as for the calibration."
-        )
-    background = None if calibration.background is None else np.moveaxis(calibration.background, 0, -1)
-    return reconstruct(
-        Measurement(bin_image(image, factor), background=background),
-        calibration,
-        z_um=z_um,
-        on_progress=None if callback is None else lambda record, now: callback(record, lambda: now()[0]),
-        cancel=cancel,
-    )
-
 
 _POLL_S = 0.25
 _KEPT = 300
@@ -313,13 +267,19 @@ class LiveView:
 
 
 def live_view(
-    bench: Bench, calibration: Calibration | Path | str, *, n_buffers: int = 4, **settings: Any
+    bench: Bench,
+    calibration: Calibration | Path | str,
+    options: ReconstructionOptions | None = None,
+    live: LiveOptions | None = None,
+    *,
+    n_buffers: int = 4,
+    **overrides: Any,
 ) -> LiveView:
     """Return a live reconstruction of a bench's camera, to be used as a context manager.
 
-    ``settings`` are those of :class:`recon.streams.live.LiveReconstructor`: ``z_um``, ``budget_ms``, ...::
+    ::
 
-        with live_view(bench, "calibration", budget_ms=33) as live:
+        with live_view(bench, "calibration", prior="l1", budget_ms=33) as live:
             for result in live:
                 show(result.picture.image, result.picture.quality)
 
@@ -329,14 +289,18 @@ def live_view(
         Open.
     calibration : Calibration or path
         A calibration, its folder, or the run that it was made of.
+    options, live, **overrides
+        As of :class:`recon.streams.live.LiveReconstructor`.
     n_buffers : int
         Frames that the camera's ring holds.
 
     Raises
     ------
     FileError, InputError
-        When the calibration cannot be used.
+        When the calibration or an option cannot be used.
     """
     if not isinstance(calibration, Calibration):
         calibration = load_calibration(find_calibration(Path(calibration)))
-    return LiveView(bench.camera.stream(n_buffers), LiveReconstructor(calibration, **settings))
+    return LiveView(
+        bench.camera.stream(n_buffers), LiveReconstructor(calibration, options, live, **overrides)
+    )

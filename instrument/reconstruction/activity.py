@@ -15,11 +15,25 @@ import numpy.typing as npt
 from instrument.files.atomic import whole_file, write_text
 from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
-from instrument.reconstruction.video_mp4 import DEFAULT_FPS, levels_of, write_mp4
-from instrument.reconstruction.video_output import VideoPictures, create_output
+from instrument.reconstruction.video_files import (
+    DEFAULT_FPS,
+    VideoPictures,
+    create_output,
+    levels_of,
+    write_mp4,
+)
 from recon.base.declare import option
-from recon.streams.baseline import Motion, aligned, baseline, change, fading, motion
-from recon.streams.regions import Region, find_regions, local_correlation
+from recon.streams.activity import (
+    Motion,
+    Region,
+    aligned,
+    baseline,
+    change,
+    fading,
+    find_regions,
+    local_correlation,
+    motion,
+)
 
 Floats = npt.NDArray[np.float32]
 
@@ -49,7 +63,7 @@ class ActivitySettings:
     align : bool
         Move frames back to one place first.
     least_correlation, radius_px
-        As :func:`recon.streams.regions.find_regions`.
+        As :func:`recon.streams.activity.find_regions`.
     """
 
     window_s: float = option(

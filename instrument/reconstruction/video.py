@@ -23,20 +23,26 @@ from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
 from instrument.reconstruction.request import PictureRequest
-from instrument.reconstruction.video_block import BlockReport, CancelledError
+from instrument.reconstruction.video_files import (
+    DEFAULT_FPS,
+    SAMPLES,
+    VideoPictures,
+    as_shown,
+    create_output,
+    has_light,
+    levels_of,
+    require_video,
+    write_mp4,
+)
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
-from instrument.reconstruction.video_mp4 import DEFAULT_FPS, SAMPLES, as_shown, levels_of, write_mp4
-from instrument.reconstruction.video_output import VideoPictures, create_output
-from instrument.reconstruction.video_source import has_light, require_video
-from instrument.reconstruction.video_workers import cluster, in_process, on_cluster
+from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
 from instrument.runs.run import Run
 from recon.base.declare import inapplicable
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
-from recon.streams.running import Running
-from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, stream_problem
+from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, VideoSolver, stream_problem
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,11 +160,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
             erasures=None if picture.valid is None else ~picture.valid,
         ),
         picture.calibration,
-        z_um=options.z_um,
-        model=options.model,
-        prior=options.prior,
-        tau=options.tau,
-        estimate_background=options.estimate_background,
+        replace(options, iterations=None),
     )
     if request.over_time is not None and not problem.together:
         raise BenchError(
@@ -205,7 +207,7 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
 
 def solve_video(
     prepared: PreparedVideo,
-    told: Callable[[BlockReport], object],
+    on_progress: Callable[[BlockReport], object],
     cancel: threading.Event,
     *,
     workers: int | None = None,
@@ -229,10 +231,10 @@ def solve_video(
     folder = job.folder.resolve()
     try:
         if workers is None and scheduler is None:
-            in_process(folder, output, prepared.left, told, cancel)
+            in_process(folder, output, prepared.left, on_progress, cancel)
         else:
             with cluster(workers=workers, scheduler=scheduler) as client:
-                on_cluster(client, folder, output, prepared.left, told, cancel)
+                on_cluster(client, folder, output, prepared.left, on_progress, cancel)
     except CancelledError:
         return False
     return True
@@ -312,9 +314,10 @@ def _settings(request: VideoRequest, picture: Job, problem: Problem, reduction: 
             "psf_file": None if request.psf is None else str(request.psf.resolve()),
             "z_um": request.options.z_um,
             "prior": str(request.options.prior or "tv"),
+            "solver": problem.solver.name,
             "model": problem.model,
             "background_estimated": problem.smooth,
-            "weight": max(Running(problem).weights),
+            "weight": max(VideoSolver(problem).weights),
             "noise_deviation": problem.noise,
             "optics_sha256": _digest(problem, reduction),
             "simulated": picture.simulated,

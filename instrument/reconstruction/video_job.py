@@ -17,6 +17,7 @@ import json
 import shutil
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
 from recon.streams.joint import OverTimeName
-from recon.streams.video import blocks_of, stream_problem
+from recon.streams.video import stream_problem
 from recon.types import Calibration, Geometry
 
 _VIDEO_JOB = RecordFormat(
@@ -129,8 +130,12 @@ class VideoJob:
     # What to do, and what is done ------------------------------------------------------------------
     @property
     def blocks(self) -> list[tuple[int, ...]]:
-        """The frames of each block."""
-        return blocks_of(list(self.plan.frames), self.plan.block)
+        """The frames of each block: numbers ``n block <= index < (n + 1) block``.
+
+        By number and not by count, so that blocks stay what they are when frames are missing or added.
+        """
+        block = self.plan.block
+        return [tuple(frames) for _, frames in groupby(self.plan.frames, lambda index: index // block)]
 
     def done(self) -> set[int]:
         """Return the numbers of the blocks whose pictures are on the disk."""

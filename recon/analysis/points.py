@@ -131,8 +131,7 @@ def try_points(
                 f"{grid.separation_planes:.3g} planes apart do not fit the window."
             )
         light = np.sum([image(float(c), float(s)) for s in z for c in x], axis=0)
-        solution = problem.solve(noise.expose(light, rng))
-        seen = solution.volume.sum(axis=1)
+        seen = problem.solve(noise.expose(light, rng)).sum(axis=1)
         places = np.stack(np.meshgrid(z, x + problem.half[1], indexing="ij"), axis=-1)
         worst = min(worst, smallest_dip(seen, places))
     return PointTrial(grid.separation_px, grid.separation_planes, float(worst), seen)
@@ -156,17 +155,14 @@ def smallest_dip(seen: Floats, places: Floats) -> float:
     n_planes, n_columns = places.shape[:2]
     step_z = float(places[1, 0, 0] - places[0, 0, 0]) if n_planes > 1 else 2.0
     step_x = float(places[0, 1, 1] - places[0, 0, 1]) if n_columns > 1 else 2.0
-    peaks = np.empty((n_planes, n_columns, 2), int)
-    for j in range(n_planes):
-        for i in range(n_columns):
-            peaks[j, i] = _peak(seen, places[j, i], max(step_z / 3, 0.5), max(step_x / 3, 0.5))
-    dips = []
-    for j in range(n_planes):
-        for i in range(n_columns):
-            for other in ((j + 1, i), (j, i + 1)):
-                if other[0] < n_planes and other[1] < n_columns:
-                    dips.append(_dip(seen, peaks[j, i], peaks[other]))
-    return min(dips)
+    reach = max(step_z / 3, 0.5), max(step_x / 3, 0.5)
+    peaks = np.array([[_peak(seen, place, *reach) for place in row] for row in places])
+    return min(
+        _dip(seen, peaks[j, i], peaks[other])
+        for j, i in np.ndindex(n_planes, n_columns)
+        for other in ((j + 1, i), (j, i + 1))
+        if other[0] < n_planes and other[1] < n_columns
+    )
 
 
 def smallest_resolved(

@@ -19,6 +19,7 @@ from recon.analysis.correlation import (
     autocorrelate,
     convolution_holds_deg,
     field_of_view,
+    lit_extent,
 )
 from recon.analysis.gram import ConditionCurve, Direction, condition_curve
 from recon.analysis.points import PLANES, Noise, PointTests, point_tests
@@ -357,15 +358,12 @@ def _geometry(calibration: Calibration) -> tuple[float, float]:
 def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int]]:
     """Cut every PSF to the part, symmetric about the axis, that any of them lights; and the whole shape."""
     height, width = calibration.psfs.shape[-2:]
-    bright = calibration.psfs.max(axis=(0, 1))
     cuts = []
-    for axis, size in ((1, height), (0, width)):
-        profile = bright.max(axis=axis)
-        used = np.flatnonzero(profile > 0.01 * float(profile.max()))
-        if not used.size:
-            raise InputError("The calibration's PSFs hold no light.")
+    for size, (first, last) in zip(
+        (height, width), lit_extent(calibration.psfs.max(axis=(0, 1))), strict=True
+    ):
         # From both ends alike, so that the axis stays where it is.
-        trim = max(min(int(used[0]), size - 1 - int(used[-1])) - MARGIN_PX, 0)
+        trim = max(min(first, size - 1 - last) - MARGIN_PX, 0)
         cuts.append(slice(trim, size - trim))
     psfs = np.ascontiguousarray(calibration.psfs[..., cuts[0], cuts[1]])
     return replace(calibration, psfs=psfs, background=None), (height, width)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.analysis.gram import WindowProblem, condition_number
-from recon.analysis.points import Noise, PointGrid, try_points
+from recon.analysis.points import DIP, Noise, PointGrid, try_points
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera
@@ -36,7 +36,6 @@ from recon.streams.joint import OverTimeName, solve_together
 from recon.streams.video import stream_problem
 from recon.verdict.cases import OF_VOLUMES
 from recon.verdict.map import (
-    DIP,
     PRECISION,
     PSNR_DB,
     Failure,

@@ -163,7 +163,7 @@ class ReconstructionOptions:
         flags=("--z-mm",),
         label="Distance",
         group=_MAIN,
-        applies=("picture", "video", "patterned picture"),
+        applies=("picture", "video", "live picture", "patterned picture"),
     )
     solver: str = option(
         "auto",
@@ -172,7 +172,7 @@ class ReconstructionOptions:
         flags=("--solver", "--method", "-m"),
         group=_MAIN,
         replaced=_replaced,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "video", "live picture"),
     )
     iterations: int | None = option(
         None,
@@ -182,6 +182,7 @@ class ReconstructionOptions:
         flags=("--iterations", "-n"),
         metavar="N",
         group=_STOP,
+        applies=("picture", "volume", "video", "patterned picture"),
         identifies=False,
     )
     time_s: float | None = option(
@@ -218,7 +219,7 @@ class ReconstructionOptions:
         help="local, lowrank: PSFs that vary over the field; auto: the smallest that explains the data.",
         choices=model_names,
         group=_CHOICE,
-        applies=("picture", "volume", "video"),
+        applies=("picture", "volume", "video", "live picture"),
     )
     choose: Overrides | None = option(
         None,
@@ -236,7 +237,7 @@ class ReconstructionOptions:
         flags=("--background/--no-background",),
         label="Smooth background",
         group=_CHOICE,
-        applies=("picture", "volume", "video"),
+        applies=("picture", "volume", "video", "live picture"),
     )
     positive_background: bool = option(
         False,
@@ -265,14 +266,18 @@ class ReconstructionOptions:
         group=_RARE,
     )
     device: Device = option(
-        "cpu", help="Where to compute.", choices=DEVICES, group=_COMPUTE, applies=("picture", "volume")
+        "cpu",
+        help="Where to compute.",
+        choices=DEVICES,
+        group=_COMPUTE,
+        applies=("picture", "volume", "live picture"),
     )
     precision: Literal["auto"] | Precision = option(
         "auto",
         help="auto: float32, unless that would show. float64: twice the memory, up to twice the time.",
         choices=("auto", *PRECISIONS),
         group=_COMPUTE,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "live picture"),
     )
     memory_gib: float | None = option(
         None,
@@ -284,7 +289,7 @@ class ReconstructionOptions:
         metavar="GIB",
         group=_COMPUTE,
         recorded=False,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "live picture"),
     )
     scratch: Path | None = option(
         None,
@@ -292,7 +297,7 @@ class ReconstructionOptions:
         metavar="FOLDER",
         group=_COMPUTE,
         recorded=False,
-        applies=("picture", "volume"),
+        applies=("picture", "volume", "live picture"),
     )
     judged: bool = option(
         True,

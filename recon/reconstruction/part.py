@@ -164,7 +164,7 @@ class Part:
             psfs,
             (height, width),
             dtype=self.dtype,
-            allocate=lambda shape, dtype: self.storage.zeros(shape, dtype),
+            allocate=lambda shape, dtype: self.storage.zeros(shape, dtype, lasting=True),
         )
         self.plan = memory.plan(
             kind_of(self.problem.prior_name),

@@ -193,7 +193,10 @@ class Problem:
         data = counts / self.noise[:, None, None]
         if not self.valid.all():
             data = np.where(self.valid, data, 0)
-        return replace(self, measurement=measurement, data=data)
+        other = replace(self, measurement=measurement, data=data)
+        for name in {"energy", "levelled"} & set(self.__dict__):  # they are the PSFs', which stay
+            other.__dict__[name] = self.__dict__[name]
+        return other
 
     # What it is --------------------------------------------------------------------------------------
     @property

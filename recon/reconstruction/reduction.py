@@ -16,7 +16,7 @@ from recon.camera.field_registration import NOT_ON_AXIS
 from recon.errors import InputError
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.colours import Colours, merged_input
-from recon.reconstruction.measurement import Measurement, central
+from recon.reconstruction.measurement import Measurement, Noise, central
 from recon.reconstruction.planes import put_back, with_planes_between
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.result import Reconstruction
@@ -105,10 +105,6 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
     calibration = reduced_calibration(calibration, factor, planes)
     window = tuple(max(n // factor, 1) for n in choice.psf_window)
     small = tuple(min(w, n) for w, n in zip(window, calibration.psfs.shape[2:], strict=True))
-    erased = None
-    if not valid.all():
-        erased = block_mean(valid.astype(np.float32), factor, about_axis=True) < 1 - 1e-6
-    kept = block_mean(np.where(valid, data, 0), factor, about_axis=True)
     warnings = problem.warnings
     single = choice.n_planes == 1 and choice.model == "convolution"
     if single:
@@ -117,11 +113,7 @@ def reduced(choice: Choice, problem: Problem) -> Problem:
         idle = {w for w in problem.depths.warnings if w != NOT_ON_AXIS}
         warnings = tuple(w for w in warnings if w not in idle)
     made = Problem.of(
-        Measurement(
-            kept[0] if flat else np.moveaxis(kept, 0, -1),
-            averaged_noise(noise, factor**2),
-            erasures=None if erased is None else (erased[0] if flat else np.moveaxis(erased, 0, -1)),
-        ),
+        on_blocks(data, valid, noise, factor, flat=flat),
         calibration,
         replace(
             problem.options,
@@ -204,6 +196,30 @@ def reduced_start(problem: Problem, before: Reconstruction) -> Reconstruction:
     planes = [volume[int(at)] if at == int(at) else np.zeros_like(volume[0]) for at in places_of(choice)]
     own = choice.binning == 1 and not choice.merged
     return replace(before, volume=np.stack(planes).astype(np.float32), state=before.state if own else None)
+
+
+def on_blocks(data: Floats, valid: Array, noise: Noise, factor: int, *, flat: bool) -> Measurement:
+    """Return a measurement on blocks of pixels: erased where one of a block's pixels is.
+
+    Parameters
+    ----------
+    data, valid : ndarray, (n_channels, height, width)
+        Counts less the background, and which pixels count.
+    noise : NoiseModel or float, optional
+        Of one pixel, counts.
+    flat : bool
+        Whether it has no axis of channels.
+    """
+    erased = None
+    if not valid.all():
+        erased = block_mean(valid.astype(np.float32), factor, about_axis=True) < 1 - 1e-6
+        data = np.where(valid, data, 0)
+    kept = block_mean(data, factor, about_axis=True)
+    return Measurement(
+        kept[0] if flat else np.moveaxis(kept, 0, -1),
+        averaged_noise(noise, factor**2),
+        erasures=None if erased is None else (erased[0] if flat else np.moveaxis(erased, 0, -1)),
+    )
 
 
 def reduced_calibration(calibration: Calibration, factor: int, planes: tuple[int, ...] | None) -> Calibration:

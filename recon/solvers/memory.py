@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,8 @@ class Storage:
     def __init__(self, scratch: Path | str | None = None, room: int = 0) -> None:
         self._room = room
         self.on_disk = 0
+        self._turn: list[tuple[int, Path | None]] = []
+        """Bytes and files (None: in memory) taken since the last turn."""
         self._folder: Path | None = None
         if scratch is not None:
             self._folder = Path(tempfile.mkdtemp(prefix="diffuserbench-", dir=scratch))
@@ -147,8 +150,24 @@ class Storage:
         if self._folder is not None:
             self._remove()
 
-    def zeros(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return an array of zeros.
+    def turn(self) -> Callable[[], None]:
+        """Begin another turn; the function that is returned gives up the arrays of those before."""
+        before, self._turn = self._turn, []
+
+        def give_up() -> None:
+            for size, path in before:
+                if path is None:
+                    self._room += size
+                else:
+                    self.on_disk -= size
+                    path.unlink(missing_ok=True)
+
+        return give_up
+
+    def zeros(
+        self, shape: tuple[int, ...], dtype: npt.DTypeLike, *, lasting: bool = False
+    ) -> npt.NDArray[Any]:
+        """Return an array of zeros; a lasting one outlives its :meth:`turn`.
 
         Raises
         ------
@@ -158,6 +177,7 @@ class Storage:
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if self._folder is None or size <= self._room:
             self._room -= size
+            self._turn += [] if lasting else [(size, None)]
             return np.zeros(shape, dtype)
         free = shutil.disk_usage(self._folder).free
         if size > free:
@@ -168,6 +188,7 @@ class Storage:
         self._count += 1
         self.on_disk += size
         path = self._folder / f"{self._count}.dat"
+        self._turn += [] if lasting else [(size, path)]
         array = np.memmap(path, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
         if hasattr(
             os, "posix_fallocate"

@@ -9,7 +9,6 @@ import numpy as np
 from recon.base import fft
 from recon.camera.base import Array, LinearOperator
 from recon.camera.factors import CroppedConvolution, as_cropped_convolution
-from recon.errors import StructureError
 from recon.solvers.base import Outcome, StopReason
 
 FLATNESS = 1e-3
@@ -61,16 +60,13 @@ class WienerFilter:
     Parameters
     ----------
     operator : LinearOperator
-        A ``Convolution`` of a picture without erasures.
+        As of :func:`wiener`.
     regularisation : float
         As of :func:`wiener`.
     """
 
     def __init__(self, operator: LinearOperator, regularisation: float) -> None:
-        structure = as_cropped_convolution(operator)
-        if not structure.weight.all():
-            raise StructureError("A WienerFilter takes no erasures: see wiener, which fills them.")
-        self._structure = structure
+        self._structure = structure = as_cropped_convolution(operator)
         convolution = structure.convolution
         power = convolution.power()
         penalty = (_penalty(convolution.grid_shape) * float(np.mean(power))).astype(power.dtype)
@@ -85,7 +81,7 @@ class WienerFilter:
 
 
 def cross_validated(operator: LinearOperator, data: Array) -> float:
-    """Return about the regularisation that :func:`wiener` would choose for data without erased pixels.
+    """Return about the regularisation that :func:`wiener` would choose for data.
 
     From every so many rows of frequencies, ``ENOUGH_FREQUENCIES`` in all: a live picture waits for it.
     """

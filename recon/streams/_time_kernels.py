@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`recon.streams.over_time` (imported lazily: numba)."""
+"""Compiled loops of :mod:`recon.streams.joint` (imported lazily: numba)."""
 
 from __future__ import annotations
 

@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.base.blocks import block_mean
-from recon.base.checks import as_channels, check_psf, require_finite, select_psf
-from recon.base.noise import NoiseModel
+from recon.base.checks import as_channels, require_finite
+from recon.base.declare import inapplicable, with_overrides
 from recon.errors import InputError
-from recon.streams.live_level import Array, ComingLevel, FilterLevel, Floats, Level
+from recon.reconstruction.measurement import Floats, Measurement
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.problem import Problem
+from recon.reconstruction.reconstruct import given, reconstruct
+from recon.reconstruction.reduction import on_blocks, reduced_calibration
+from recon.reconstruction.result import Reconstruction
+from recon.reconstruction.solve import Progress
+from recon.streams.live_picture import ComingLevel, Level, LiveOptions, LivePicture
 from recon.streams.pace import Pace, Spent
 from recon.streams.stillness import SceneState, SceneWatch
+from recon.streams.video import require_steps, stream_problem
 from recon.types import Calibration
+
+Array = npt.NDArray[Any]
 
 LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
 
 SETTLED = 1e-3
-"""Change an iteration below which a frame's picture is done: 55 dB from where it would end."""
+"""Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
+from where the exact-data ADMM would end."""
 
 AT_ONCE = 150_000
 """Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
@@ -32,54 +44,6 @@ _POLL_S = 0.005
 
 _Stamp = tuple[float, float]
 """Seconds on the clock, and of this thread's processor time."""
-
-
-@dataclass(frozen=True, slots=True)
-class LivePicture:
-    """A picture, and what it is worth.
-
-    Attributes
-    ----------
-    image : ndarray, float32, (height, width) or (height, width, n_channels)
-        The part of the scene opposite to the sensor, on pixels binned ``binning x binning``; brightness does
-        not depend on the binning.
-    binning : int
-    method : "admm" or "wiener"
-    iterations : int
-        Done for this picture; 0 for ``"wiener"``.
-    total_iterations : int
-        Since the solver last began anew; what it knew of the scene before a movement stays with it.
-    scene : SceneState
-        Whether the scene is new, moving or still.
-    frames : int
-        Frames averaged; 1 unless the scene is still.
-    settled : bool
-        Whether further iterations on these frames would change nothing that can be seen.
-    work_ms : float
-        Time that the picture took.
-    budget_ms : float
-        Time that it was allowed.
-    """
-
-    image: Floats
-    binning: int
-    method: Literal["admm", "wiener"]
-    iterations: int
-    total_iterations: int
-    scene: SceneState
-    frames: int
-    settled: bool
-    work_ms: float
-    budget_ms: float
-
-    @property
-    def quality(self) -> str:
-        """What the picture is worth, in words: ``"binned 2 x 2, 3 iterations (41 in all), moving"``."""
-        pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
-        steps = f"{self.iterations} iterations ({self.total_iterations} in all)"
-        how = "Wiener filter" if self.method == "wiener" else steps
-        scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
-        return ", ".join((pixels, how, scene, *(("settled",) if self.settled else ())))
 
 
 class LiveReconstructor:
@@ -93,80 +57,93 @@ class LiveReconstructor:
     The first picture of a scene is a Wiener filter's, at once; from the next on, or by :meth:`refine`, it is
     iterated. While the scene is still, frames are averaged and iterations go on from frame to frame, so that
     the picture converges. While it moves, they go on from the picture before. After a cut, they begin anew.
-    Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is told
+    Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is said
     in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
 
     Parameters
     ----------
     calibration : Calibration or ndarray
-        As of :func:`recon.reconstruct`. One PSF is used for the whole field.
-    z_um : float, optional
-        Depth of the scene, where there are several PSFs.
-    background : array or number, optional
-        Counts, subtracted from each frame; default: the calibration's background.
-    noise : NoiseModel or float, optional
-        The camera's noise, of one pixel, counts; default: estimated from the first frame.
-    budget_ms : float
-        Time for one picture. 33 keeps up with 30 frames a second. May be changed at any time.
-    finest, coarsest : int
-        Bounds of the binning.
-    average : int
-        Frames averaged at most while the scene is still.
+        As of :func:`recon.reconstruct`.
+    options : ReconstructionOptions, optional
+        Any camera model, prior, solver, background and depths, as of
+        :func:`~recon.streams.video.stream_problem`; when to stop is the budget's matter.
+    live : LiveOptions, optional
+    **overrides
+        Single options of both by their names, and what is known of the frames, as of
+        :class:`~recon.reconstruction.measurement.Measurement`: ``noise``, ``background`` (default: the
+        calibration's), ``erasures``.
 
     Attributes
     ----------
+    budget_ms : float
+        May be changed at any time.
     warnings : tuple of str
         What is doubtful about the calibration, and what became of the pictures since.
 
     Raises
     ------
     InputError
-        When the calibration or a setting is unusable.
+        When the calibration or an option is unusable, or no solver has a way for them.
     """
 
     def __init__(
         self,
         calibration: Calibration | npt.ArrayLike,
-        *,
-        z_um: float | None = None,
-        background: npt.ArrayLike | None = None,
-        noise: NoiseModel | float | None = None,
-        budget_ms: float = 33.0,
-        finest: int = 1,
-        coarsest: int = 8,
-        average: int = 8,
+        options: ReconstructionOptions | None = None,
+        live: LiveOptions | None = None,
+        **overrides: Any,
     ) -> None:
-        if isinstance(calibration, Calibration):
-            self._psfs, self.psf_z_um = select_psf(calibration, z_um)
-            if background is None and calibration.background is not None:
-                background = np.moveaxis(calibration.background, 0, -1)
-        else:
-            self._psfs, self.psf_z_um = as_channels(calibration, "PSF"), None
-        self.warnings = self._doubts = check_psf(self._psfs)
-        if not budget_ms > 0:
-            raise InputError(f"budget_ms must be above 0, not {budget_ms}.")
-        if not 1 <= finest <= coarsest:
-            raise InputError(
-                f"1 <= finest <= coarsest is expected; got finest {finest}, coarsest {coarsest}."
-            )
-        if average < 1:
-            raise InputError(f"average must be 1 or more, not {average}.")
-        self.budget_ms = budget_ms
-        self._noise = noise
-        self._background = None if background is None else self._like_psf(background)
-        fine_enough = [b for b in range(finest, coarsest + 1) if min(self._psfs.shape[1:]) >= LEAST_SIDE * b]
-        self._binnings = fine_enough or [finest]
+        of_live = {f.name: overrides.pop(f.name) for f in fields(LiveOptions) if f.name in overrides}
+        self.live = live = with_overrides(live or LiveOptions(), of_live)
+        self._known, self.options = given(overrides, options)
+        if wrong := inapplicable(self.options, "live picture"):
+            names = ", ".join(o.name for o in wrong)
+            raise InputError(f"{names}: not for live pictures, which take what fits into budget_ms.")
+        if self._known.get("patterns") is not None:
+            raise InputError("Live pictures are of one scene in one light: leave the patterns out.")
+        self._given = calibration
+        background = calibration.background if isinstance(calibration, Calibration) else None
+        if background is not None and self._known.get("background") is None:
+            self._known["background"] = np.moveaxis(background, 0, -1)
+        checked = self._checked()
+        self.calibration, self._options = checked.calibration, checked.options
+        self.warnings = self._doubts = checked.warnings
+        self._n_planes = checked.n_planes
+        if live.plane is not None and live.plane >= self._n_planes:
+            raise InputError(f"plane {live.plane} is none of the {self._n_planes} depths, counted from 0.")
+        self.budget_ms = live.budget_ms
+        self._sensor = checked.sensor_shape
+        binnings = range(live.finest, live.coarsest + 1)
+        fine_enough = [b for b in binnings if min(self._sensor) >= LEAST_SIDE * b]
+        self._binnings = fine_enough or [live.finest]
         self._pace = Pace(self._binnings)
-        self._level: FilterLevel | None = None
+        self._level: Level | None = None
         self._coming: ComingLevel | None = None
-        self._watch = SceneWatch(average)
+        self._watch = SceneWatch(live.average)
         self._shape: tuple[int, ...] = ()
+        self._background: Array | None = None
+        self._valid: npt.NDArray[np.bool_] | None = None
         self._scene = SceneState.NEW
         self._follows = False
         """Whether the solver knows the scene as it was a frame ago."""
         self._greeted = False
         """Whether the newest scene was shown by a Wiener filter already."""
         self._settled = False
+
+    def _checked(self) -> Problem:
+        """Return the problem of a frame that holds nothing: what has no way is refused before the stream."""
+        psfs = self._given.psfs if isinstance(self._given, Calibration) else as_channels(self._given, "PSF")
+        sides = psfs.shape[-2:]
+        known = {"noise": 1.0} | {name: fact for name, fact in self._known.items() if fact is not None}
+        shapes = [np.shape(fact) for fact in known.values()]
+        colours = max(psfs.shape[-3], *(shape[2] if len(shape) == 3 else 1 for shape in shapes))
+        blank = np.arange(colours * int(np.prod(sides)), dtype=np.float32).reshape(*sides, colours)
+        options = self.options
+        if options.estimate_background is None and "background" in known:
+            options = replace(options, estimate_background=False)
+        problem = stream_problem(Measurement(blank, **known), self._given, options)
+        require_steps(problem)
+        return problem
 
     # Pictures --------------------------------------------------------------------------------------
     def feed(self, image: Array) -> LivePicture:
@@ -187,31 +164,30 @@ class LiveReconstructor:
             out, and the next goes on as if it had not been.
         """
         began = _now()
-        frame = self._on_calibration_pixels(image)
+        frame = self._measured(np.asarray(image))
         level = self._level_for(frame)
-        small = block_mean(frame, level.binning)
+        small = block_mean(frame, level.binning, about_axis=True)
         self._scene = self._watch.see(small)
         affordable = self._pace.affordable(level.binning, self.budget_ms)
         cut = self._scene is SceneState.NEW and not self._greeted
         too_slow = affordable < 1 and self._scene is not SceneState.STILL
         self._greeted = self._scene is SceneState.NEW
-        if not isinstance(level, Level) or cut or too_slow:
+        solver = level.solver
+        if solver is None or cut or too_slow:
             self._follows = self._settled = False
-            filtered = level.filtered(self._watch.mean)
+            filtered = level.filtered(self._as_given(self._watch.mean))
             if too_slow:
                 self._pace.note_filter(_since(began))
-            return self._told(level, "wiener", filtered, 0, 0, began)
-        data = level.data(self._watch.mean)
+            return self._picture(level, filtered, 0, began)
         anew = self._scene is SceneState.NEW or not self._follows
         if anew:
-            level.solver.restart(data)
-        else:
-            level.solver.set_data(data)
+            solver.begin()
+        solver.take(self._as_given(self._watch.mean))
         self._follows = True
         done, steps = self._iterate(level, began, max(affordable, 1), lambda: False)
-        picture = self._told(level, "admm", level.solved(), done, level.solver.iteration, began)
+        picture = self._picture(level, level.solved(), done, began)
         after = _since(began)
-        if not anew and self._coming is None:  # otherwise it tells nothing of the pictures to come
+        if not anew and self._coming is None:  # otherwise it says nothing of the pictures to come
             fixed = Spent(after.wall_ms - steps.wall_ms, after.work_ms - steps.work_ms)
             self._pace.note(fixed, steps, done)
         return picture
@@ -232,18 +208,51 @@ class LiveReconstructor:
         if self._level is None or self._settled:
             return None
         level = self._solving_level(newer)
-        if level is None:
+        if level is None or level.solver is None:
             return None
         began = _now()
         if not self._follows:
-            level.solver.restart(level.data(self._watch.mean))
+            level.solver.begin()
+            level.solver.take(self._as_given(self._watch.mean))
             self._follows = True
         done, _ = self._iterate(level, began, None, newer)
         self._greeted = False
-        return self._told(level, "admm", level.solved(), done, level.solver.iteration, began)
+        return self._picture(level, level.solved(), done, began)
+
+    def full(
+        self, image: Array, *, on_progress: Progress | None = None, cancel: threading.Event | None = None
+    ) -> Reconstruction:
+        """Reconstruct a frame as a single picture, to the end, with the same options; from any thread.
+
+        Parameters
+        ----------
+        image : ndarray
+            As of :meth:`feed`.
+        on_progress, cancel
+            As of :func:`recon.reconstruct`.
+
+        Raises
+        ------
+        InputError
+            When the image does not fit the calibration.
+        """
+        pixels = np.moveaxis(self._on_calibration_pixels(image), 0, -1)
+        pixels = pixels[..., 0] if image.ndim == 2 else pixels
+        measurement = Measurement(pixels, **self._known)
+        return reconstruct(measurement, self._given, self.options, on_progress=on_progress, cancel=cancel)
+
+    def shown(self, volume: Floats) -> Floats:
+        """Return the picture of depths (n_z, ...): of the one chosen, else each pixel's brightest."""
+        chosen = volume.max(axis=0) if self.live.plane is None else volume[self.live.plane]
+        return np.ascontiguousarray(volume[0] if len(volume) == 1 else chosen)
 
     def restart(self) -> None:
-        """Forget the scene, the machine's timing and the noise: the next frame is the first."""
+        """Forget the scene, the machine's timing and the noise, and give up what solvers hold.
+
+        The next frame is the first.
+        """
+        if self._level is not None and self._level.solver is not None:
+            self._level.solver.close()
         self._level = self._coming = None
         self._pace = Pace(self._binnings)
         self.warnings = self._doubts
@@ -257,49 +266,55 @@ class LiveReconstructor:
     ) -> tuple[int, Spent]:
         """Do one iteration, and more while they fit into the budget; return how many, and what they took."""
         cost = self._pace.cost(level.binning)
+        assert level.solver is not None
         ahead_ms = 0.0 if cost is None else cost.step.wall_ms + 0.5 * cost.fixed.wall_ms
         first = _now()
         done = 0
         while True:
-            change = level.solver.advance().change
+            self._settled = level.solver.advance(min(SETTLED, level.problem.stop_tolerance))
             done += 1
-            self._settled = change < SETTLED
             spent_ms = _since(began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
                 return done, _since(first)
 
-    def _level_for(self, frame: Floats) -> FilterLevel:
+    def _level_for(self, frame: Floats) -> Level:
         """Return the level for the next frame: the one there is, until another is made."""
         if self._level is None:
-            binning = self._first_binning()
-            small = block_mean(frame, binning).copy()
-            self._level = FilterLevel(self._psfs, binning, small, self._noise)
-            self._pace.enter(binning)
-            self._make(binning, small)
+            self._level = self._level_of(self._first_binning(), frame.copy())
+            self._pace.enter(self._level.binning)
+            self._coming = ComingLevel(self._level.binning, self._level.solving)
         elif self._coming is not None:
             if self._coming.wait(0):
                 self._take_up(self._coming)
-        elif not isinstance(self._level, Level):  # there was no memory for its solver
+        elif self._level.solver is None:  # there was no memory for it
             coarser = next((b for b in self._pace.levels if b > self._level.binning), None)
             if coarser is not None:
-                self._make(coarser, block_mean(frame, coarser).copy())
+                self._make(coarser, frame)
         elif (wanted := self._pace.next_level(self.budget_ms)) != self._level.binning:
-            self._make(wanted, block_mean(frame, wanted).copy())
+            self._make(wanted, frame)
         return self._level
+
+    def _level_of(self, binning: int, frame: Floats) -> Level:
+        """Return the level of a binning, without a solver, for a frame on the calibration's pixels."""
+        valid = np.broadcast_to(True if self._valid is None else self._valid, frame.shape)
+        measurement = on_blocks(frame, valid, self._known.get("noise"), binning, flat=len(self._shape) == 2)
+        calibration = reduced_calibration(self.calibration, binning, None)
+        plane = self._n_planes // 2 if self.live.plane is None else self.live.plane
+        return Level.of(stream_problem(measurement, calibration, self._options), binning, plane)
 
     def _first_binning(self) -> int:
         """Return the finest binning at which a first picture takes no time to speak of."""
-        n_pixels = int(np.prod(self._psfs.shape[1:]))
-        levels = self._pace.levels
+        n_pixels, levels = int(np.prod(self._sensor)), self._pace.levels
         return next((b for b in levels if n_pixels <= AT_ONCE * b**2), levels[-1])
 
-    def _make(self, binning: int, small: Floats) -> None:
-        """Begin to make a level for a frame on its pixels."""
-        self._coming = ComingLevel(binning, lambda: Level(self._psfs, binning, small, self._noise))
+    def _make(self, binning: int, frame: Floats) -> None:
+        """Begin to make a level for a frame on the calibration's pixels."""
+        kept = frame.copy()
+        self._coming = ComingLevel(binning, lambda: self._level_of(binning, kept).solving())
 
     def _solving_level(self, newer: Callable[[], bool]) -> Level | None:
         """Return the level in use once it has a solver; None when a newer frame comes first."""
-        while not isinstance(self._level, Level):
+        while self._level is not None and self._level.solver is None:
             if self._coming is None:
                 return None
             if self._coming.wait(_POLL_S):
@@ -323,7 +338,7 @@ class LiveReconstructor:
         assert self._level is not None
         self._pace.give_up(binning)
         present = self._level.binning
-        how = "go on" if isinstance(self._level, Level) else "are a Wiener filter's,"
+        how = "are a Wiener filter's," if self._level.solver is None else "go on"
         self.warnings = (
             *self.warnings,
             f"There was no memory to iterate pictures binned {binning} x {binning}: they {how} binned "
@@ -337,78 +352,73 @@ class LiveReconstructor:
             self._watch.forget()
             self._greeted = True  # a scene already shown is iterated at once
             self._pace.enter(level.binning)
+        if self._level.solver is not None:
+            self._level.solver.close()
         self._level, self._coming = level, None
         self._follows = self._settled = False
 
-    def _on_calibration_pixels(self, image: Array) -> Floats:
-        """Return a frame (n_channels, height, width) less background on the PSF's pixels."""
-        image = np.asarray(image)
-        if image.dtype.kind == "f":
-            require_finite(image, "frame")
+    def _as_given(self, channels: Floats) -> Floats:
+        """Return a frame (n_channels, height, width) with the axes that frames came with."""
+        return channels[0] if len(self._shape) == 2 else np.moveaxis(channels, 0, -1)
+
+    def _measured(self, image: Array) -> Floats:
+        """Return a frame on the calibration's pixels, less background, 0 where erased, channels first."""
+        frame = self._on_calibration_pixels(image)
         if image.shape != self._shape:
-            self._refuse_other_shape(image)
-        factor = image.shape[0] // self._psfs.shape[1]
-        frame = block_mean(_channels(image), factor)
+            if self._shape:
+                raise InputError(
+                    f"A frame of {image.shape} came after frames of {self._shape}: call restart() after a "
+                    "change of the camera's region, binning or format."
+                )
+            background, flat = self._known.get("background"), image.ndim == 2
+            known = Measurement(frame[0] if flat else np.moveaxis(frame, 0, -1), **self._known)
+            valid = known.counts().valid
+            self._background = None if background is None else known.like(background, frame, "background")
+            self._valid = None if valid.all() else valid
+            self._shape = image.shape
         if self._background is not None:
             frame = frame - self._background
-        return frame
+        return frame if self._valid is None else np.where(self._valid, frame, np.float32(0))
 
-    def _like_psf(self, background: npt.ArrayLike) -> Floats:
-        """Return a background, a number or an image, as (n_channels, height, width) or (1, 1, 1)."""
-        if np.ndim(background) == 0:
-            return np.full((1, 1, 1), background, np.float32)
-        channels = as_channels(background, "background")
-        if channels.shape[1:] != self._psfs.shape[1:]:
-            raise InputError(
-                f"The background has {channels.shape[1]} x {channels.shape[2]} pixels and the PSF "
-                f"{self._psfs.shape[1]} x {self._psfs.shape[2]}: it must be on the PSF's pixels."
-            )
-        return channels
-
-    def _refuse_other_shape(self, image: Array) -> None:
-        if self._shape:
-            raise InputError(
-                f"A frame of {image.shape} came after frames of {self._shape}: call restart() after a change "
-                "of the camera's region, binning or format."
-            )
+    def _on_calibration_pixels(self, image: Array) -> Floats:
         if image.ndim not in (2, 3) or image.dtype.kind not in "uif":
             raise InputError(
                 f"A frame must be (height, width[, n_channels]) of numbers, not {image.dtype} {image.shape}."
             )
-        height, width = self._psfs.shape[1:]
+        if image.dtype.kind == "f":
+            require_finite(image, "frame")
+        height, width = self._sensor
         factor = image.shape[0] // height
         if factor < 1 or image.shape[:2] != (factor * height, factor * width):
             raise InputError(
                 f"The frame has {image.shape[0]} x {image.shape[1]} pixels and the PSF {height} x {width}. "
                 "Both must come from the same sensor area; the frame's pixels may be finer by a whole factor."
             )
-        n_channels = image.shape[2] if image.ndim == 3 else 1
-        for name, channels in (("PSF", self._psfs), ("background", self._background)):
-            if channels is not None and len(channels) not in (1, n_channels):
-                raise InputError(f"The frame has {n_channels} channels and the {name} {len(channels)}.")
-        self._shape = image.shape
+        return block_mean(image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0), factor)
 
-    def _told(
-        self,
-        level: FilterLevel,
-        method: Literal["admm", "wiener"],
-        channels: Floats,
-        done: int,
-        total: int,
-        began: _Stamp,
-    ) -> LivePicture:
-        image = channels[0] if len(self._shape) == 2 else np.ascontiguousarray(np.moveaxis(channels, 0, 2))
+    def _picture(self, level: Level, volume: Floats, done: int, began: _Stamp) -> LivePicture:
+        """Return a picture: of the filter, or of ``done`` iterations."""
+        filtered, of = done == 0, f"of {self._n_planes} depths"
+        plane = self.live.plane
+        if filtered and plane is None:
+            plane = self._n_planes // 2
         return LivePicture(
-            image=image,
+            image=self.shown(volume),
             binning=level.binning,
-            method=method,
+            method="wiener" if filtered else level.problem.solver.name,
             iterations=done,
-            total_iterations=total,
+            total_iterations=0 if filtered or level.solver is None else level.solver.iterations,
             scene=self._scene,
             frames=self._watch.count,
             settled=self._settled,
             work_ms=_since(began).wall_ms,
             budget_ms=self.budget_ms,
+            volume=volume if len(volume) > 1 else None,
+            shown=""
+            if self._n_planes == 1
+            else f"brightest {of}"
+            if plane is None
+            else f"depth {plane} {of}",
         )
 
 
@@ -419,8 +429,3 @@ def _now() -> _Stamp:
 def _since(began: _Stamp) -> Spent:
     wall_s, work_s = _now()
     return Spent(1e3 * (wall_s - began[0]), 1e3 * (work_s - began[1]))
-
-
-def _channels(image: Array) -> Array:
-    """View an image (height, width[, n_channels]) with its channels first."""
-    return image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0)

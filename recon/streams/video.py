@@ -1,4 +1,4 @@
-"""A video's frames one after the other, each from where the one before ended.
+"""Frames of one camera one after the other, each from where the one before ended: videos, and live pictures.
 
 A warm start keeps the object, its dual variables and the penalties, so that a frame that differs little from
 the one before needs few iterations. It makes a frame depend on those before it, back to the last cold start.
@@ -10,22 +10,21 @@ adds up (1e-6 of the brightest pixel).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.errors import InputError
-from recon.reconstruction.measurement import Measurement
+from recon.reconstruction.measurement import Floats, Measurement
 from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part, parts_of
 from recon.reconstruction.problem import Problem
 from recon.reconstruction.reconstruct import given
-from recon.reconstruction.solvers import SOLVERS
-from recon.streams.running import Running
+from recon.reconstruction.solvers import SOLVERS, OfferedSolver
+from recon.solvers.base import Solver, StoppingRules
+from recon.solvers.sensor_admm import SensorAdmm
 from recon.types import Calibration
-
-Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
 """Iterations of a block's first frame and of the others: as good as independent frames at their best where
@@ -35,7 +34,7 @@ BLOCK = 32
 """Frames a block: its cold start is then a seventh of the work."""
 
 SETTLED = 2e-4
-"""Change an iteration below which a frame is done before its iterations are."""
+"""Change an iteration below which a video's frame is done before its iterations are."""
 
 
 def stream_problem(
@@ -74,14 +73,31 @@ def stream_problem(
 
 
 class VideoSolver:
-    """Reconstructs frames in order; for one thread.
+    """Solves frame after frame of one camera; for one thread. Close it, or use it as a context manager.
+
+    Whatever camera, background, erasures and depths the problem has, each frame goes on from the one before,
+    with all that an iteration builds on (object, dual variables, penalties). The exact-data ADMM of a picture
+    takes new data in the memory that it has; other solvers are made anew for each frame, which costs what
+    their making costs.
 
     Parameters
     ----------
     problem : Problem
-        Of :func:`stream_problem`.
+        Of :func:`stream_problem`: a first frame settles noise, scales and the prior's weight.
     cold_iterations, warm_iterations : int
         Of the first frame after :meth:`begin`, and of each after it.
+    parts : list of Part, optional
+        The problem's, where they are there already.
+
+    Attributes
+    ----------
+    iterations : int
+        Since the last frame that began from zero.
+
+    Raises
+    ------
+    InputError
+        When the solver has no iterations, or no way for the problem.
     """
 
     def __init__(
@@ -90,17 +106,40 @@ class VideoSolver:
         *,
         cold_iterations: int = COLD_ITERATIONS,
         warm_iterations: int = WARM_ITERATIONS,
+        parts: list[Part] | None = None,
     ) -> None:
         if min(cold_iterations, warm_iterations) < 1:
             raise InputError(
                 f"Every frame needs an iteration; got {cold_iterations} cold and {warm_iterations} warm ones."
             )
-        self.problem = problem
-        self.cold_iterations = cold_iterations
-        self.warm_iterations = warm_iterations
-        self.running = Running(problem)
+        self.cold_iterations, self.warm_iterations = cold_iterations, warm_iterations
+        self._offered = require_steps(problem)
+        self._first = self.problem = problem
+        self.parts = parts or [Part(problem, channels) for channels in parts_of(problem)]
+        for part in self.parts:
+            part.weigh(problem.options.tau)
+        self.solvers: list[Any] = [None for _ in self.parts]
+        self.iterations = self._calm = 0
         self._cold = True
 
+    def close(self) -> None:
+        """Remove what the solvers kept on disk; nothing can be solved afterwards."""
+        self.solvers = [None for _ in self.parts]
+        for part in self.parts:
+            part.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def weights(self) -> list[float]:
+        """The prior's weight in the scaled problem, one a part."""
+        return [part.weight for part in self.parts]
+
+    # Frames ------------------------------------------------------------------------------------------
     def begin(self) -> None:
         """Forget the frames before: the next one starts cold."""
         self._cold = True
@@ -113,29 +152,76 @@ class VideoSolver:
         frame : ndarray, float32, (height, width[, n_channels])
             Background subtracted, on the PSF's pixels.
         """
-        problem = self.problem.with_data(frame)
-        if self._cold:
-            self.running.begin(problem)
-        else:
-            self.running.go_on(problem)
-        self.running.iterate(self.cold_iterations if self._cold else self.warm_iterations, SETTLED)
-        self._cold = False
+        count = self.cold_iterations if self._cold else self.warm_iterations
+        self.take(frame)
+        for _ in range(count):
+            if self.advance(SETTLED):
+                break
         return self.picture()
 
+    def take(self, frame: Floats) -> None:
+        """Take a frame as of :meth:`next`, to be iterated by :meth:`advance`."""
+        self.problem = self._first.with_data(frame)
+        for place, (part, solver) in enumerate(zip(self.parts, self.solvers, strict=True)):
+            part.set_data(self.problem)
+            if isinstance(solver, SensorAdmm):
+                (solver.restart if self._cold else solver.set_data)(part.data)
+            else:
+                self.solvers[place] = self._renewed(part, solver)
+        self.iterations = 0 if self._cold else self.iterations
+        self._calm, self._cold = 0, False
+
+    def advance(self, settled: float) -> bool:
+        """Do one iteration of every part; return whether changes stay below ``settled``.
+
+        Solvers that are made anew may not move at all in their first iteration: theirs must be calm for
+        several in a row.
+        """
+        change = max(float(solver.advance().change) for solver in self.solvers)
+        self.iterations += 1
+        self._calm = self._calm + 1 if change < settled else 0
+        kept = all(isinstance(solver, SensorAdmm) for solver in self.solvers)
+        return self._calm >= (1 if kept else StoppingRules().patience)
+
+    def volume(self) -> Floats:
+        """Return what there is of the newest frame, (n_z, height, width[, n_channels]), measurement units."""
+        return self.problem.whole(
+            [
+                self.problem.measured(part.lifted(solver.solution), part.channels)
+                for part, solver in zip(self.parts, self.solvers, strict=True)
+            ]
+        )
+
     def picture(self) -> Floats:
-        """Return what there is of the newest frame."""
-        volume = self.running.volume()
-        return np.ascontiguousarray(volume[0]) if self.problem.n_planes == 1 else volume
+        """Return the same; of one depth its picture."""
+        volume = self.volume()
+        return volume[0] if self.problem.n_planes == 1 else volume
+
+    # Solvers -----------------------------------------------------------------------------------------
+    def _renewed(self, part: Part, before: Any) -> Any:
+        """Return a solver of a part's new data; unless it begins cold, with all that the one before knew."""
+        remove = part.storage.turn()
+        if self._cold or before is None:
+            solver = self._made(part, None)
+        elif isinstance(before, Solver) and before.state_names:
+            solver = self._made(part, None)
+            solver.restore(before.checkpoint(copy=False))
+        else:
+            solver = self._made(part, np.array(part.lifted(before.solution)))
+        remove()
+        return solver
+
+    def _made(self, part: Part, start: Any) -> Any:
+        solver = self._offered.make(part, start)
+        if not hasattr(solver, "advance"):
+            raise InputError(f"{self._offered.name} cannot be halted after each iteration: take another.")
+        if isinstance(solver, Solver):
+            solver.compile()
+        return solver
 
 
-def blocks_of(frames: list[int], length: int = BLOCK) -> list[tuple[int, ...]]:
-    """Cut a video's frame numbers, ascending, into blocks of numbers ``n length <= index < (n + 1) length``.
-
-    By number and not by count, so that blocks stay what they are when frames are missing or added at the end.
-    """
-    if length < 1:
-        raise InputError(f"A block needs a frame at least; got a length of {length}.")
-    blocks: dict[int, list[int]] = {}
-    for index in frames:
-        blocks.setdefault(index // length, []).append(index)
-    return [tuple(block) for _, block in sorted(blocks.items())]
+def require_steps(problem: Problem) -> OfferedSolver:
+    """Return a problem's solver; InputError where it has no iterations to go on with."""
+    if problem.solver.one_step:
+        raise InputError(f"{problem.solver.name} has no iterations to go on with: take another solver.")
+    return problem.solver

@@ -172,7 +172,7 @@ def video(frames: npt.NDArray[Any], psf: npt.NDArray[Any], *, cold: int, warm: i
         if n == len(frames) // 2:
             solver.begin()
         pictures.append(solver.next(frame))
-    return {"image": np.stack(pictures), "weight": solver.running.weights[0]}
+    return {"image": np.stack(pictures), "weight": solver.weights[0]}
 
 
 def joint(frames: npt.NDArray[Any], psf: npt.NDArray[Any], over_time: Any, **options: Any) -> Result:

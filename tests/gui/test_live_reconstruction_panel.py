@@ -107,21 +107,21 @@ def test_refining_tells_how_long_it_takes_at_most(
     qtbot.waitUntil(lambda: panel._shown is not None, timeout=WAIT_MS)
     told: list[str] = []
     heard = threading.Event()
-    real = live_reconstruction.full_picture
+    real = live_reconstruction.LiveReconstructor.full
 
-    def not_over_before_it_is_heard(*args: Any, callback: Any, **options: Any) -> Any:
+    def not_over_before_it_is_heard(*args: Any, on_progress: Any, **options: Any) -> Any:
         def watch(*record: Any) -> None:
-            callback(*record)
+            on_progress(*record)
             heard.wait(WAIT_MS / 1000)
 
-        return real(*args, callback=watch, **options)
+        return real(*args, on_progress=watch, **options)
 
     def listen(so_far: Any) -> None:
         panel._refined_so_far(so_far)
         told.append(panel.status.text())
         heard.set()
 
-    monkeypatch.setattr(live_reconstruction, "full_picture", not_over_before_it_is_heard)
+    monkeypatch.setattr(live_reconstruction.LiveReconstructor, "full", not_over_before_it_is_heard)
     qtbot.mouseClick(panel.refine_button, Qt.MouseButton.LeftButton)
     assert panel._refining is not None
     panel._refining.progressed.connect(listen)
@@ -155,10 +155,10 @@ def test_of_depths_chosen_in_quick_succession_the_last_is_shown(
     made: dict[Any, float] = {}
     real = live_reconstruction.LiveReconstructor
 
-    def slow_at_first(calibration: Calibration, *, z_um: float, budget_ms: float) -> Any:
-        reconstructor = real(calibration, z_um=z_um, budget_ms=budget_ms)
-        time.sleep(0.6 if z_um == 1e5 else 0.0)
-        made[reconstructor] = z_um
+    def slow_at_first(calibration: Calibration, options: Any, live: Any) -> Any:
+        reconstructor = real(calibration, options, live)
+        time.sleep(0.6 if options.z_um == 1e5 else 0.0)
+        made[reconstructor] = options.z_um
         return reconstructor
 
     monkeypatch.setattr(live_reconstruction, "LiveReconstructor", slow_at_first)
@@ -215,7 +215,11 @@ def test_after_another_calibration_failed_the_depths_are_still_those_of_the_one_
     monkeypatch.setattr(live_reconstruction, "LiveReconstructor", refuse)
     load("bad", 3e5, 4e5, 5e5)
     qtbot.waitUntil(lambda: "This PSF is dark." in panel.file.toolTip(), timeout=WAIT_MS)
-    assert [panel.plane.itemText(i) for i in range(panel.plane.count())] == ["z 100 mm", "z 200 mm"]
+    assert [panel.plane.itemText(i) for i in range(panel.plane.count())] == [
+        "z 100 mm",
+        "z 200 mm",
+        "all depths",
+    ]
     assert panel.z_um == 2e5
     assert f"{Path('good')}" in panel.as_python()
     assert "bad" not in panel.as_python()

@@ -15,7 +15,7 @@ import zarr
 from instrument.cli import main
 from instrument.files.errors import BenchError
 from instrument.reconstruction.activity import COPIES, ActivitySettings, find_activity
-from instrument.reconstruction.video_output import VideoPictures, create_output
+from instrument.reconstruction.video_files import VideoPictures, create_output
 
 COUNT, SHAPE, MISSING = 120, (32, 40), 7
 

@@ -16,7 +16,8 @@ from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.live.live import LiveView, live_view
 from recon import Calibration, InputError
-from recon.streams.live import LivePicture, LiveReconstructor
+from recon.streams.live import LiveReconstructor
+from recon.streams.live_picture import LivePicture
 from recon.streams.stillness import SceneState
 from tests.mocks.free_running import FreeRunningCamera
 

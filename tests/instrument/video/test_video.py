@@ -21,7 +21,7 @@ from ome_zarr_models.v05 import Image
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
 from instrument.plan import Part, Plan
-from instrument.reconstruction import video_block as block_module
+from instrument.reconstruction import video_work as block_module
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import (
     PreparedVideo,
@@ -30,11 +30,8 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_block import BlockReport
-from instrument.reconstruction.video_mp4 import as_shown, levels_of
-from instrument.reconstruction.video_output import VideoPictures
-from instrument.reconstruction.video_source import has_light, require_video
-from instrument.reconstruction.video_workers import cluster, on_cluster
+from instrument.reconstruction.video_files import VideoPictures, as_shown, has_light, levels_of, require_video
+from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
 from instrument.runs.run import Run
 from recon import reconstruct
 from recon.base.metrics import psnr
@@ -151,7 +148,7 @@ def test_a_video_cut_off_goes_on_and_ends_the_same(
     wanted = request(recording, tmp_path)
     prepared = prepare_video(wanted)
     cancel = threading.Event()
-    monkeypatch.setattr("instrument.reconstruction.video_workers.get_threads", lambda: 1)
+    monkeypatch.setattr("instrument.reconstruction.video_work.get_threads", lambda: 1)
     assert not solve_video(prepared, lambda _: cancel.set(), cancel)
     first = {0, 1, 2, 3}
     written = {t for t in range(11) if VideoPictures(wanted.out).is_written(t)}
@@ -291,9 +288,9 @@ def test_blocks_solved_together_are_in_memory_one_after_the_other(
         present.remove(number)
         return BlockReport(number, 0, 0, 0.0)
 
-    monkeypatch.setattr("instrument.reconstruction.video_workers.get_threads", lambda: 4)
-    monkeypatch.setattr("instrument.reconstruction.video_workers.set_threads", threads.append)
-    monkeypatch.setattr("instrument.reconstruction.video_workers.solve_block", solve)
+    monkeypatch.setattr("instrument.reconstruction.video_work.get_threads", lambda: 4)
+    monkeypatch.setattr("instrument.reconstruction.video_work.set_threads", threads.append)
+    monkeypatch.setattr("instrument.reconstruction.video_work.solve_block", solve)
     prepared = prepare_video(request(recording, tmp_path, over_time="tv"))
     assert solve_video(prepared, lambda _: None, threading.Event())
     assert (at_once, threads) == ([1, 1, 1], [4, 4])
@@ -329,7 +326,7 @@ def test_the_same_on_a_cluster_that_loses_a_worker(recording: Path, video: Path,
 
 
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("instrument.reconstruction.video_workers.CONNECT_S", 1)
+    monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
     with pytest.raises(BenchError, match="No Dask scheduler answers"), cluster(scheduler="tcp://127.0.0.1:9"):
         pass
 
@@ -337,7 +334,7 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) 
 def test_an_unknown_scheduler_leaves_nothing_behind(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("instrument.reconstruction.video_workers.CONNECT_S", 1)
+    monkeypatch.setattr("instrument.reconstruction.video_work.CONNECT_S", 1)
     arguments = ["reconstruct", str(recording), "--video", "--psf", str(recording.parent / "psf.npy")]
     out = ["--out", str(tmp_path / "s.ome.zarr"), "--scheduler", "tcp://127.0.0.1:9"]
     assert main([*arguments, "--dark", "20", *out]) == 2

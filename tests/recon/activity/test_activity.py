@@ -7,8 +7,7 @@ import pytest
 from scipy import ndimage
 
 from recon import InputError
-from recon.streams.baseline import aligned, baseline, change, fading, motion
-from recon.streams.regions import find_regions, local_correlation
+from recon.streams.activity import aligned, baseline, change, fading, find_regions, local_correlation, motion
 
 SHAPE = (40, 48)
 PLACES = ((10, 12), (12, 34), (29, 20))

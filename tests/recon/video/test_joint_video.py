@@ -12,8 +12,13 @@ from recon import InputError
 from recon.camera.convolution import Convolution
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers import SensorAdmm
-from recon.streams.joint import JointAdmm, OverTimeName, solve_together
-from recon.streams.over_time import LowRankPlusSparse, TemporalTotalVariation
+from recon.streams.joint import (
+    JointAdmm,
+    LowRankPlusSparse,
+    OverTimeName,
+    TemporalTotalVariation,
+    solve_together,
+)
 from recon.streams.video import stream_problem
 
 

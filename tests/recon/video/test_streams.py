@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,9 @@ import pytest
 
 from recon import InputError, Measurement, solve
 from recon.evaluation.scene import make_scene
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.solvers import memory
 from recon.streams.joint import solve_together
 from recon.streams.video import VideoSolver, stream_problem
 
@@ -69,3 +74,29 @@ def test_what_a_stream_has_no_way_for_is_refused_in_words() -> None:
         solve_together(local, np.stack([scene.measurement] * 2).astype(np.float32), "tv")
     with pytest.raises(InputError, match="those before"):
         VideoSolver(local).next(np.zeros((8, 8), np.float32))
+
+
+@pytest.mark.parametrize("prior", ["tv", "l1"])
+def test_a_stream_s_scratch_files_do_not_grow_with_frames_and_go_with_it(
+    prior: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "lies_in_memory", lambda _: False)  # where the tests' folder is a tmpfs
+    scene = make_scene("beads", size=48, depths=12, density=0.5)
+    options = ReconstructionOptions(prior=prior, estimate_background=False)
+    part = Part(stream_problem(scene.measurement, scene.calibration, options), slice(0, 1))
+    assert part.plan is not None
+    room = (1.05 * part.plan.work + 0.2 * part.plan.state) / (1 - memory.KEPT_FREE)
+    limited = replace(options, memory_gib=room / memory.GIB, scratch=tmp_path)
+    problem = stream_problem(scene.measurement, scene.calibration, limited)
+    free = stream_problem(scene.measurement, scene.calibration, options)
+    on_disk = []
+    with VideoSolver(problem) as video, VideoSolver(free) as in_memory:
+        for n in range(5):
+            if n == 3:
+                video.begin()
+                in_memory.begin()
+            np.testing.assert_array_equal(video.next(scene.measurement), in_memory.next(scene.measurement))
+            on_disk.append(sum(path.stat().st_size for path in tmp_path.rglob("*.dat")))
+    assert min(on_disk) > 0
+    assert max(on_disk) <= part.plan.state
+    assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Who solves a video's blocks: threads of this process, processes on this machine, or a Dask cluster.
+"""Solving a video's blocks: in threads of this process, processes on this machine, or a Dask cluster.
 
 Blocks do not depend on one another, so that all three give the same pictures (see
 :mod:`recon.streams.video`).
@@ -10,18 +10,136 @@ import contextlib
 import importlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from instrument.files.errors import BenchError
-from instrument.reconstruction.video_block import BlockReport, CancelledError, solve_block
-from instrument.reconstruction.video_job import VideoJob
-from recon.base.threads import get_threads, set_threads
+import numpy as np
 
-Told = Callable[[BlockReport], object]
+from instrument.files.errors import BenchError
+from instrument.reconstruction.video_files import VideoPictures, has_light
+from instrument.reconstruction.video_job import VideoJob
+from instrument.runs.frame_array import FrameArray
+from instrument.runs.run import FRAMES
+from recon.base.threads import get_threads, set_threads
+from recon.reconstruction.measurement import Floats
+from recon.streams.joint import solve_together
+from recon.streams.video import VideoSolver
+
+_kept = threading.local()
+"""A thread's last job with its solver, whose arrays are dear to make."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockReport:
+    """What a worker did: a block's number, how many frames it solved and wrote, and in how long.
+
+    ``unlit`` is how many of its frames hold nothing but noise.
+    """
+
+    block: int
+    solved: int
+    written: int
+    seconds: float
+    unlit: int = 0
+
+
+class CancelledError(Exception):
+    """The block was left unfinished because somebody wanted the end."""
+
+
+def solve_block(
+    job_folder: str,
+    output: str,
+    number: int,
+    *,
+    threads: int | None = None,
+    ended: Callable[[], bool] = lambda: False,
+) -> BlockReport:
+    """Solve a block, write those of its pictures that are not there, and note that it is done.
+
+    Runs anywhere where the recording and the output are under the same paths. Done already, it does nothing.
+
+    Parameters
+    ----------
+    job_folder, output : str
+        The job's folder, and the OME-Zarr folder.
+    number : int
+        The block.
+    threads : int, optional
+        FFT and kernel threads of this process.
+    ended : callable
+        Asked before each frame; True ends the work.
+
+    Raises
+    ------
+    FileError, OSError
+        When a file cannot be read or written.
+    CancelledError
+    """
+    began_s = time.perf_counter()
+    if threads is not None:
+        set_threads(threads)
+    job = VideoJob(Path(job_folder))
+    plan = job.plan
+    if job.is_done(number):
+        return BlockReport(number, 0, 0, time.perf_counter() - began_s)
+    pictures = VideoPictures(Path(output), write=True)
+    frames = FrameArray(Path(plan.run) / FRAMES)
+    block = job.blocks[number]
+    together_in = None if len(block) == 1 else plan.over_time
+    written = 0
+    unlit = 0
+
+    def measured() -> Iterator[Floats]:
+        nonlocal unlit
+        reduction, deviation = job.reduction, job.problem.noise
+        for index in block:
+            frame = reduction.apply(frames.read(index))
+            unlit += not has_light(frame, deviation)
+            yield frame
+
+    if together_in is None:
+        job, solver = _solver_for(job)
+        solver.begin()
+        solved: Iterator[Floats] = map(solver.next, measured())
+    else:
+        stack = np.stack(list(measured()))
+        together = solve_together(
+            job.problem, stack, together_in, iterations=plan.cold_iterations, ended=ended
+        )
+        solved = iter([] if together is None else together)
+    for index in block:
+        picture = None if ended() else next(solved, None)
+        if picture is None:
+            raise CancelledError
+        if not pictures.is_written(index):
+            pictures.write(index, np.ascontiguousarray(np.rot90(picture, plan.rotate_deg // 90)))
+            written += 1
+    job.mark_done(number, unlit)
+    return BlockReport(number, len(block), written, time.perf_counter() - began_s, unlit)
+
+
+def _solver_for(job: VideoJob) -> tuple[VideoJob, VideoSolver]:
+    kept: tuple[VideoJob, VideoSolver] | None = getattr(_kept, "value", None)
+    if kept is not None:
+        if (kept[0].folder, kept[0].plan) == (job.folder, job.plan):
+            return kept
+        kept[1].close()
+    kept = _kept.value = None  # its memory is needed
+    plan = job.plan
+    solver = VideoSolver(
+        job.problem, cold_iterations=plan.cold_iterations, warm_iterations=plan.warm_iterations
+    )
+    _kept.value = job, solver
+    return job, solver
+
+
+OnBlock = Callable[[BlockReport], object]
 """Called in the caller's thread after each block."""
 
 _POLL_S = 0.2
@@ -32,7 +150,9 @@ _RETRIES = 3
 """Workers that may be lost over one block before the block is taken for the reason."""
 
 
-def in_process(job: Path, output: Path, blocks: Sequence[int], told: Told, cancel: threading.Event) -> None:
+def in_process(
+    job: Path, output: Path, blocks: Sequence[int], on_progress: OnBlock, cancel: threading.Event
+) -> None:
     """Solve blocks in this process, on all cores: one block a thread, or all threads to the only block.
 
     With a prior over time, whose blocks take much memory, one after the other with all threads.
@@ -61,7 +181,7 @@ def in_process(job: Path, output: Path, blocks: Sequence[int], told: Told, cance
                 while waiting:
                     done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
                     for future in done:
-                        told(future.result())
+                        on_progress(future.result())
             finally:
                 failed.set()
                 for future in waiting:
@@ -71,7 +191,7 @@ def in_process(job: Path, output: Path, blocks: Sequence[int], told: Told, cance
 
 
 def on_cluster(
-    client: Any, job: Path, output: Path, blocks: Sequence[int], told: Told, cancel: threading.Event
+    client: Any, job: Path, output: Path, blocks: Sequence[int], on_progress: OnBlock, cancel: threading.Event
 ) -> None:
     """Solve blocks on a Dask cluster whose workers see the same files; raises as :func:`in_process`.
 
@@ -85,7 +205,7 @@ def on_cluster(
         while left:
             finished = {future for future in left if future.done()}
             for future in finished:
-                told(future.result())
+                on_progress(future.result())
             left -= finished
             if cancel.wait(_POLL_S):
                 raise CancelledError

@@ -1,0 +1,271 @@
+"""What a video is read from and written to: a recording, pictures as OME-Zarr, a film.
+
+The pictures are OME-Zarr 0.5: one a chunk, float32, written by whoever computed them. The film is MP4 with
+VP9, which browsers and players show, by OpenCV's FFmpeg: OpenCV's wheels carry no H.264 encoder (its
+licence); VP9 in MP4 was played back from each file when this was chosen, and is read back by the tests.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.frame import FrameMetadata
+from instrument.files.atomic import whole_file
+from instrument.files.calibration_file import is_calibration
+from instrument.files.errors import FileError
+from instrument.files.volumes import ome_attributes
+from instrument.runs.run import Run
+from recon.base.blocks import block_mean
+from recon.base.noise import estimate_deviation
+
+_BLOCK = 8
+"""Pixels along a side over which light is averaged to tell it from noise."""
+
+LIT = 2.0
+"""Variance of block means from which a frame has light, in units of what its pixels' noise makes of it."""
+
+STILL = {"um": 0.5, "mrad": 0.02}
+"""How far readings of a stage that stands may lie apart, by the unit that an axis' name ends in.
+
+A mask 25 mm wide that turns by 0.02 mrad moves by 0.25 um at its edges: less than any pixel.
+"""
+
+_SAME: dict[str, Callable[[FrameMetadata], object]] = {
+    "light": lambda m: m.led_pattern,
+    "pattern on the SLM": lambda m: m.slm_image_hash,
+    "exposure": lambda m: m.exposure_ms,
+    "gain": lambda m: m.gain,
+}
+"""What all frames of a planned run must share to be a video of one scene, besides the stage's position."""
+
+
+def require_video(run: Run) -> None:
+    """Refuse a run that is no video: frames of a plan that moves or lights something, or a calibration.
+
+    A recording is one; so is a plan that takes the same photograph again and again.
+
+    Raises
+    ------
+    FileError
+        With what differs from frame to frame, and what to do.
+    """
+    if not run.records:
+        raise FileError(run.path, "has no frames to reconstruct.")
+    planned = run.plan is not None
+    if is_calibration(run.path) or (planned and any(run.path.glob("*/calibration.json"))):
+        raise FileError(
+            run.path,
+            "holds a calibration: it is no video of a scene.",
+            "Give the recording as RUN and this as --calibration: were the two swapped?",
+        )
+    if not planned:
+        return
+    frames = [record.metadata for record in run.records.values()]
+    differing = [] if _stands([frame.stage_position for frame in frames]) else ["stage position"]
+    differing += [what for what, of in _SAME.items() if len({of(frame) for frame in frames}) > 1]
+    if differing:
+        raise FileError(
+            run.path,
+            f"is the run of a plan, no video: its frames differ in {' and '.join(differing)}.",
+            "Record a video with 'diffuserbench record'. Single frames: 'diffuserbench export' writes them, "
+            "'reconstruct --image' takes each.",
+        )
+
+
+def _stands(positions: Sequence[Mapping[str, float]]) -> bool:
+    """Tell whether all positions have the same axes, each at one place as far as readings tell."""
+    axes = set(positions[0])
+    if any(set(position) != axes for position in positions):
+        return False
+    for axis in axes:
+        readings = [position[axis] for position in positions]
+        # An axis of another unit has no tolerance.
+        if not np.ptp(readings) <= STILL.get(axis.rsplit("_", 1)[-1], 0.0):
+            return False
+    return True
+
+
+def has_light(frame: npt.NDArray[Any], deviation: npt.NDArray[Any]) -> bool:
+    """Tell whether there is more in a frame than noise.
+
+    Noise of single pixels goes away where pixels are averaged, a scene through a diffuser does not: the
+    variance of the means of 8 x 8 pixels is compared with what noise leaves of it. Noise grows with light: a
+    frame dimmer than the one that ``deviation`` was found on has less, which it tells itself.
+
+    Parameters
+    ----------
+    frame : ndarray, (height, width) or (height, width, n_channels)
+        Counts less dark.
+    deviation : ndarray, (n_channels,)
+        Of the noise, counts; that of another frame of the same camera is enough.
+    """
+    channels = frame[None] if frame.ndim == 2 else np.moveaxis(frame, 2, 0)
+    height, width = (n // _BLOCK for n in channels.shape[1:])
+    if min(height, width) < 2:
+        return True  # too few blocks to tell
+    means = block_mean(channels, _BLOCK, dtype=np.float64)
+    spread = means.var(axis=(1, 2)) * _BLOCK**2
+    given = np.asarray(deviation, np.float64).reshape(-1)
+    if (spread > LIT * given**2).any():
+        return True
+    own = np.array([estimate_deviation(channel) for channel in channels])
+    return bool(((own > 0) & (spread > LIT * own**2)).any())  # 0 is no estimate: most pixels are alike
+
+
+if TYPE_CHECKING:
+    import zarr
+
+Floats = npt.NDArray[np.float32]
+
+
+def create_output(
+    path: Path,
+    n_frames: int,
+    picture_shape: tuple[int, ...],
+    *,
+    period_s: float | None,
+    pitch_um: float | None,
+    attributes: dict[str, Any],
+) -> None:
+    """Make the folder of a video whose pictures are still to come; they read as NaN until then.
+
+    Parameters
+    ----------
+    picture_shape : tuple of int
+        ``(height, width)`` or ``(height, width, 3)``; stored as ``t, y, x`` or ``t, c, y, x``.
+    period_s : float, optional
+        From frame to frame.
+    pitch_um : float, optional
+        Of the picture's pixels in the object.
+    attributes : dict
+        JSON-compatible, for the attribute ``diffuserbench``.
+    """
+    import zarr
+
+    colour = len(picture_shape) == 3
+    shape = (picture_shape[2], *picture_shape[:2]) if colour else picture_shape
+    names = ["t", "c", "y", "x"] if colour else ["t", "y", "x"]
+    group = zarr.open_group(path, mode="w", zarr_format=3)
+    group.create_array(
+        "0",
+        shape=(n_frames, *shape),
+        chunks=(1, *shape),
+        dtype="float32",
+        fill_value=np.nan,
+        dimension_names=names,
+    )
+    group.attrs["ome"] = ome_attributes(path.name, names, {"t": period_s, "y": pitch_um, "x": pitch_um})
+    group.attrs["diffuserbench"] = attributes
+
+
+class VideoPictures:
+    """The pictures of a video, to be read and written one by one.
+
+    Parameters
+    ----------
+    path : Path
+        The OME-Zarr folder.
+    write : bool
+    """
+
+    def __init__(self, path: Path, *, write: bool = False) -> None:
+        import zarr
+
+        self.path = path
+        self.array: zarr.Array[Any] = zarr.open_array(path / "0", mode="r+" if write else "r", zarr_format=3)
+        self.attributes: dict[str, Any] = dict(zarr.open_group(path, mode="r").attrs)
+
+    @property
+    def period_s(self) -> float | None:
+        """Time from picture to picture, where it is known."""
+        multiscale = self.attributes["ome"]["multiscales"][0]
+        if "unit" not in multiscale["axes"][0]:
+            return None
+        return float(multiscale["datasets"][0]["coordinateTransformations"][0]["scale"][0])
+
+    def __len__(self) -> int:
+        return int(self.array.shape[0])
+
+    def read(self, index: int) -> Floats:
+        """Return one picture, (height, width[, 3]); NaN where there is none."""
+        picture = np.asarray(self.array[index], np.float32)
+        return picture if picture.ndim == 2 else np.ascontiguousarray(np.moveaxis(picture, 0, 2))
+
+    def is_written(self, index: int) -> bool:
+        """Whether a picture is on the disk."""
+        return self._file(index).exists()
+
+    def write(self, index: int, picture: Floats) -> None:
+        """Put a picture on the disk, whole or not at all."""
+        self.array[index] = picture if picture.ndim == 2 else np.moveaxis(picture, 2, 0)
+        with self._file(index).open("rb") as written:
+            os.fsync(written.fileno())
+
+    def _file(self, index: int) -> Path:
+        return self.path / "0" / "c" / "/".join(map(str, (index, *(0,) * (self.array.ndim - 1))))
+
+
+CODEC = "vp09"
+DEFAULT_FPS = 25.0
+SAMPLES = 24
+"""Pictures looked at to find black and white of all."""
+BLACK_PERCENTILE, WHITE_PERCENTILE = 0.5, 99.8
+
+
+def levels_of(pictures: Iterable[npt.NDArray[Any]]) -> tuple[float, float]:
+    """Return black and white for pictures to be shown alike: percentiles over all of them, NaN left out."""
+    values = [picture[np.isfinite(picture)][::7] for picture in pictures]
+    together = np.concatenate([v for v in values if v.size] or [np.zeros(1)])
+    low, high = np.percentile(together, (BLACK_PERCENTILE, WHITE_PERCENTILE))
+    return float(low), float(high) if high > low else float(low) + 1.0
+
+
+def as_shown(picture: npt.NDArray[Any], black: float, white: float) -> npt.NDArray[np.uint8]:
+    """Return a picture as 8-bit RGB, (height, width, 3); NaN is black."""
+    level = np.nan_to_num((picture - black) / (white - black), nan=0.0)
+    shown = np.round(255 * np.clip(level, 0, 1)).astype(np.uint8)
+    return np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
+
+
+def write_mp4(path: Path, pictures: Iterable[npt.NDArray[np.uint8]], fps: float) -> int:
+    """Write pictures, 8-bit RGB (height, width, 3), whole or not at all; returns how many.
+
+    Sides are made even by repeating the last row or column, as the codec needs.
+
+    Raises
+    ------
+    FileError
+        When OpenCV here cannot encode, or the folder cannot be written to.
+    """
+    import cv2
+
+    count = 0
+    writer: Any = None
+    with whole_file(path) as temporary:
+        try:
+            for picture in pictures:
+                height, width = picture.shape[:2]
+                even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                if writer is None:
+                    size = (even.shape[1], even.shape[0])
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*CODEC), fps, size)
+                    if not writer.isOpened():
+                        raise FileError(
+                            path,
+                            f"OpenCV {cv2.__version__} here cannot encode VP9.",
+                            "Install opencv-contrib-python-headless from PyPI, or use --no-mp4.",
+                        )
+                writer.write(np.ascontiguousarray(even[..., ::-1]))
+                count += 1
+        finally:
+            if writer is not None:
+                writer.release()
+        if count == 0:
+            raise FileError(path, "there is no picture to make a film of.")
+    return count

@@ -1,0 +1,211 @@
+"""Live pictures: how they are asked for, what each is worth, and what makes them at one resolution."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.base.declare import option, require
+from recon.errors import InputError
+from recon.reconstruction.measurement import Floats
+from recon.reconstruction.options import ReconstructionOptions
+from recon.reconstruction.part import Part
+from recon.reconstruction.problem import Problem
+from recon.solvers.wiener import WienerFilter, cross_validated
+from recon.streams.stillness import SceneState
+from recon.streams.video import VideoSolver
+
+Array = npt.NDArray[Any]
+
+
+_LIVE = "Live pictures"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How live pictures keep pace with a camera."""
+
+    budget_ms: float = option(
+        33.0,
+        help="Time for one picture: pixels and iterations give way to it.",
+        unit="ms",
+        above=0,
+        group=_LIVE,
+    )
+    finest: int = option(1, help="Least binning.", least=1, group=_LIVE)
+    coarsest: int = option(8, help="Largest binning.", least=1, group=_LIVE)
+    average: int = option(
+        8,
+        help="Frames averaged at most while the scene is still.",
+        least=1,
+        label="Frames averaged",
+        group=_LIVE,
+    )
+    plane: int | None = option(
+        None,
+        help="Of several depths the one that is shown, the nearest is 0.",
+        default_words="the brightest of all",
+        least=0,
+        label="Depth shown",
+        group=_LIVE,
+    )
+
+    def __post_init__(self) -> None:
+        """Raise InputError that names all mistakes at once."""
+        require(self)
+        if self.finest > self.coarsest:
+            raise InputError(
+                f"1 <= finest <= coarsest is expected; got finest {self.finest}, coarsest {self.coarsest}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class LivePicture:
+    """A picture, and what it is worth.
+
+    Attributes
+    ----------
+    image : ndarray, float32, (height, width) or (height, width, n_channels)
+        The part of the scene opposite to the sensor, on pixels binned ``binning x binning``; brightness does
+        not depend on the binning.
+    binning : int
+    method : str
+        The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF.
+    iterations : int
+        Done for this picture; 0 for ``"wiener"``.
+    total_iterations : int
+        Since the solver last began anew; what it knew of the scene before a movement stays with it.
+    scene : SceneState
+        Whether the scene is new, moving or still.
+    frames : int
+        Frames averaged; 1 unless the scene is still.
+    settled : bool
+        Whether further iterations on these frames would change nothing that can be seen.
+    work_ms : float
+        Time that the picture took.
+    budget_ms : float
+        Time that it was allowed.
+    volume : ndarray, float32, (n_z, height, width[, n_channels]), or None
+        All depths, where several are reconstructed; None for a filter's picture.
+    shown : str
+        Which of several depths ``image`` shows, in words.
+    """
+
+    image: Floats
+    binning: int
+    method: str
+    iterations: int
+    total_iterations: int
+    scene: SceneState
+    frames: int
+    settled: bool
+    work_ms: float
+    budget_ms: float
+    volume: Floats | None = None
+    shown: str = ""
+
+    @property
+    def quality(self) -> str:
+        """What the picture is worth, in words: ``"binned 2 x 2, 3 iterations (41 in all), moving"``."""
+        pixels = "all pixels" if self.binning == 1 else f"binned {self.binning} x {self.binning}"
+        steps = f"{self.iterations} iterations ({self.total_iterations} in all)"
+        how = "Wiener filter" if self.method == "wiener" else steps
+        scene = f"still, {self.frames} frames averaged" if self.frames > 1 else str(self.scene)
+        return ", ".join(filter(None, (pixels, self.shown, how, scene, "settled" if self.settled else "")))
+
+
+@dataclass(frozen=True)
+class Level:
+    """Live pictures at one binning.
+
+    Brightness does not depend on the binning: one binned pixel holds the light of all its pixels.
+
+    Attributes
+    ----------
+    problem : Problem
+        Of a first frame on binned pixels, which settles noise, scales and weights.
+    binning : int
+        Pixels averaged along each axis.
+    preview : Part
+        Of the same frame through one PSF, without a background: what the filter is for.
+    filter : WienerFilter
+    solver : VideoSolver or None
+        None until it was made: a filter is made in a moment, for the first picture.
+    """
+
+    problem: Problem
+    binning: int
+    preview: Part
+    filter: WienerFilter
+    solver: VideoSolver | None = None
+
+    @classmethod
+    def of(cls, problem: Problem, binning: int, plane: int) -> Level:
+        """Return a level without a solver, whose filter is for one of the depths."""
+        plain = problem if problem.together else _preview(problem, plane)
+        part = Part(plain, slice(0, plain.n_channels))
+        operator = part.picture_operator
+        return cls(problem, binning, part, WienerFilter(operator, cross_validated(operator, part.data)))
+
+    def solving(self) -> Level:
+        """Return the level with a solver that has found memory and threads, at a picture's cost."""
+        shared = self.preview.problem is self.problem
+        solver = VideoSolver(self.problem, parts=[self.preview] if shared else None)
+        try:
+            solver.take(np.asarray(self.problem.measurement.image, np.float32))
+            solver.advance(0.0)
+        except BaseException:
+            solver.close()
+            raise
+        solver.begin()
+        return replace(self, solver=solver)
+
+    def filtered(self, frame: Floats) -> Floats:
+        """Return Wiener's picture, (1, height, width[, n_channels]), of a frame on binned pixels."""
+        plain = self.preview.problem
+        light = np.maximum(self.filter(plain.with_data(frame).data), 0)
+        volume = plain.measured(self.preview.lifted(light), self.preview.channels)
+        return plain.whole([volume]) / np.float32(self.binning**2)
+
+    def solved(self) -> Floats:
+        """Return what the solver has at present, (n_z, height, width[, n_channels])."""
+        assert self.solver is not None
+        return self.solver.volume() / np.float32(self.binning**2)
+
+
+def _preview(problem: Problem, plane: int) -> Problem:
+    """Return a problem with one depth's central PSF for everything."""
+    options = ReconstructionOptions(solver="wiener", prior="none", field=problem.options.field)
+    psf = np.moveaxis(problem.depths.central[plane], 0, -1)
+    return Problem.of(problem.measurement, psf, options)
+
+
+class ComingLevel:
+    """A level being made in a thread of its own, while pictures go on at the one before."""
+
+    def __init__(self, binning: int, make: Callable[[], Level]) -> None:
+        self.binning = binning
+        self._made: Future[Level] = Future()
+        self._thread = threading.Thread(target=self._work, args=(make,), name="live level")
+        self._thread.start()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the level is made, or the time is over; return whether it is made."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def result(self) -> Level:
+        """Return the level; waits for it, and raises what went wrong with it."""
+        return self._made.result()
+
+    def _work(self, make: Callable[[], Level]) -> None:
+        try:
+            self._made.set_result(make())
+        except Exception as error:  # noqa: BLE001 - raised where the level is asked for
+            self._made.set_exception(error)

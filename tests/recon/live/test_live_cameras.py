@@ -1,0 +1,167 @@
+"""Live pictures and videos through every camera, prior and solver: they become what one picture becomes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon import InputError, reconstruct
+from recon.camera.camera_model import CAMERAS
+from recon.evaluation.scene import make_scene
+from recon.priors import PRIORS
+from recon.reconstruction.solvers import SOLVERS
+from recon.streams.live import LiveReconstructor
+from recon.streams.live_picture import LivePicture
+from recon.streams.video import VideoSolver, stream_problem
+
+OWN = Path(__file__).parents[3] / "examples" / "own_methods"
+SIZE = 24
+PACE: dict[str, Any] = {"budget_ms": 20_000.0, "coarsest": 1}
+"""A budget that no machine exhausts."""
+CASES: dict[str, tuple[dict[str, Any], float]] = {
+    "one PSF": ({"model": "convolution"}, 0.04),
+    "one PSF, erasures": ({"model": "convolution", "erased": True}, 0.04),
+    "l1, erasures": ({"prior": "l1", "model": "convolution", "erased": True}, 0.04),
+    "local": ({"model": "local"}, 0.06),
+    "low rank, l1, erasures": ({"model": "lowrank", "prior": "l1", "erased": True}, 0.04),
+    "smooth background, erasures": ({"estimate_background": True, "erased": True}, 0.06),
+    "known background": ({"model": "convolution", "background": 3.0}, 0.04),
+    "FISTA": ({"model": "convolution", "solver": "fista", "prior": "l1"}, 0.2),
+    "own prior, erasures": ({"model": "convolution", "prior": "colour-groups", "erased": True}, 0.08),
+    "own solver": ({"model": "convolution", "solver": "landweber", "prior": "l1"}, 0.4),
+    "own camera": ({"model": "vignetting"}, 0.03),
+    "float64": ({"model": "convolution", "precision": "float64"}, 0.04),
+}
+"""Options, and how far from the single picture a stream may end: about twice what was measured.
+Landweber's iteration is slow: it is at rest, by its small steps, long before it is at the end."""
+
+
+@pytest.fixture(autouse=True)
+def _own_methods(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(OWN))
+    import own_camera
+    import own_prior
+    import own_solver
+
+    own = ((CAMERAS, own_camera.CAMERA), (PRIORS, own_prior.PRIOR), (SOLVERS, own_solver.SOLVER))
+    for registry, registered in own:
+        registry.register(registered)
+    yield
+    for registry, registered in own:
+        del registry._foreign[registered.name]
+    for name in ("own_camera", "own_prior", "own_solver"):
+        sys.modules.pop(name)
+
+
+def settled(reconstructor: LiveReconstructor, frames: list[np.ndarray]) -> LivePicture:
+    """Feed frames of a still scene, and refine until nothing is gained."""
+    for frame in frames:
+        picture = reconstructor.feed(frame)
+    for _ in range(40):
+        picture = reconstructor.refine() or picture
+    return picture
+
+
+def apart(image: np.ndarray, reference: np.ndarray) -> float:
+    return float(np.linalg.norm(image - reference) / np.linalg.norm(reference))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_still_scene_becomes_what_its_mean_frame_becomes(name: str) -> None:
+    asked, within = CASES[name]
+    options: dict[str, Any] = {"model": "convolution", "noise": 3.0, **asked}
+    scene = make_scene("sparse-picture", size=SIZE, grid=3, photons=2000.0)
+    frames = [scene.measurement + np.random.default_rng(n).normal(0, 1.0, (SIZE, SIZE)) for n in range(3)]
+    if options.pop("erased", False):
+        gone = options["erasures"] = np.random.default_rng(0).random((SIZE, SIZE)) < 0.1
+        for frame in frames:
+            frame[gone] = 4095.0
+    mean = np.mean(frames, axis=0).astype(np.float32)
+    alone = reconstruct(mean, scene.calibration, **options, iterations=400, tolerance=0).image
+    picture = settled(LiveReconstructor(scene.calibration, **PACE, **options), frames)
+    assert picture.frames == len(frames)
+    assert picture.method == stream_problem(frames[0], scene.calibration, **options).solver.name
+    assert apart(picture.image, alone) < within
+    problem = stream_problem(frames[0], scene.calibration, **options)
+    with VideoSolver(problem, cold_iterations=80, warm_iterations=80) as video:
+        for _ in range(3):
+            film = video.next(mean)
+    assert apart(film, alone) < within
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_of_several_depths_the_brightest_is_shown_or_one_that_is_chosen(channels: int) -> None:
+    scene = make_scene("beads", size=SIZE, depths=2, channels=channels, density=0.5)
+    options: dict[str, Any] = {"prior": "l1", "estimate_background": False, "noise": 2.0}
+    alone = reconstruct(
+        scene.measurement, scene.calibration, **options, model="convolution", iterations=300, tolerance=0
+    ).volume
+    live = LiveReconstructor(scene.calibration, **PACE, **options)
+    first = live.feed(scene.measurement)
+    assert (first.method, first.volume, first.shown) == ("wiener", None, "depth 1 of 2 depths")
+    assert first.image.shape == scene.measurement.shape
+    picture = settled(live, [scene.measurement])
+    assert picture.volume is not None
+    assert apart(picture.volume, alone) < 0.05
+    np.testing.assert_array_equal(picture.image, picture.volume.max(axis=0))
+    assert "brightest of 2 depths" in picture.quality
+    np.testing.assert_array_equal(live.shown(alone), alone.max(axis=0))
+    nearest = settled(LiveReconstructor(scene.calibration, plane=0, **PACE, **options), [scene.measurement])
+    assert nearest.volume is not None
+    np.testing.assert_array_equal(nearest.image, nearest.volume[0])
+    assert "depth 0 of 2 depths" in nearest.quality
+
+
+def test_a_picture_to_the_end_has_the_same_options() -> None:
+    scene = make_scene("sparse-picture", size=SIZE, grid=3, photons=2000.0)
+    live = LiveReconstructor(scene.calibration, model="local", prior="l1", background=2.0)
+    live.feed(scene.measurement)
+    result = live.full(scene.measurement)
+    assert (result.model, result.prior) == ("local", "l1")
+    alone = reconstruct(scene.measurement, scene.calibration, model="local", prior="l1", background=2.0)
+    np.testing.assert_allclose(result.image, alone.image, rtol=1e-4, atol=1e-4 * alone.image.max())
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"solver": "wiener"}, "no iterations"),
+        ({"iterations": 5}, "budget_ms"),
+        ({"positive_background": True}, "not for live pictures"),
+        ({"solver": "admm-sensor", "model": "local"}, "one PSF"),
+        ({"prior": "tv", "solver": "fista", "z_um": None, "tau": -1.0}, "tau"),
+        ({"plane": 1}, "plane 1"),
+        ({"background": np.zeros((5, 5))}, "background has 5 x 5"),
+        ({"erasures": np.ones((SIZE, SIZE), bool)}, "no pixel"),
+        ({"patterns": np.ones((2, SIZE, SIZE))}, "one light"),
+        ({"priorr": "l1"}, "prior"),
+    ],
+)
+def test_what_has_no_way_is_refused_before_the_stream(asked: dict[str, Any], says: str) -> None:
+    scene = make_scene("sparse-picture", size=SIZE, grid=3)
+    with pytest.raises(InputError, match=says):
+        LiveReconstructor(scene.calibration, **asked)
+
+
+def test_a_solver_that_cannot_be_halted_is_refused() -> None:
+    scene = make_scene("sparse-picture", size=SIZE)
+
+    class Whole:
+        solution = np.zeros(1)
+
+        def run(self) -> None: ...
+
+    offered = replace(SOLVERS["landweber"], name="whole", make=lambda part, start: Whole())
+    SOLVERS.register(offered)
+    try:
+        video = VideoSolver(stream_problem(scene.measurement, scene.calibration, solver="whole"))
+        with pytest.raises(InputError, match="halted"):
+            video.next(scene.measurement)
+    finally:
+        del SOLVERS._foreign["whole"]
