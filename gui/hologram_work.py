@@ -254,7 +254,7 @@ def _exposure_kept(camera: Camera) -> Iterator[None]:
 
 
 def _display_bench(
-    bench: Bench, correction: Path | None, check: Callable[[], object] | None = None
+    bench: Bench, correction: Path | None, check: Callable[[], object] = lambda: None
 ) -> DisplayBench:
     loaded = None if correction is None else load_slm_correction(correction)
     return DisplayBench(bench, bench.config.display.slm_binning, loaded, check=check)

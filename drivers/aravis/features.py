@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from drivers.device import FoundDevice
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 
 REMEDY = (
@@ -16,6 +17,8 @@ REMEDY = (
 )
 FAKE_PREFIX = "Fake_"
 """Ids of the cameras that Aravis itself makes up, for tests."""
+
+_MISSING = "Is it on, connected, and in this computer's subnet? arv-tool-0.8 lists what Aravis finds."
 
 _lock = threading.Lock()
 
@@ -54,10 +57,55 @@ def library_error() -> type[Exception]:
     return error
 
 
-def enable_fake(aravis: Any, device_id: str | None) -> None:
-    """Have Aravis make up a camera when, and only when, its id is asked for."""
-    if device_id is not None and device_id.startswith(FAKE_PREFIX):
+def find_camera(aravis: Any, device: str, wanted: str | None) -> Any:
+    """Return the library's camera of an id or network address; of None the only one there is.
+
+    Raises
+    ------
+    DeviceError
+        When it is not found, or there are several.
+    """
+    if wanted is not None and wanted.startswith(FAKE_PREFIX):
         aravis.enable_interface("Fake")
+    if wanted is None:
+        aravis.update_device_list()
+        ids = [aravis.get_device_id(i) for i in range(aravis.get_n_devices())]
+        if len(ids) != 1:
+            raise DeviceError(
+                device,
+                f"{len(ids)} GenICam cameras were found{': ' if ids else ''}{', '.join(ids)}.",
+                "Name one by device_id." if ids else _MISSING,
+            )
+        wanted = ids[0]
+    try:
+        return aravis.Camera.new(wanted)
+    except library_error() as error:
+        message = error.message  # type: ignore[attr-defined]
+        raise DeviceError(device, f"was not found: {message}.", _MISSING) from error
+
+
+def found_cameras() -> tuple[FoundDevice, ...]:
+    """Return the GenICam cameras on the network and on USB."""
+    aravis = load("GenICam")
+    aravis.update_device_list()
+    found = []
+    for i in range(aravis.get_n_devices()):
+        vendor, model = aravis.get_device_vendor(i) or "", aravis.get_device_model(i) or ""
+        found.append(
+            FoundDevice(
+                bus="GenICam",
+                address=aravis.get_device_address(i) or aravis.get_device_id(i),
+                description=f"{vendor} {model} ({aravis.get_device_protocol(i)})",
+                vendor=vendor,
+                product=model,
+                serial_number=aravis.get_device_serial_nbr(i) or "",
+                driver="aravis",
+                kind="camera",
+                options={"device_id": aravis.get_device_id(i)},
+                note="pixel_pitch_um = (micrometres, if the camera does not say it: its data sheet does)",
+            )
+        )
+    return tuple(found)
 
 
 FeatureValue = str | bool | int | float

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QWidget
 
-from calibration_routines import Photograph, SweepCalibration
+from calibration_routines.optics.photograph import Photograph
 from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook, Routine, routines
+from calibration_routines.psf.sweep import SweepCalibration
 from calibration_routines.psf.sweep_watch import PointTaken
 from gui.background import NewestOnly
 from gui.procedure_panel import ProcedurePanel

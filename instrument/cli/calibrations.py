@@ -106,7 +106,7 @@ def analyze(
     simulated = bool(measured.provenance.get("simulated"))
     with saying_what_is_left(out, record):
         with one_task("analyze") as advance:
-            analysis = analyse(measured, settings, progress=lambda _what, share: advance(share * 100, 100))
+            analysis = analyse(measured, settings, on_progress=lambda _what, share: advance(share * 100, 100))
         title, subtitle = _titles(measured, folder)
         figure = draw_analysis(analysis, title, subtitle, simulated=simulated)
         save_figure(figure, out)
