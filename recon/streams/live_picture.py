@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,10 @@ from recon.streams.video import VideoSolver
 
 Array = npt.NDArray[Any]
 
+
+SETTLED = 1e-3
+"""Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
+from where the exact-data ADMM would end."""
 
 _LIVE = "Live pictures"
 
@@ -152,6 +157,16 @@ class Level:
         part = Part(plain, slice(0, plain.n_channels))
         operator = part.picture_operator
         return cls(problem, binning, part, WienerFilter(operator, cross_validated(operator, part.data)))
+
+    @cached_property
+    def method(self) -> str:
+        """The solver's name."""
+        return self.problem.solver.name
+
+    @cached_property
+    def tolerance(self) -> float:
+        """Change an iteration below which a frame's picture is done."""
+        return min(SETTLED, self.problem.stop_tolerance)
 
     def solving(self) -> Level:
         """Return the level with a solver that has found memory and threads, at a picture's cost."""
