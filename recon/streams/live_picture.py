@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -206,21 +205,15 @@ class ComingLevel:
 
     def __init__(self, binning: int, make: Callable[[], Level]) -> None:
         self.binning = binning
-        self._made: Future[Level] = Future()
-        self._thread = threading.Thread(target=self._work, args=(make,), name="live level")
-        self._thread.start()
+        pool = ThreadPoolExecutor(1, "live level")
+        self._made = pool.submit(make)
+        pool.shutdown(wait=False)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the level is made, or the time is over; return whether it is made."""
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        wait((self._made,), timeout_s)
+        return self._made.done()
 
     def result(self) -> Level:
         """Return the level; waits for it, and raises what went wrong with it."""
         return self._made.result()
-
-    def _work(self, make: Callable[[], Level]) -> None:
-        try:
-            self._made.set_result(make())
-        except Exception as error:  # noqa: BLE001 - raised where the level is asked for
-            self._made.set_exception(error)
