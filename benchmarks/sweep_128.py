@@ -17,7 +17,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from calibration_routines import AxialSweep, Listener, calibrate_sweep, expose_sweep, sweep_plan
+from calibration_routines import AxialSweep, calibrate_sweep, expose_sweep, sweep_plan
+from calibration_routines.procedure import Listener
 from drivers.simulated.camera import SimulatedCamera
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import open_bench

@@ -1,71 +1,35 @@
-"""Procedures: a plan, the analysis of its frames, a Calibration."""
+"""Procedures: a plan, the analysis of its frames, a Calibration.
 
-from calibration_routines.optics.angular import AngularProcedure, AngularSweep
-from calibration_routines.optics.angular_response import AngularResponse, load_response
-from calibration_routines.optics.dpc import DiffuserSurface, DpcProcedure, DpcSetup
-from calibration_routines.optics.photograph import Photograph, photograph
-from calibration_routines.procedure import CalibrationError, Listener
-from calibration_routines.psf.exposure import (
-    AutoExposure,
-    ExposureOutcome,
-    auto_expose,
-    expose_scene,
-    expose_source,
-)
-from calibration_routines.psf.field_response import FieldResponse, measure_field_response
-from calibration_routines.psf.sampling import (
-    GridSweep,
-    Sampling,
-    axial_planes,
-    grid_sweep,
-    lateral_spacing,
-    planes_needed,
-)
-from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep, finish_sweep, watch_resumed
-from calibration_routines.psf.sweep_options import AxialSweep, LateralSweep, PointSweep, VolumeSweep
-from calibration_routines.psf.sweep_plan import SweepExposures, check_sweep, expose_sweep, sweep_plan
-from calibration_routines.psf.sweep_procedure import SweepProcedure
-from calibration_routines.psf.sweep_watch import PointTaken, SourceVisit, SweepEvent
+The names that scripts use are imported when they are asked for: ``--help`` needs declarations only.
+"""
 
-__all__ = [
-    "AngularProcedure",
-    "AngularResponse",
-    "AngularSweep",
-    "AutoExposure",
-    "AxialSweep",
-    "CalibrationError",
-    "DiffuserSurface",
-    "DpcProcedure",
-    "DpcSetup",
-    "ExposureOutcome",
-    "FieldResponse",
-    "GridSweep",
-    "LateralSweep",
-    "Listener",
-    "Photograph",
-    "PointSweep",
-    "PointTaken",
-    "Sampling",
-    "SourceVisit",
-    "SweepCalibration",
-    "SweepEvent",
-    "SweepExposures",
-    "SweepProcedure",
-    "VolumeSweep",
-    "auto_expose",
-    "axial_planes",
-    "calibrate_sweep",
-    "check_sweep",
-    "expose_scene",
-    "expose_source",
-    "expose_sweep",
-    "finish_sweep",
-    "grid_sweep",
-    "lateral_spacing",
-    "load_response",
-    "measure_field_response",
-    "photograph",
-    "planes_needed",
-    "sweep_plan",
-    "watch_resumed",
-]
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "optics.angular": "AngularProcedure AngularSweep",
+    "optics.angular_response": "AngularResponse load_response",
+    "optics.dpc": "DiffuserSurface DpcProcedure DpcSetup",
+    "optics.photograph": "FieldResponse Photograph measure_field_response photograph",
+    "procedure": "CalibrationError Listener",
+    "psf.exposure": "AutoExposure ExposureOutcome auto_expose expose_scene expose_source",
+    "psf.sampling": "GridSweep Sampling axial_planes grid_sweep lateral_spacing",
+    "psf.sweep": "SweepCalibration calibrate_sweep finish_sweep watch_resumed",
+    "psf.sweep_options": "AxialSweep LateralSweep PointSweep VolumeSweep",
+    "psf.sweep_plan": "SweepExposures check_sweep expose_sweep sweep_plan",
+    "psf.sweep_procedure": "SweepProcedure",
+    "psf.sweep_watch": "PointTaken SourceVisit SweepEvent",
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOMES.items():
+        if name in names.split():
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(" ".join(_HOMES.values()).split())

@@ -48,7 +48,6 @@ class RunEndedError(CalibrationError):
     ----------
     what : str
         Begins the sentence: ``"The sweep"``.
-    run : Run
     remedy : str
         What to do about it.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -10,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.common.stream import FrameStream
-from drivers.device import Device
-from drivers.errors import DeviceError
+from drivers.device import Device, Setting
+from drivers.errors import DeviceError, LimitError
 from drivers.frame import Frame, FrameMetadata
 
 TriggerMode = Literal["free_run", "software", "hardware"]
@@ -25,6 +26,14 @@ class Roi:
     left: int
     height: int
     width: int
+
+    def contains(self, other: Roi) -> bool:
+        """Whether another region lies in this one, and is not empty."""
+        bottom, right = self.top + self.height, self.left + self.width
+        return (
+            self.top <= other.top < other.top + other.height <= bottom
+            and self.left <= other.left < other.left + other.width <= right
+        )
 
     def as_tuple(self) -> tuple[int, int, int, int]:
         """Return ``(top, left, height, width)``."""
@@ -153,6 +162,33 @@ class Camera(Device):
     @abstractmethod
     def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
         """Choose what starts an exposure; returns what the device made of it."""
+
+    def _common_settings(self) -> dict[str, Setting]:
+        """Return what every camera's settings say, for drivers."""
+        names = (
+            "exposure_ms gain black_level pixel_format significant_bits roi binning trigger_mode "
+            "sensor_shape pixel_pitch_um"
+        )
+        return {name: getattr(self, name) for name in names.split()} | {"roi": self.roi.as_tuple()}
+
+    def _require_within(
+        self, value: float, limits: tuple[float, float], problem: str, what: str, unit: str = ""
+    ) -> None:
+        """Refuse a value beyond limits, for drivers: ``problem``, then what ``what`` is."""
+        low, high = limits
+        if not low <= value <= high:
+            raise LimitError(self.name, problem, f"{what} is {low:g} to {high:g}{unit}.")
+
+    def _require_offered(self, what: str, value: object, offered: Sequence[object]) -> None:
+        """Refuse a value that is not on offer, for drivers."""
+        if value not in offered:
+            choices = ", ".join(map(str, offered))
+            raise LimitError(self.name, f"has no {what} {value!r}.", f"It offers {choices}.")
+
+    def _no_region(self, asked: Roi, remedy: str) -> LimitError:
+        """Return the refusal of a region, for drivers."""
+        problem = f"cannot read the region (top, left, height, width) = {asked.as_tuple()}."
+        return LimitError(self.name, problem, remedy)
 
     @property
     def image_shape(self) -> tuple[int, int]:

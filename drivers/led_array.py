@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.device import Device
+from drivers.errors import LimitError
 
 Rgb = tuple[int, int, int]
 
@@ -74,6 +75,21 @@ class LedArray(Device):
         LimitError
             When an index or a level is out of range; the pattern shown stays.
         """
+
+    def check(self, pattern: LedPattern) -> None:
+        """Refuse a pattern that the array cannot show.
+
+        Raises
+        ------
+        LimitError
+            When an index or a level is out of range.
+        """
+        count = len(self.led_positions_mm)
+        for led, rgb in pattern.levels:
+            if not 0 <= led < count:
+                raise LimitError(self.name, f"has no LED {led}.", f"It has LEDs 0 to {count - 1}.")
+            if len(rgb) != 3 or not all(0 <= level <= 255 for level in rgb):
+                raise LimitError(self.name, f"cannot show level {rgb} on LED {led}.", "Levels are 0 to 255.")
 
     @abstractmethod
     def off(self) -> None:

@@ -8,6 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.device import Device
+from drivers.errors import LimitError
+
+
+def read_only(levels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return a view that cannot be written to."""
+    view = levels.view()
+    view.flags.writeable = False
+    return view
 
 
 class Slm(Device):
@@ -42,6 +50,13 @@ class Slm(Device):
     @abstractmethod
     def displayed(self) -> npt.NDArray[np.uint8]:
         """The grey levels shown now, ``(height, width)`` uint8, read only."""
+
+    def _check(self, levels: npt.NDArray[np.uint8]) -> None:
+        """Refuse what does not fit, for drivers."""
+        if levels.shape != self.shape or levels.dtype != np.uint8:
+            raise LimitError(
+                self.name, f"cannot show {levels.dtype} {levels.shape}.", f"It takes uint8 {self.shape}."
+            )
 
     def blank(self) -> None:
         """Show all zeros."""

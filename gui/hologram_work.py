@@ -15,11 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.display.display_io import DisplayBench, bring_mask
-from calibration_routines.display.hologram_photograph import (
-    Photographed,
-    photograph_hologram,
-    write_capture,
-)
+from calibration_routines.display.hologram_photograph import Photographed, photograph_hologram, write_capture
 from drivers.camera import Camera
 from drivers.errors import DeviceError
 from gui.jobs import JobCancelledError, JobContext
@@ -238,7 +234,7 @@ def photograph(
                 computed.target,
                 CaptureOptions(average=average),
             )
-            bench.safe_state()
+            bench.stop()
     except EndedEarlyError as error:
         raise JobCancelledError from error
     write_capture(out, seen)
@@ -258,7 +254,7 @@ def _exposure_kept(camera: Camera) -> Iterator[None]:
 
 
 def _display_bench(
-    bench: Bench, correction: Path | None, check: Callable[[], object] | None = None
+    bench: Bench, correction: Path | None, check: Callable[[], object] = lambda: None
 ) -> DisplayBench:
     loaded = None if correction is None else load_slm_correction(correction)
     return DisplayBench(bench, bench.config.display.slm_binning, loaded, check=check)

@@ -197,13 +197,7 @@ class JobRunner(QObject):
 
     # Starting ------------------------------------------------------------------------------------
     def device(
-        self,
-        title: str,
-        work: Work,
-        lanes: Collection[str],
-        *,
-        quiet: bool = False,
-        endless: bool = False,
+        self, title: str, work: Work, lanes: Collection[str], *, quiet: bool = False, endless: bool = False
     ) -> Job:
         """Run a short job on some devices, after those before it that use one of them.
 
@@ -215,9 +209,7 @@ class JobRunner(QObject):
             When a job that holds the whole bench runs or waits, an endless one holds a device, or too many
             jobs wait.
         """
-        if (holder := self.exclusive_job) is not None:
-            raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
-        self._refuse_endless(lanes)
+        self._require_free(lanes)
         if len(self._waiting) >= _MOST_WAITING:
             raise BusyError(f"{title}: {_MOST_WAITING} commands are waiting already. Wait a moment.")
         job = self._add(title, work, frozenset(lanes), exclusive=False)
@@ -232,9 +224,7 @@ class JobRunner(QObject):
         BusyError
             When another such job runs or waits, or an endless one holds a device.
         """
-        if (holder := self.exclusive_job) is not None:
-            raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
-        self._refuse_endless(DEVICE_LANES)
+        self._require_free(DEVICE_LANES)
         return self._add(title, work, DEVICE_LANES, exclusive=True)
 
     def compute(self, title: str, work: Work) -> Job:
@@ -303,7 +293,10 @@ class JobRunner(QObject):
         return not any(thread.is_alive() for thread in self._threads)
 
     # Inside --------------------------------------------------------------------------------------
-    def _refuse_endless(self, lanes: Collection[str]) -> None:
+    def _require_free(self, lanes: Collection[str]) -> None:
+        """Raise BusyError where a job would wait for the whole bench, or for an endless one."""
+        if (holder := self.exclusive_job) is not None:
+            raise BusyError(f"{holder.title} is running. Wait for its end, or stop it (Esc).")
         for job in self._jobs.values():
             if job.endless and not job.is_cancelling and not job.lanes.isdisjoint(lanes):
                 raise BusyError(f"{job.title} goes on until it is stopped. Stop it first, there or with Esc.")
@@ -347,12 +340,10 @@ class JobRunner(QObject):
             return
         if mail.kind == "start":
             self._start_what_can()
-        elif mail.kind == "progress":
-            for value in job._context._take_newest():
-                job.progressed.emit(value)
-        else:
-            for value in job._context._take_newest():
-                job.progressed.emit(value)
+            return
+        for value in job._context._take_newest():
+            job.progressed.emit(value)
+        if mail.kind != "progress":
             self._finish(mail.number, mail.kind, mail.value)
 
     def _finish(self, number: int, kind: str, value: Any) -> None:

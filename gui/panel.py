@@ -25,7 +25,6 @@ class Panel(QWidget):
     Parameters
     ----------
     session : BenchSession
-    parent : QWidget, optional
     """
 
     title: ClassVar[str] = ""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +18,6 @@ from gui.procedure_run import Ended, ProcedureRun, RunBar, Situation, script
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.widgets.building import after_rest, button, choice, fill, label, mark, scrolled, split, text_view
-from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError, count, duration, size
 
 _CHECK_MS = 250
@@ -38,7 +37,6 @@ class ProcedurePanel(Panel):
         What can be carried out: each has a form of its options.
     words : str
         On the start button.
-    parent : QWidget, optional
     """
 
     handed_to: ClassVar[str] = "reconstructions"
@@ -162,8 +160,14 @@ class ProcedurePanel(Panel):
             return
         self.run_bar.set_startable("It is being checked.")
 
-        def work(_: JobContext) -> _Checked:
-            return _check(routine.name, bench, procedure, first)
+        def work(_: JobContext) -> Mapping[str, Any] | Outlook | BenchError:
+            try:
+                if first is not None:
+                    return first(bench)
+                assert procedure is not None
+                return procedure.outlook(bench)
+            except BenchError as error:
+                return error
 
         try:
             self._check_job = self.session.jobs.device(
@@ -174,7 +178,7 @@ class ProcedurePanel(Panel):
             self._unchecked = True
             return
         self._slow.start()
-        self._check_job.succeeded.connect(self._checked)
+        self._check_job.succeeded.connect(partial(self._checked, routine))
         self._check_job.failed.connect(self._check_failed)
         self._check_job.ended.connect(self._check_ended)
 
@@ -248,21 +252,20 @@ class ProcedurePanel(Panel):
         self.run_bar.set_startable("It is being checked.")
         self._rest.start()
 
-    def _checked(self, checked: _Checked) -> None:
-        if checked.start is not None:
-            self._started.add(checked.routine)
-            self.views[checked.routine].begin_with(checked.start)
+    def _checked(self, routine: Routine, result: Mapping[str, Any] | Outlook | BenchError) -> None:
+        """Take values to begin with, what will be done, or what stands against it."""
+        if isinstance(result, Mapping):
+            self._started.add(routine.name)
+            self.views[routine.name].begin_with(result)
             self._again = True
+        elif routine is not self.routine:  # another one was chosen meanwhile, and waits for its check
             return
-        if checked.routine != self.routine.name:  # another one was chosen meanwhile, and waits for its check
-            return
-        if checked.error is not None:
-            self.show_problem(checked.error)
+        elif isinstance(result, BenchError):
+            self.show_problem(result)
             self.run_bar.set_startable("It cannot be done; see below the form.")
         else:
-            assert checked.outlook is not None
-            self.outlook = checked.outlook
-            self.show_outlook(checked.outlook)
+            self.outlook = result
+            self.show_outlook(result)
             self.run_bar.set_startable()
 
     def _check_failed(self, why: str) -> None:
@@ -319,27 +322,3 @@ class ProcedurePanel(Panel):
     def _say(self, text: str, *, wrong: bool) -> None:
         self.verdict.setPlainText(text)
         mark(self.verdict, "refused", wrong)
-
-
-@dataclass(slots=True)
-class _Checked:
-    """What the check of a form comes to: values to begin with, an outlook, or what stands against it."""
-
-    routine: str
-    start: dict[str, Any] | None = None
-    outlook: Outlook | None = None
-    error: BenchError | None = None
-
-
-def _check(
-    routine: str, bench: Bench, procedure: Procedure | None, start: Callable[[Bench], Any] | None
-) -> _Checked:
-    checked = _Checked(routine)
-    try:
-        if start is not None:
-            checked.start = dict(start(bench))
-        elif procedure is not None:
-            checked.outlook = procedure.outlook(bench)
-    except BenchError as error:
-        checked.error = error
-    return checked

@@ -41,7 +41,7 @@ class Situation:
         What it does now.
     done, total : float
         Of the step; total 0: not known.
-    seconds, seconds_left : float
+    seconds_left : float
         Of the step; None: not known.
     at_most : bool
         Whether it usually ends long before ``total``: then ``seconds_left`` is a bound, no estimate.
@@ -57,7 +57,6 @@ class Situation:
     done: float = 0.0
     total: float = 0.0
     at_most: bool = False
-    seconds: float = 0.0
     seconds_left: float | None = None
     paused: bool = False
     newest: Snapshot | None = None
@@ -86,7 +85,7 @@ class _Mailbox(Listener):
         left = seconds * (total - done) / done if done > 0 else None
         with self._lock:
             self._situation = replace(
-                self._situation, done=done, total=total, at_most=at_most, seconds=seconds, seconds_left=left
+                self._situation, done=done, total=total, at_most=at_most, seconds_left=left
             )
 
     def said(self, words: str) -> None:
@@ -103,7 +102,6 @@ class _Mailbox(Listener):
                 self._situation,
                 done=status.done,
                 total=status.total,
-                seconds=status.seconds,
                 seconds_left=status.seconds_left,
                 paused=status.state is RunState.PAUSED,
                 newest=status.newest or self._situation.newest,

@@ -212,10 +212,7 @@ class BenchSession(QObject):
     def switch_light(self, light: LightState, *, quiet: bool = False) -> Job:
         """Light the scene, the point source, or nothing; ``quiet`` where nobody asked for it."""
         return self.jobs.device(
-            f"Light: {light}",
-            lambda _: switch_light(self.bench, light),
-            {"led_array", "light"},
-            quiet=quiet,
+            f"Light: {light}", lambda _: switch_light(self.bench, light), {"led_array", "light"}, quiet=quiet
         )
 
     def exclusive_job(self, title: str, work: Work) -> Job:
@@ -385,7 +382,7 @@ class BenchSession(QObject):
         """Close everything; whatever a device does or does not, this ends and says so."""
         problems: list[str] = []
         try:
-            problems += _within(_STOP_WAIT_S, "making the bench safe", self.bench.safe_state)
+            problems += _within(_STOP_WAIT_S, "making the bench safe", self.bench.stop)
             deadline_s = time.monotonic() + _STOP_WAIT_S
             while not all(job.is_over for job in jobs) and time.monotonic() < deadline_s:
                 time.sleep(_STOP_REPEAT_S)

@@ -33,11 +33,6 @@ class OperatorRequest:
         self._refused = True
         self._answer()
 
-    @property
-    def is_answered(self) -> bool:
-        """Whether the operator (or STOP) has answered."""
-        return self._done.is_set()
-
     def _answer(self) -> None:
         if not self._done.is_set():
             self._done.set()

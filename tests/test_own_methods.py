@@ -7,11 +7,16 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tomllib
+import venv
+import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import setuptools
 
 from recon.evaluation.scene import make_scene
 
@@ -20,41 +25,84 @@ EXAMPLE = ROOT / "examples" / "own_methods"
 PROGRAM = "import sys; from instrument.cli import main; sys.exit(main())"
 
 
+@dataclass(frozen=True)
+class Fresh:
+    """An environment of its own into which the package was installed, and a folder with a photograph."""
+
+    python: Path
+    folder: Path
+
+    def run(self, *arguments: str) -> str:
+        """Run Python there and return what it says."""
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run(
+            [self.python, *arguments],
+            capture_output=True,
+            text=True,
+            cwd=self.folder,
+            env=env | {"QT_QPA_PLATFORM": "offscreen"},
+            timeout=300,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+
+def wheel_of(source: Path) -> Path:
+    """Return what the package's build backend would make of it."""
+    project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
+    stem = f"{project['name'].replace('-', '_')}-{project['version']}"
+    points = project["entry-points"].items()
+    about = {
+        "METADATA": f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n",
+        "WHEEL": "Wheel-Version: 1.0\nGenerator: tests\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        "entry_points.txt": "".join(
+            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in named.items())
+            for group, named in points
+        ),
+    }
+    wheel = source.parent / f"{stem}-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for module in source.glob("*.py"):
+            archive.write(module, module.name)
+        for name, text in about.items():
+            archive.writestr(f"{stem}.dist-info/{name}", text)
+        archive.writestr(f"{stem}.dist-info/RECORD", "".join(f"{n},,\n" for n in archive.namelist()))
+    return wheel
+
+
 @pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy, and beside it what pip would write for its entry points; a photograph with its PSF."""
-    folder = tmp_path_factory.mktemp("own") / "own_methods"
-    shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-    info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
-    lines = [
-        line
-        for group, points in project["entry-points"].items()
-        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in points.items()))
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines))
-    scene = make_scene("sparse-picture", size=48)
-    np.save(folder / "photo.npy", scene.measurement)
-    np.save(folder / "psf.npy", scene.calibration.psfs[0, 0])
-    return folder
-
-
-def run(package: Path, *arguments: str) -> str:
-    """Run Python in a process of its own that has the package, and return what it says."""
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> Fresh:
+    """A new environment that borrows the libraries of this one, and pip installs the package: no network."""
+    pytest.importorskip("pip", reason="pip installs the package")
+    folder = tmp_path_factory.mktemp("fresh")
+    venv.create(folder / "venv", with_pip=False)
+    python = folder / "venv" / "bin" / "python"
+    asked = [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    site = Path(subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip())
+    libraries = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
+    (site / "borrowed.pth").write_text("\n".join([*libraries, str(ROOT)]) + "\n")
+    source = folder / "source"
+    shutil.copytree(EXAMPLE, source, ignore=shutil.ignore_patterns("__pycache__"))
+    if tuple(map(int, setuptools.__version__.split(".")[:2])) < (70, 1):  # makes no wheels by itself
+        source = wheel_of(source)
+    install = ["install", "--no-deps", "--no-build-isolation", "--no-index", "--quiet", source]
     done = subprocess.run(
-        [sys.executable, *arguments],
+        [sys.executable, "-m", "pip", "--python", python, *install],
         capture_output=True,
         text=True,
-        cwd=package,
-        env=os.environ
-        | {"PYTHONPATH": os.pathsep.join((str(package), str(ROOT))), "QT_QPA_PLATFORM": "offscreen"},
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
         timeout=300,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    assert (site / "own_prior.py").is_file()
+    work = folder / "work"
+    work.mkdir()
+    scene = make_scene("sparse-picture", size=48)
+    np.save(work / "photo.npy", scene.measurement)
+    np.save(work / "psf.npy", scene.calibration.psfs[0, 0])
+    return Fresh(python, work)
 
 
 @pytest.mark.parametrize("name", [path.name for path in EXAMPLE.glob("*.py")])
@@ -62,24 +110,25 @@ def test_a_method_is_one_short_file(name: str) -> None:
     assert len((EXAMPLE / name).read_text().splitlines()) < 60
 
 
-def test_the_terminal_offers_and_runs_them_and_says_that_they_are_not_judged(package: Path) -> None:
-    words = run(package, "-c", PROGRAM, "reconstruct", "--help")
+def test_the_terminal_offers_and_runs_them_and_says_that_they_are_not_judged(fresh: Fresh) -> None:
+    words = fresh.run("-c", PROGRAM, "reconstruct", "--help")
     assert "colour-groups" in words
     assert "landweber" in words
     assert "vignetting" in words
     files = ["--psf", "psf.npy", "--image", "photo.npy", "--dark", "0", "--out", "own.tif"]
     asked = ["--solver", "landweber", "--prior", "colour-groups", "--iterations", "40"]
-    said = run(package, "-c", PROGRAM, "reconstruct", *files, *asked)
+    said = fresh.run("-c", PROGRAM, "reconstruct", *files, *asked)
     assert "not judged: there are no known cases of the solver landweber" in said.lower().replace("\n", " ")
-    assert (package / "own.tif").exists()
+    assert (fresh.folder / "own.tif").exists()
 
 
-def test_charts_and_maps_offer_them(package: Path) -> None:
-    said = run(package, "-c", PROGRAM, "stability", "--list")
+def test_charts_and_maps_offer_them(fresh: Fresh) -> None:
+    said = fresh.run("-c", PROGRAM, "stability", "--list")
     assert "landweber tv" in said
+    assert "admm vignetting tv" in said
     assert "colour-groups of volumes" in said
     assert "admm vignetting tv" in said
-    made = run(package, "-c", PROGRAM, "stability", "light-points", "--method", "admm vignetting tv")
+    made = fresh.run("-c", PROGRAM, "stability", "light-points", "--method", "admm vignetting tv")
     assert "of 12 cells fail" in made
     lines = (
         "from recon.evaluation.chart_reconstruction import ChartProblem",
@@ -94,10 +143,10 @@ def test_charts_and_maps_offer_them(package: Path) -> None:
         "    print(setting.name)",
         "    assert any(s.model == 'vignetting' for s in problem.settings())",
     )
-    assert run(package, "-c", "\n".join(lines)).count("landweber convolution colour-groups") == 2
+    assert fresh.run("-c", "\n".join(lines)).count("landweber convolution colour-groups") == 2
 
 
-def test_the_window_offers_them(package: Path) -> None:
+def test_the_window_offers_them(fresh: Fresh) -> None:
     pytest.importorskip("PySide6")
     lines = (
         "from PySide6.QtWidgets import QApplication, QComboBox",
@@ -107,14 +156,14 @@ def test_the_window_offers_them(package: Path) -> None:
         "boxes = form.findChildren(QComboBox)",
         "print({box.itemText(n) for box in boxes for n in range(box.count())})",
     )
-    words = run(package, "-c", "\n".join(lines))
+    words = fresh.run("-c", "\n".join(lines))
     assert "'landweber'" in words
     assert "'colour-groups'" in words
     assert "'vignetting'" in words
 
 
 @pytest.mark.parametrize("solver", ["admm", "fista", "landweber"])
-def test_a_camera_model_is_used_by_every_solver(package: Path, solver: str) -> None:
+def test_a_camera_model_is_used_by_every_solver(fresh: Fresh, solver: str) -> None:
     """A photograph that fades towards the corners is explained by the camera that does."""
     lines = (
         "import numpy as np, recon",
@@ -130,7 +179,25 @@ def test_a_camera_model_is_used_by_every_solver(package: Path, solver: str) -> N
         "assert rest[0] < rest[1], rest",
         "assert 'camera model vignetting' in ' '.join(found[0].warnings), found[0].warnings",
     )
-    run(package, "-c", "\n".join(lines))
+    fresh.run("-c", "\n".join(lines))
+
+
+def test_videos_take_them(fresh: Fresh) -> None:
+    lines = (
+        "import numpy as np",
+        "from recon.evaluation.scene import make_scene",
+        "from recon.streams.video import VideoSolver, stream_problem",
+        "scene = make_scene('sparse-picture', size=48)",
+        "for own in ({'solver': 'landweber'}, {'prior': 'colour-groups'}, {'model': 'vignetting'}):",
+        "    video = VideoSolver(stream_problem(scene.measurement, scene.calibration, **own))",
+        "    first, second = (video.next(scene.measurement) for _ in range(2))",
+        "    assert np.isfinite(second).all() and second.max() > 0, own",
+        "    print(video.problem.solver.name, video.problem.prior_name, video.problem.model)",
+    )
+    said = fresh.run("-c", "\n".join(lines)).splitlines()
+    assert said[0].startswith("landweber tv")
+    assert said[1].endswith("colour-groups convolution")
+    assert said[2].endswith("vignetting")
 
 
 def test_the_prox_is_that_of_the_value() -> None:

@@ -19,7 +19,7 @@ from drivers.slm import Slm
 from drivers.stage import Stage
 from instrument.bench.bench import Bench
 from instrument.files.atomic import check_writable
-from instrument.files.errors import BenchError, FileError
+from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection, phase_levels
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.writer import dated_name, free_name
@@ -48,6 +48,8 @@ class DisplayBench:
         first photograph's darkest 10 x 10 pixels.
     check : callable, optional
         Called before anything is shown or photographed; what it raises ends that, e.g. ``RunControl.check``.
+    on_frame : callable, optional
+        Called after each frame with how many were taken.
     """
 
     def __init__(
@@ -57,16 +59,15 @@ class DisplayBench:
         correction: SlmCorrection | None = None,
         *,
         estimate_background: bool = False,
-        check: Callable[[], object] | None = None,
+        check: Callable[[], object] = lambda: None,
+        on_frame: Callable[[int], object] = lambda _: None,
     ) -> None:
-        if bench.slm is None:
-            raise BenchError(f"{bench.label} has no [slm].")
         self.bench = bench
-        self.slm = bench.slm
+        self.slm = require_slm(bench)
         self.binning = binning
         self.correction = correction or SlmCorrection.ideal()
         self.estimates_background = estimate_background
-        self._check = check or (lambda: None)
+        self._check, self._on_frame = check, on_frame
         self.frames = 0
         self._dark: tuple[tuple[float, ...], Array | float] | None = None
 
@@ -106,7 +107,9 @@ class DisplayBench:
 
     def _snap(self) -> Array:
         self.frames += 1
-        return np.asarray(self.bench.snap().image, np.float64)
+        frame = np.asarray(self.bench.snap().image, np.float64)
+        self._on_frame(self.frames)
+        return frame
 
 
 def approach_from_below(stage: Stage, target: Mapping[str, float]) -> None:
@@ -189,18 +192,6 @@ def require_slm(bench: Bench) -> Slm:
     return bench.slm
 
 
-def refuse_existing(file: Path | None, *, overwrite: bool) -> None:
-    """Refuse to write over a file that nobody allowed to be replaced.
-
-    Raises
-    ------
-    FileError
-        When it exists.
-    """
-    if file is not None and file.exists() and not overwrite:
-        raise FileError(file, "exists already.", "Choose another name, or overwrite with --force.")
-
-
 def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) -> Path:
     """Return the file to write in the end, by default one with a date, sure now that it can be written."""
     if out is None:
@@ -245,8 +236,6 @@ class SpotCamera:
 
     Parameters
     ----------
-    io : DisplayBench
-    display : Display
     before_frame : callable, optional
         Called before every photograph; raises to end the work.
     on_look : callable, optional
@@ -261,8 +250,8 @@ class SpotCamera:
         io: DisplayBench,
         display: Display,
         *,
-        before_frame: Callable[[], object] | None = None,
-        on_look: Callable[[SpotLook], object] | None = None,
+        before_frame: Callable[[], object] = lambda: None,
+        on_look: Callable[[SpotLook], object] = lambda _: None,
     ) -> None:
         self.io = io
         self.display = display
@@ -285,10 +274,10 @@ class SpotCamera:
         InputError
             When the speckle is not recognised.
         """
-        self._ask()
+        self._before_frame()
         self.camera, blank_per_ms = find_camera(self.io, self.display)
         if not self._brightness_known:
-            self._ask()
+            self._before_frame()
             self.mean_per_ms = random_brightness(self.io, self.display, self.camera, blank_per_ms)
             self._brightness_known = True
 
@@ -322,8 +311,6 @@ class SpotCamera:
 
         Parameters
         ----------
-        pose : Pose
-        sections : Sections
         shifts : ndarray, (sections, hypotheses, 2)
             ``(y, x)``, mask pixels.
 
@@ -380,7 +367,7 @@ class SpotCamera:
         ``lobes`` are a spot's half widths in camera pixels.
         """
         shape = self.display.mask.shape
-        self._ask()
+        self._before_frame()
         self.io.show(slm)
         # An ideal spot's brightest pixel would reach two thirds of full scale.
         full = (1 << self.io.bench.camera.significant_bits) - 1
@@ -393,14 +380,9 @@ class SpotCamera:
         # From camera pixels to the brightness at the peak: a spot's area is one bin of the mask's spectrum.
         captured = self._captured(window, lobes)
         brightness = found / (self._spot_area() * captured * (np.sinc(y) * np.sinc(x)) ** 2)
-        if self._on_look is not None:
-            whole = all(spot.section is None for spot in spots)
-            self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
+        whole = all(spot.section is None for spot in spots)
+        self._on_look(SpotLook(frame, rows, columns, tuple(spots), brightness / ideal, whole))
         return brightness, float(np.median(around))
-
-    def _ask(self) -> None:
-        if self._before_frame is not None:
-            self._before_frame()
 
     def _spot_area(self) -> float:
         """Camera pixels in the area of a spot."""

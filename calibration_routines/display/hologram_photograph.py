@@ -100,7 +100,6 @@ class HologramCamera:
         ----------
         fields : sequence of ndarray, complex, (height, width)
             Time-multiplexed frames.
-        target : Target
         average : int
             Photographs of each frame.
         """
@@ -140,7 +139,6 @@ class HologramCamera:
         ----------
         slm : ndarray, complex, (1, height, width)
             Start, from :func:`recon.holography.compute_hologram` for this display.
-        target : Target
         options : CaptureOptions
             Rounds, and photographs averaged in each.
         progress : callable, optional
@@ -231,12 +229,10 @@ def photograph_hologram(
 
     Parameters
     ----------
-    io : DisplayBench
     fields : sequence of ndarray, complex, (height, width)
         Time-multiplexed frames; one where it is to be refined.
     display : Display
         With the mask's displacement where it is known.
-    target : Target
     options : CaptureOptions, optional
     progress : callable, optional
         ``progress(round, psnr_db)``.

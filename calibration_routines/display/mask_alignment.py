@@ -17,7 +17,6 @@ nothing moves at first: each picture holds many spots, each computed for another
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,7 @@ import numpy.typing as npt
 
 from calibration_routines.display.display_io import (
     DisplayBench,
-    SpotLook,
     approach_from_below,
-    refuse_existing,
     require_slm,
     writable,
 )
@@ -39,7 +36,6 @@ from calibration_routines.display.mask_search import (
     AlignmentSession,
     AlignmentSettings,
     Measured,
-    Progress,
     measure_sections,
     refine_pose,
     search_pose,
@@ -48,6 +44,7 @@ from calibration_routines.display.mask_stage import MaskStage, PlacementCost
 from calibration_routines.procedure import Listener, Outcome, Outlook, Procedure, Routine, home_if_needed
 from instrument.bench.bench import Bench
 from instrument.display.hologram import Alignment, bench_display, save_alignment
+from instrument.files.atomic import require_new
 from instrument.files.slm_image import load_slm_correction
 from instrument.runs.run_control import RunControl
 from recon.errors import InputError
@@ -121,14 +118,10 @@ class MaskAlignment:
 
     Parameters
     ----------
-    io : DisplayBench
     display : Display
         What is known of the display; its displacement is not used.
-    settings : AlignmentSettings
-    progress : callable, optional
-        ``progress(words, frames_taken)``; may raise to end the alignment.
-    on_look : callable, optional
-        Called with every picture of spots.
+    listener : Listener, optional
+        What is found is said to it, and every picture of spots shown; may raise to end the alignment.
     """
 
     def __init__(
@@ -136,13 +129,11 @@ class MaskAlignment:
         io: DisplayBench,
         display: Display,
         settings: AlignmentSettings | None = None,
-        *,
-        progress: Progress | None = None,
-        on_look: Callable[[SpotLook], object] | None = None,
+        listener: Listener | None = None,
     ) -> None:
         self.io = io
         self.settings = settings or AlignmentSettings()
-        self.session = AlignmentSession(io, display, self.settings, progress, on_look)
+        self.session = AlignmentSession(io, display, self.settings, listener or Listener())
         self._cost = PlacementCost(self.session.display)
         self._repeatability_db = float("nan")
         self._directions: dict[str, int] = {}
@@ -258,8 +249,9 @@ class AlignmentProcedure(Procedure):
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, a display that does not fit, files that exist or cannot be read."""
         slm = require_slm(bench)
-        for file in (self.settings.out, self.settings.out and self.settings.out.with_suffix(".png")):
-            refuse_existing(file, overwrite=self.settings.overwrite)
+        if (out := self.settings.out) is not None:
+            for file in (out, out.with_suffix(".png")):
+                require_new(file, overwrite=self.settings.overwrite)
         if self.settings.slm_calibration is not None:
             load_slm_correction(self.settings.slm_calibration)
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
@@ -279,19 +271,19 @@ class AlignmentProcedure(Procedure):
         out = writable(bench, folder, settings.out, "alignment")
         correction = load_slm_correction(settings.slm_calibration) if settings.slm_calibration else None
         display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-        io = DisplayBench(bench, bench.config.display.slm_binning, correction)
+        io = DisplayBench(
+            bench,
+            bench.config.display.slm_binning,
+            correction,
+            check=control.check,
+            on_frame=lambda frames: listener.share(frames, settings.max_frames, at_most=True),
+        )
         if settings.moves:
             home_if_needed(bench, listener)
         listener.step("aligning the mask")
-
-        def on_progress(words: str, frames: int) -> None:
-            control.check()
-            listener.said(words)
-            listener.share(frames, settings.max_frames, at_most=True)
-
-        report = MaskAlignment(io, display, settings, progress=on_progress, on_look=listener.look).run()
+        report = MaskAlignment(io, display, settings, listener).run()
         alignment = _alignment(report, bench, display.mask.shape)
-        bench.safe_state()
+        bench.stop()
         figure = out.with_suffix(".png")
         save_alignment(out, alignment, _facts(report, bench))
         from instrument.display.hologram_files import (

@@ -6,7 +6,7 @@ share (bench, spots, how many frames are left, what was said) is the alignment's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.display.display_io import DisplayBench, SpotCamera, SpotLook
-from calibration_routines.procedure import Checked, Size
+from calibration_routines.display.display_io import DisplayBench, SpotCamera
+from calibration_routines.procedure import Checked, Listener, Size
 from instrument.files.errors import BenchError
 from recon.base.declare import RARE, option
 from recon.holography import Display
@@ -24,7 +24,6 @@ from recon.holography.sections import Sections, SectionShifts, SmoothField, fit_
 from recon.holography.sections import response as spot_response
 from recon.holography.spots import PoseProbe, depth_um
 
-Progress = Callable[[str, int], object]
 ALIGNMENT_FILE = "alignment.json"
 """Where the command line writes it."""
 
@@ -102,14 +101,10 @@ class AlignmentSession:
 
     Parameters
     ----------
-    io : DisplayBench
     display : Display
         What is known of the display; its displacement is not used.
-    settings : AlignmentSettings
-    progress : callable, optional
-        ``progress(words, frames_taken)``.
-    on_look : callable, optional
-        Called with every picture of spots.
+    listener : Listener
+        What is found is said to it, and every picture of spots shown.
     """
 
     def __init__(
@@ -117,17 +112,16 @@ class AlignmentSession:
         io: DisplayBench,
         display: Display,
         settings: AlignmentSettings,
-        progress: Progress | None = None,
-        on_look: Callable[[SpotLook], object] | None = None,
+        listener: Listener,
     ) -> None:
         self.io = io
         self.display = replace(display, displacement=None)
         self.settings = settings
-        self.spots = SpotCamera(io, self.display, before_frame=self._enough, on_look=on_look)
+        self.spots = SpotCamera(io, self.display, before_frame=self._enough, on_look=listener.look)
         self.probe = PoseProbe(self.spots.maker)
         self.log: list[str] = []
         self.efficiencies: list[tuple[int, float]] = []
-        self._progress = progress
+        self.listener = listener
 
     @property
     def frames_left(self) -> int:
@@ -149,14 +143,9 @@ class AlignmentSession:
             )
 
     def say(self, words: str) -> None:
-        """Keep words for the record, and tell them."""
+        """Say words, and keep them for the record."""
         self.log.append(words)
-        self.tell(words)
-
-    def tell(self, words: str) -> None:
-        """Tell what is going on."""
-        if self._progress is not None:
-            self._progress(words, self.io.frames)
+        self.listener.said(words)
 
     def _enough(self) -> None:
         if self.frames_left <= 0:
@@ -205,7 +194,7 @@ def refine_pose(
         efficiency = float(brightness[:, -1].mean()) / session.spots.ideal(len(NAMES) * 2 + 1)
         pose, error = pose.plus(step.change), step.error
         session.efficiencies.append((session.io.frames, efficiency))
-        session.tell(f"refinement, efficiency {efficiency:.2f}")
+        session.listener.said(f"refinement, efficiency {efficiency:.2f}")
     session.check(efficiency, floor=floor)
     return Measured(pose, error, efficiency)
 
@@ -232,7 +221,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
             amplitudes.append(amplitude)
             tried.append(shifts)
             noises.append(noise)
-            session.tell("sections")
+            session.listener.said("sections")
         found = fit_shifts(
             np.array(amplitudes), np.array(tried), float(np.mean(noises)), falling, limit=1.5 * k
         )
@@ -297,7 +286,7 @@ def _shifts(session: AlignmentSession) -> list[Pose]:
     for first in range(0, len(order), settings.spots):
         chosen = order[first : first + settings.spots]
         brightness[chosen], _ = session.spots.measure([hypotheses[n] for n in chosen], shifts_only=True)
-        session.tell("search for the shift")
+        session.listener.said("search for the shift")
     score = _smooth(brightness.reshape(len(depths), 2 * steps + 1, 2 * steps + 1)).ravel()
     ranked = np.argsort(score)[::-1]
     beyond = score[ranked[min(SHORT_LIST, len(ranked) - 1)]]
@@ -311,7 +300,7 @@ def _shifts(session: AlignmentSession) -> list[Pose]:
 def _best(session: AlignmentSession, poses: Sequence[Pose], count: int, words: str) -> list[Pose]:
     """Measure poses twice with other places for the spots and return the brightest ones."""
     total = sum(session.spots.measure(poses)[0] for _ in range(2))
-    session.tell(words)
+    session.listener.said(words)
     order = np.argsort(total)[::-1]
     return [poses[n] for n in order[:count]]
 

@@ -29,12 +29,7 @@ DRAWS = 6
 
 
 class PlacementCost:
-    """Computes holograms of a busy sample picture for places of the mask, and looks at them.
-
-    Parameters
-    ----------
-    display : Display
-    """
+    """Computes holograms of a busy sample picture for places of the mask, and looks at them."""
 
     def __init__(self, display: Display) -> None:
         self.display = display
@@ -73,7 +68,6 @@ class PlacementCost:
 
         Parameters
         ----------
-        pose : Pose
         deep_error : ndarray, (3,)
             Uncertainty of depth, pitch and yaw.
         rest : ndarray, (rows, columns, 2)
@@ -120,7 +114,6 @@ class MaskStage:
 
     Parameters
     ----------
-    session : AlignmentSession
     stage : Stage
         Homed.
     """

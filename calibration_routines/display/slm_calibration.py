@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,13 @@ from calibration_routines.display.display_io import (
     DisplayBench,
     SpotCamera,
     bring_mask,
-    refuse_existing,
     require_slm,
     writable,
 )
 from calibration_routines.procedure import Checked, Listener, Outcome, Outlook, Procedure, Routine
 from instrument.bench.bench import Bench
 from instrument.display.hologram import bench_display, load_alignment
+from instrument.files.atomic import require_new
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import SlmCorrection
 from instrument.runs.run_control import RunControl
@@ -30,7 +29,6 @@ from recon.holography.pose import Pose
 from recon.holography.slm_response import MODES, flatness_jacobian, mode, phases_from_frames
 
 Array = npt.NDArray[Any]
-Progress = Callable[[str, int], object]
 SLM_FILE = "slm-calibration.json"
 """Where the command line writes it."""
 _FLATNESS_FRAMES = 22
@@ -60,9 +58,7 @@ class SlmCalibration:
     frames: int
 
 
-def measure_look_up_table(
-    io: DisplayBench, *, n_levels: int = 33, seed: int = 0, progress: Progress | None = None
-) -> SlmCalibration:
+def measure_look_up_table(io: DisplayBench, *, n_levels: int = 33, seed: int = 0) -> SlmCalibration:
     """Let half of the SLM's pixels interfere with the other half at one level after the other.
 
     Needs no alignment and no model: see :func:`recon.holography.slm_response.phases_from_frames`.
@@ -83,8 +79,6 @@ def measure_look_up_table(
         picture = io.photograph(exposure_ms)
         # Every fourth pixel has more than enough light.
         frames.append(picture[::2, ::2])
-        if progress is not None:
-            progress(f"level {level}", len(frames))
     phases = phases_from_frames(np.array(frames))
     from scipy.interpolate import PchipInterpolator
 
@@ -100,14 +94,11 @@ def measure_flatness(
     *,
     rest: Array | None = None,
     pictures: int = 10,
-    progress: Progress | None = None,
 ) -> SlmCalibration:
     """Find the SLM's smooth phase error by spots that take off more and less of it, a pair a mode.
 
     Parameters
     ----------
-    io : DisplayBench
-    display : Display
     pose : Pose
         Of the mask, from an alignment; the stage must be where that left it.
     table : SlmCalibration
@@ -137,8 +128,6 @@ def measure_flatness(
             phases = [np.tensordot(c, modes, 1) for c in (*trials, found)]
             brightness, _ = eye.measure_with_phases(pose, phases)
             total += np.sqrt(np.maximum(brightness, 0))
-            if progress is not None:
-                progress("flatness", io.frames)
         if total[-1] ** 2 / count**2 < 0.03 * eye.ideal(len(total)):
             raise BenchError("Flatness cannot be measured: the spots are too weak. Align the mask first.")
         plus, minus = total[0:-1:2], total[1:-1:2]
@@ -195,7 +184,8 @@ class SlmProcedure(Checked, Procedure):
     def outlook(self, bench: Bench, folder: Path | None = None) -> Outlook:
         """Refuse a bench without SLM, an alignment that cannot be read, a file that exists."""
         require_slm(bench)
-        refuse_existing(self.out, overwrite=self.overwrite)
+        if self.out is not None:
+            require_new(self.out, overwrite=self.overwrite)
         if self.alignment is not None:
             load_alignment(self.alignment)
         return Outlook((f"{self.levels} grey levels, {self.frames} frames at most",))
@@ -204,20 +194,20 @@ class SlmProcedure(Checked, Procedure):
         """Measure, and save what ``align mask`` and ``show`` take."""
         slm, out = require_slm(bench), writable(bench, folder, self.out, "slm calibration")
         place = load_alignment(self.alignment) if self.alignment is not None else None
-        io = DisplayBench(bench, bench.config.display.slm_binning)
-
-        def on_frame(_words: str, _n: int) -> None:
-            control.check()
-            listener.share(io.frames, self.frames)
-
+        io = DisplayBench(
+            bench,
+            bench.config.display.slm_binning,
+            check=control.check,
+            on_frame=lambda frames: listener.share(frames, self.frames),
+        )
         listener.step("measuring the look-up table")
-        found = measure_look_up_table(io, n_levels=self.levels, progress=on_frame)
+        found = measure_look_up_table(io, n_levels=self.levels)
         if place is not None:
             listener.step("measuring flatness")
             bring_mask(bench, place.stage_position)
             display = bench_display(bench.config, (slm.shape, slm.pixel_pitch_um))
-            found = measure_flatness(io, display, place.pose, found, rest=place.rest, progress=on_frame)
-        bench.safe_state()
+            found = measure_flatness(io, display, place.pose, found, rest=place.rest)
+        bench.stop()
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds), "frames": found.frames}
         found.correction.save(out, facts)
         return Outcome(

@@ -37,7 +37,7 @@ from calibration_routines.procedure import (
     outlook_of,
 )
 from calibration_routines.psf.analysis import DarkModel, dark_model, drift_of, light_of
-from calibration_routines.psf.sampling import Position
+from calibration_routines.psf.sampling import Position, source_limits
 from calibration_routines.psf.stage_fit import Drift
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import PSF, REFERENCE, check_sweep, expose_sweep, sweep_plan
@@ -186,12 +186,9 @@ def _reach(bench: Bench) -> tuple[float, tuple[float, float]]:
     """Return how far the source goes to both sides along x and y, and its nearest and farthest z."""
     if bench.stage is None:
         raise BenchError(f"{bench.config.label} has no [stage]: the angular response needs one.")
-    limits, offset = bench.stage.limits, bench.config.source.offset_um
-    reach = []
-    for k, axis in enumerate(("x_um", "y_um")):
-        low, high = limits.get(axis, (0.0, 0.0))
-        reach.append(min(high + offset[k], -(low + offset[k])))
-    low, high = (end + offset[2] for end in limits.get("z_um", (-offset[2], -offset[2])))
+    limits = source_limits(bench)
+    reach = [min(high, -low) for low, high in (limits.get(axis, (0.0, 0.0)) for axis in ("x_um", "y_um"))]
+    low, high = limits.get("z_um", (0.0, 0.0))
     return min(reach), (low, high)
 
 

@@ -27,8 +27,9 @@ from calibration_routines.procedure import (
 from calibration_routines.psf.analysis import binned
 from calibration_routines.psf.exposure import expose_scene
 from instrument.bench.bench import Bench
+from instrument.files.atomic import require_new
 from instrument.files.calibration_file import save_calibration
-from instrument.files.errors import BenchError, FileError, OperatorNeededError
+from instrument.files.errors import BenchError, OperatorNeededError
 from instrument.runs.run_control import RunControl
 from instrument.runs.writer import dated_name, free_name
 from recon.base.declare import RARE, option
@@ -137,8 +138,8 @@ class BeadSlides(Checked):
 
     def refuse_existing(self) -> None:
         """Refuse to write over a calibration that nobody allowed to be replaced."""
-        if self.out is not None and self.out.exists() and not self.overwrite:
-            raise FileError(self.out, "exists already.", "Choose another name, or replace it with --force.")
+        if self.out is not None:
+            require_new(self.out, overwrite=self.overwrite)
 
     def record(self) -> dict[str, Any]:
         """Return what is kept of it with a calibration."""
@@ -240,7 +241,6 @@ def calibrate_beads(
     ----------
     images : ndarray, float32, (n_images, height, width)
         Dark frame subtracted.
-    slides : BeadSlides
     geometry : Geometry
         Of the images' pixels. ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the PSFs;
         ``aperture_mm`` gives the window where none is named.
@@ -254,7 +254,7 @@ def calibrate_beads(
     """
     pitch_um, distance_mm = needed_geometry(geometry)
     window = window_for(slides, geometry, (images.shape[1], images.shape[2]))
-    result = calibrate_from_beads(images, window, slides.solver, progress=progress)
+    result = calibrate_from_beads(images, window, slides.solver, on_progress=progress)
     object_um = pitch_um * slides.z_um / (1e3 * distance_mm)
     places = [(-column * object_um, -row * object_um, slides.z_um) for row, column in result.points]
     record = {
@@ -309,11 +309,6 @@ def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -
     return min(height, shape[0]), min(width, shape[1])
 
 
-def bench_geometry(bench: Bench, slides: BeadSlides) -> Geometry:
-    """Return the geometry of the slides' binned pixels."""
-    return binned(bench.geometry, slides.binning)
-
-
 def window_of(geometry: Geometry, z_um: float, deflection_deg: float = 1.0) -> tuple[int, int]:
     """Return the pixels that hold a PSF: the aperture's shadow at a depth, and what is bent beyond it.
 
@@ -322,19 +317,17 @@ def window_of(geometry: Geometry, z_um: float, deflection_deg: float = 1.0) -> t
     BenchError
         When the aperture, the distance d or the pitch are not known.
     """
-    if None in (geometry.aperture_mm, geometry.diffuser_distance_mm, geometry.pixel_pitch_um):
+    aperture_mm, distance_mm = geometry.aperture_mm, geometry.diffuser_distance_mm
+    pitch_um = geometry.pixel_pitch_um
+    if aperture_mm is None or distance_mm is None or pitch_um is None:
         raise BenchError(
             "How large the pattern is follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
             "give them in [geometry] of bench.toml, or the window with --window."
         )
-    assert geometry.aperture_mm is not None
-    assert geometry.diffuser_distance_mm is not None
-    assert geometry.pixel_pitch_um is not None
-    distance_um = 1e3 * geometry.diffuser_distance_mm
-    bent_um = 2 * distance_um * np.tan(np.deg2rad(deflection_deg))
+    bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(deflection_deg))
     height, width = (
-        int((1e3 * side * (1 + distance_um / z_um) + bent_um) / geometry.pixel_pitch_um) // 2 * 2 + 1
-        for side in geometry.aperture_mm
+        int((1e3 * side * (1 + 1e3 * distance_mm / z_um) + bent_um) / pitch_um) // 2 * 2 + 1
+        for side in aperture_mm
     )
     return height, width
 
@@ -369,7 +362,7 @@ class BeadProcedure(Procedure):
         """Refuse what cannot be solved because the optics are not known, or saved."""
         self.slides.refuse_existing()
         slides = self.slides
-        geometry = bench_geometry(bench, slides)
+        geometry = binned(bench.geometry, slides.binning)
         frame = bench.camera.frame_shape[0] // slides.binning, bench.camera.frame_shape[1] // slides.binning
         frames = slides.images * (slides.average + 4)
         return Outlook(
@@ -382,7 +375,7 @@ class BeadProcedure(Procedure):
 
     def perform(self, bench: Bench, folder: Path | None, control: RunControl, listener: Listener) -> Outcome:
         """Photograph, solve, and save the calibration."""
-        geometry = bench_geometry(bench, self.slides)
+        geometry = binned(bench.geometry, self.slides.binning)
         facts = {"bench": bench.label, "simulated": bool(bench.simulated_kinds)}
         listener.step("photographing bead slides")
         taken = photograph_slides(bench, self.slides, folder, control, listener)

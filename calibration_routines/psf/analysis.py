@@ -70,7 +70,6 @@ class DarkModel:
         One or two different exposures.
     frames : sequence of ndarray
         For each exposure its dark frames, (n_frames, height, width) or (n_frames, height, width, 3).
-    full_scale : int
     """
 
     def __init__(self, exposures_ms: Sequence[float], frames: Sequence[Counts], full_scale: int) -> None:
@@ -127,7 +126,6 @@ def analyse_sweep(
     ----------
     planes : iterable of PlaneFrames
         Read one after the other, so that a lazily loaded sweep needs the memory of one plane.
-    dark : DarkModel
     geometry : Geometry
         Its ``diffuser_distance_mm``, where known, is held against the support's scaling and the shifts.
     dct_order : int

@@ -287,7 +287,6 @@ def expose_light(
 
     Parameters
     ----------
-    bench : Bench
     light_on : callable
         Lights what is to be exposed.
     target : float

@@ -12,9 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from instrument.bench.bench import Bench
 from instrument.files.errors import BenchError, SettingsError
+from recon.analysis.resolution import SPECTRUM_LEVEL, axial_spacing_per_um, lateral_spacing_um
 from recon.optics.fall_off import FallOff
 from recon.types import Geometry
 
@@ -22,16 +24,11 @@ Position = tuple[float, float, float]
 """Of the source: ``(x, y, z)`` from the diffuser's centre, micrometres."""
 MOST_PLANES = 256
 """More planes than these are a mistake, or must be asked for."""
-BANDWIDTH_LEVEL = 0.01
-"""Part of the response's mean below which its frequencies no longer count. With it the microscope's 13
-degrees give 0.41 mm at 1.7 mm; the dissertation says 0.4 mm, and not at which level or depth."""
 NO_FALL_OFF_STEP_DEG = 15.0
 """Spacing where the sensor's response is not known: the PSF itself keeps its shape this far (Kuo 2020, Fig.
 5.1)."""
 FEATURE_PX = 2.0
 """How far the edge of the pattern may move from plane to plane: the PSF's smallest features (Sec. 4.3)."""
-_EXTENT = 20.0  # in tangents: the response is taken to be zero beyond
-_SAMPLES = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +39,16 @@ class Sampling:
     reason: str
 
 
-def lateral_spacing(
-    response: FallOff | None, z_um: float, *, along: str = "x", level: float = BANDWIDTH_LEVEL
-) -> Sampling:
+def lateral_spacing(response: FallOff | None, z_um: float, *, along: str = "x") -> Sampling:
     """Return the largest spacing of calibration points at a depth, micrometres.
 
-    Half a period of the highest frequency at which the spectrum of ``f(atan(x / z))`` is above ``level`` of
-    its value at zero (Kuo 2020, Eqs. 5.8 and 5.9).
+    By Nyquist of the response (:func:`~recon.analysis.resolution.lateral_spacing_um`).
 
     Parameters
     ----------
     response : callable, optional
         The sensor's angular response (:mod:`recon.optics.fall_off`); None: not known, or none.
-    z_um : float
     along : {"x", "y"}
-    level : float
     """
     if response is None:
         spacing_um = float(np.tan(np.deg2rad(NO_FALL_OFF_STEP_DEG)) * z_um)
@@ -66,30 +58,20 @@ def lateral_spacing(
             "degrees, over which a PSF keeps its shape (Kuo 2020, Fig. 5.1); no angular response of the "
             "sensor is known",
         )
-    bandwidth = _bandwidth(response, along, level)
-    spacing_um = z_um / (2 * bandwidth)
+
+    def along_axis(angles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        tangents, zero = np.tan(angles), np.zeros_like(angles)
+        return response(zero, tangents) if along == "x" else response(tangents, zero)
+
+    spacing_um = lateral_spacing_um(along_axis, z_um)
+    if not np.isfinite(spacing_um):
+        raise BenchError("The sensor's angular response is the same at all angles: it asks for no spacing.")
     return Sampling(
         spacing_um,
         f"{spacing_um / 1e3:.3g} mm along {along} at z = {z_um / 1e3:.4g} mm: the sensor's response "
-        f"f(atan({along}/z)) has frequencies up to {1e3 * bandwidth / z_um:.3g} per mm above {level:.0%} of "
-        "its mean, and is sampled at twice that (Kuo 2020, Eqs. 5.8 and 5.9)",
+        f"f(atan({along}/z)) has frequencies up to {500 / spacing_um:.3g} per mm above "
+        f"{SPECTRUM_LEVEL:.0%} of its mean, and is sampled at twice that (Kuo 2020, Eqs. 5.8 and 5.9)",
     )
-
-
-def _bandwidth(response: FallOff, along: str, level: float) -> float:
-    """Highest frequency of the response as a function of the tangent, periods per unit."""
-    tangents = np.linspace(-_EXTENT, _EXTENT, _SAMPLES, endpoint=False)
-    zero = np.zeros_like(tangents)
-    values = response(zero, tangents) if along == "x" else response(tangents, zero)
-    # A response that does not reach zero has a constant part, which any spacing samples.
-    values = np.asarray(values, np.float64) - float(np.min(values))
-    spectrum = np.abs(np.fft.rfft(values))
-    if not spectrum[0] > 0:
-        raise BenchError("The sensor's angular response is the same at all angles: it asks for no spacing.")
-    above = np.flatnonzero(spectrum > level * spectrum[0])
-    step = 1 / (2 * _EXTENT)
-    # At least one frequency: the response changes once over the field.
-    return float(max(int(above[-1]), 1) * step)
 
 
 def axial_planes(
@@ -104,8 +86,6 @@ def axial_planes(
 
     Parameters
     ----------
-    z_min_um, z_max_um : float
-    geometry : Geometry
     lenslet_um : float, optional
         Diameter p of a microlens diffuser's lenslets: then ``1/z1 - 1/z2 <= 4 wavelength / p^2`` (Kuo 2020,
         Eq. 5.10). Else the edge of the pattern moves by two pixels at most (Eq. 4.7).
@@ -123,7 +103,7 @@ def axial_planes(
             f"{z_min_um / 1e3:g} and {z_max_um / 1e3:g} mm."
         )
     if lenslet_um is None:
-        number = max(2, planes_needed(z_min_um, z_max_um, geometry, FEATURE_PX))
+        number = max(2, _planes_by_edge(z_min_um, z_max_um, geometry))
         step = (1 / z_min_um - 1 / z_max_um) / (number - 1)
         return Sampling(
             number,
@@ -141,7 +121,7 @@ def axial_planes(
             f"A lenslet is wider than the wavelength and less than a metre: {lenslet_um:g} um and "
             f"{wavelength_nm:g} nm make no sense together."
         )
-    step = 4e-3 * wavelength_nm / lenslet_um**2
+    step = axial_spacing_per_um(lenslet_um, 1e-3 * wavelength_nm)
     number = max(2, 1 + int(np.ceil((1 / z_min_um - 1 / z_max_um) / step - 1e-9)))
     return Sampling(
         number,
@@ -295,41 +275,37 @@ def _reach(bench: Bench, centre_um: tuple[float, float]) -> tuple[float, float]:
     """How far the source can go from the centre to both sides along y and x."""
     if bench.stage is None:
         raise BenchError(f"{bench.config.label} has no [stage]: a grid of points needs one.")
-    limits = bench.stage.limits
-    reach = []
-    for axis, centre, offset in (
-        ("y_um", centre_um[0], bench.config.source.offset_um[1]),
-        ("x_um", centre_um[1], bench.config.source.offset_um[0]),
-    ):
-        low, high = limits.get(axis, (0.0, 0.0))
-        reach.append(max(0.0, _REACH_MARGIN * min(high + offset - centre, centre - low - offset)))
+    limits, reach = source_limits(bench), []
+    for axis, centre in zip(("y_um", "x_um"), centre_um, strict=True):
+        low, high = limits.get(axis, (centre, centre))
+        reach.append(max(0.0, _REACH_MARGIN * min(high - centre, centre - low)))
     return reach[0], reach[1]
 
 
-def planes_needed(z_min_um: float, z_max_um: float, geometry: Geometry, feature_px: float = 2.0) -> int:
-    """Return how many planes leave no depth between them unsampled.
+def _planes_by_edge(z_min_um: float, z_max_um: float, geometry: Geometry) -> int:
+    """Return how many planes leave no depth between them unsampled; BenchError where optics are not known.
 
     From plane to plane the edge of the aperture's shadow moves on the sensor by ``w / 2 * d * (1/z1 - 1/z2)``
     (from the scaling ``1 + d/z``), which may be one feature of the PSF at most: the constant of Kuo 2020,
     Eq. 4.7. The PSF's smallest features are about two pixels (Sec. 4.3).
-
-    Raises
-    ------
-    BenchError
-        When the geometry lacks the aperture, the distance d or the pixel pitch.
     """
-    if (
-        geometry.aperture_mm is None
-        or geometry.diffuser_distance_mm is None
-        or geometry.pixel_pitch_um is None
-    ):
+    aperture_mm, d_mm, pitch_um = geometry.aperture_mm, geometry.diffuser_distance_mm, geometry.pixel_pitch_um
+    if aperture_mm is None or d_mm is None or pitch_um is None:
         raise BenchError(
             "How many planes are needed follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
             "give them in [geometry] of bench.toml, or give the number of planes."
         )
-    edge_um2 = 1e6 * max(geometry.aperture_mm) / 2 * geometry.diffuser_distance_mm
-    travel_px = edge_um2 * (1 / z_min_um - 1 / z_max_um) / geometry.pixel_pitch_um
-    return 1 + int(np.ceil(travel_px / feature_px - 1e-9))
+    travel_px = 1e6 * max(aperture_mm) / 2 * d_mm * (1 / z_min_um - 1 / z_max_um) / pitch_um
+    return 1 + int(np.ceil(travel_px / FEATURE_PX - 1e-9))
+
+
+def source_limits(bench: Bench) -> dict[str, tuple[float, float]]:
+    """Return how far the stage takes the source along each of its axes, micrometres; empty: no stage."""
+    if bench.stage is None:
+        return {}
+    offsets = dict(zip(("x_um", "y_um", "z_um"), bench.config.source.offset_um, strict=True))
+    limits = {name: ends for name, ends in bench.stage.limits.items() if name in offsets}
+    return {name: (low + offsets[name], high + offsets[name]) for name, (low, high) in limits.items()}
 
 
 def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:
@@ -337,18 +313,14 @@ def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None
 
     Parameters
     ----------
-    bench : Bench
     places : mapping
         Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
     """
-    if bench.stage is None:
-        return  # what needs one says so
-    problems = []
+    limits, problems = source_limits(bench), []  # no stage, no limits: what needs one says so
     for name, (axis, place_um) in places.items():
-        limits = bench.stage.limits.get(f"{'xyz'[axis]}_um")
-        if limits is None:
+        if f"{'xyz'[axis]}_um" not in limits:
             continue
-        low_mm, high_mm = ((end + bench.config.source.offset_um[axis]) / 1e3 for end in limits)
+        low_mm, high_mm = (end / 1e3 for end in limits[f"{'xyz'[axis]}_um"])
         if not low_mm <= place_um / 1e3 <= high_mm:
             words = (
                 f"{'xyz'[axis]} = {place_um / 1e3:g} mm is outside the stage's limits, {low_mm:g} to "
@@ -365,11 +337,11 @@ def reachable_depths_um(bench: Bench) -> tuple[float, float]:
     Where the bench has no stage, both are one hundred times the diffuser's distance from the sensor (or 100
     mm), which a photographic camera may call far.
     """
-    if bench.stage is None or "z_um" not in bench.stage.limits:
+    limits = source_limits(bench)
+    if "z_um" not in limits:
         distance_mm = bench.geometry.diffuser_distance_mm or 1.0
         return 1e5 * distance_mm, 1e5 * distance_mm
-    offset_um = bench.config.source.offset_um[2]
-    low, high = (end + offset_um for end in bench.stage.limits["z_um"])
+    low, high = limits["z_um"]
     far_um = _rounded_down(high)
     return max(_rounded_down(far_um / 3), math.ceil(max(low, 1.0))), far_um
 
@@ -378,31 +350,3 @@ def _rounded_down(length_um: float) -> float:
     """Return a length with two digits, not longer."""
     unit = 10.0 ** (math.floor(math.log10(length_um)) - 1)
     return unit * math.floor(length_um / unit + 1e-9)
-
-
-def planes_for(
-    bench: Bench,
-    z_min_um: float,
-    z_max_um: float,
-    *,
-    lenslet_um: float | None = None,
-    wavelength_nm: float | None = None,
-) -> tuple[int, tuple[str, ...]]:
-    """Return how many planes the bench's optics need (:func:`axial_planes`), and why.
-
-    Raises
-    ------
-    SettingsError
-        When they are more than :data:`MOST_PLANES`.
-    """
-    needed = axial_planes(
-        z_min_um, z_max_um, bench.geometry, lenslet_um=lenslet_um, wavelength_nm=wavelength_nm
-    )
-    number = int(needed.value)
-    if number > MOST_PLANES:
-        words = (
-            f"from {z_min_um / 1e3:g} to {z_max_um / 1e3:g} mm these optics need {number} planes, more than "
-            f"{MOST_PLANES}: narrow the range, or say how many planes"
-        )
-        raise SettingsError([("planes", words)])
-    return number, (f"{needed.reason}. Another number of planes can be chosen.",)

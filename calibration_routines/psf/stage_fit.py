@@ -377,7 +377,6 @@ def find_pattern(
         ``(y, x)`` of the PSF's source from the reference's.
     nominal_px_per_um : float, optional
         :func:`nominal_px_per_um`.
-    factor : int
 
     Returns
     -------

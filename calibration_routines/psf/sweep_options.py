@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration_routines.optics.angular_response import load_response
 from calibration_routines.procedure import MM, Checked
-from calibration_routines.psf.sampling import Position, grid_sweep, planes_for, require_reach
+from calibration_routines.psf.sampling import MOST_PLANES, Position, axial_planes, grid_sweep, require_reach
 from instrument.bench.bench import Bench
 from instrument.files.errors import SettingsError
 from instrument.plan import Span
@@ -218,9 +218,20 @@ class _Depths:
             return self.planes, ()
         if self.far_um == self.z_min_um:
             return 1, ()
-        return planes_for(
-            bench, self.z_min_um, self.far_um, lenslet_um=self.lenslet_um, wavelength_nm=self.wavelength_nm
+        needed = axial_planes(
+            self.z_min_um,
+            self.far_um,
+            bench.geometry,
+            lenslet_um=self.lenslet_um,
+            wavelength_nm=self.wavelength_nm,
         )
+        if needed.value > MOST_PLANES:
+            words = (
+                f"from {self.z_min_um / 1e3:g} to {self.far_um / 1e3:g} mm these optics need "
+                f"{needed.value:.0f} planes, more than {MOST_PLANES}: narrow the range, or say how many"
+            )
+            raise SettingsError([("planes", words)])
+        return int(needed.value), (f"{needed.reason}. Another number of planes can be chosen.",)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -64,7 +64,6 @@ def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
 
     Parameters
     ----------
-    sweep : Sweep
     exposures_ms : sequence of float
         One a point.
     """

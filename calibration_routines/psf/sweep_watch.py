@@ -119,7 +119,6 @@ class SweepWatch:
 
     Parameters
     ----------
-    sweep : PointSweep
     geometry : Geometry
         Of the camera's pixels.
 

@@ -6,7 +6,6 @@ import struct
 import threading
 import time
 from dataclasses import dataclass
-from typing import Protocol
 
 from drivers.apt.link import Link
 from drivers.apt.protocol import (
@@ -65,31 +64,6 @@ class DriveState:
     moving: bool
     homed: bool
     faults: list[str]
-
-
-class Drive(Protocol):
-    """What a stage needs of an axis, whatever moves it."""
-
-    def prepare(self) -> None:
-        """Switch the axis on, and its unasked status messages off."""
-
-    def state(self) -> DriveState:
-        """Ask where the axis is."""
-
-    def move(self, counts: int) -> None:
-        """Begin a move."""
-
-    def home(self) -> None:
-        """Begin to look for the reference."""
-
-    def stop(self) -> None:
-        """Stop at once; from any thread."""
-
-    def speed(self) -> float:
-        """Ask for the speed of moves, counts a second."""
-
-    def set_speed(self, counts_per_s: float) -> None:
-        """Set the speed of moves."""
 
 
 class Motor:
@@ -314,3 +288,7 @@ class InertiaChannel:
 def _bit(channel: int) -> int:
     """Return how messages of inertia drives name a channel: 1, 2, 4, 8."""
     return 1 << (channel - 1)
+
+
+Drive = Motor | InertiaChannel
+"""An axis, whatever moves it."""

@@ -6,14 +6,15 @@ import logging
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, ClassVar
 
 import numpy as np
 
-from drivers.camera import Camera, Roi, TriggerMode
+from drivers.camera import Roi, TriggerMode
+from drivers.common.camera_settings import KeptSettings
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels
 from drivers.errors import (
@@ -32,8 +33,6 @@ _START_S = 3.0
 _SNAP_BUFFERS = 4
 _MISNUMBERED = 3
 """Frames in a row whose numbers do not rise: then the device does not number its frames."""
-_ORDER = ("pixel_format", "binning", "roi", "black_level", "gain", "exposure_ms", "trigger_mode")
-"""The order in which settings are brought back: each may change the limits of those after it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,26 +85,25 @@ class _Run:
     misnumbered: int = 0
 
 
-class BufferedCamera(Camera):
+class BufferedCamera(KeptSettings):
     """A camera whose driver waits for full buffers and gives them back.
 
     The frames wait in the device's own queue: when nobody fetches them, those in the queue stay and those
     after them are lost, and counted by the device's frame numbers. Frames that arrived incomplete are not
     handed out; they count as lost.
 
-    Subclasses give the settings and the ``_...`` methods below; settings made through
-    :meth:`_remember` come back when the device is opened again.
+    Subclasses give the settings and the ``_...`` methods below.
     """
 
     drops_counted_by = "device frame numbers"
     kind: ClassVar[str] = "camera"
 
     def __init__(self) -> None:
+        super().__init__()
         self._fetching = threading.RLock()
         self._run: _Run | None = None
         self._next_id = 0
         self._lost: DeviceLostError | None = None
-        self._remembered: dict[str, Callable[[], object]] = {}
         self._incomplete = 0
 
     # What a driver gives --------------------------------------------------------------------------
@@ -180,13 +178,9 @@ class BufferedCamera(Camera):
         self.close()
         self._lost = None
         self._connect()
-        remembered = dict(self._remembered)  # bringing one back may forget another
         try:
-            for name in _ORDER:
-                if name in remembered:
-                    remembered[name]()
+            self._bring_back()
         except BaseException:
-            self._remembered = remembered
             self.close()
             raise
 
@@ -218,14 +212,6 @@ class BufferedCamera(Camera):
     def _lost_again(self) -> DeviceLostError:
         assert self._lost is not None
         return DeviceLostError(self._lost.device, self._lost.problem, self._lost.remedy)
-
-    def _remember(self, name: str, again: Callable[[], object]) -> None:
-        """Keep how a setting is made again after a reconnection; the latest counts."""
-        self._remembered[name] = again
-
-    def _forget(self, name: str) -> None:
-        """Let a setting be as after opening: another one has undone it."""
-        self._remembered.pop(name, None)
 
     # Taking images --------------------------------------------------------------------------------
     @property

@@ -70,6 +70,27 @@ def reply_line(pattern: bytes) -> Matcher:
     return lambda message: Belongs.END if compiled.fullmatch(message) else Belongs.OTHER
 
 
+def reply_between(start: bytes, end: bytes) -> Matcher:
+    """Return a matcher for a reply from a line that matches ``start`` to the next one that matches ``end``.
+
+    No older ``end`` is taken for this reply's.
+    """
+    starts, ends = re.compile(start), re.compile(end)
+    seen = False
+
+    def judge(message: bytes) -> Belongs:
+        nonlocal seen
+        if starts.fullmatch(message):
+            seen = True
+            return Belongs.PART
+        if seen and ends.fullmatch(message):
+            seen = False  # the matcher is used again
+            return Belongs.END
+        return Belongs.OTHER
+
+    return judge
+
+
 def reply_until(end: bytes, body: bytes = rb".*") -> Matcher:
     """Return a matcher for a reply of lines that match ``body``, up to one that matches ``end``."""
     ends, belongs = re.compile(end), re.compile(body)

@@ -18,7 +18,7 @@ from drivers.dlpc900 import commands
 from drivers.dlpc900.commands import Board, Command, encode
 from drivers.dlpc900.link import HidLink, found_controllers
 from drivers.errors import DeviceError, DeviceNotOpenError, DeviceTimeoutError, LimitError, StoppedError
-from drivers.slm import Slm
+from drivers.slm import Slm, read_only
 
 _log = logging.getLogger(__name__)
 _START_S = 2.0
@@ -246,11 +246,7 @@ class Dlpc900Slm(Slm):
         DeviceError
             When the controller refuses or was unplugged; what is shown is then unknown.
         """
-        board = self._require()
-        if levels.shape != board.shape or levels.dtype != np.uint8:
-            raise LimitError(
-                self.name, f"cannot show {levels.dtype} {levels.shape}.", f"It takes uint8 {board.shape}."
-            )
+        self._check(levels)
         if self.options.bit_depth == 1 and np.any((levels != 0) & (levels != _FULL)):
             raise LimitError(
                 self.name,
@@ -279,9 +275,7 @@ class Dlpc900Slm(Slm):
         self._require()
         if self._displayed is None:
             raise DeviceError(self.name, "what it shows is unknown after a failed upload.", "Display again.")
-        view = self._displayed.view()
-        view.flags.writeable = False
-        return view
+        return read_only(self._displayed)
 
     # More than the interface ----------------------------------------------------------------------
     def stop(self) -> None:

@@ -9,7 +9,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from drivers.common.framing import Belongs, Matcher
+from drivers.common.framing import Belongs, Matcher, reply_between, reply_until
 
 STATUS = b"?"
 JOG_CANCEL = b"\x85"
@@ -139,33 +139,14 @@ def report_matcher(message: bytes) -> Belongs:
     return Belongs.END if parse_report(message) is not None else Belongs.OTHER
 
 
-def line_matcher(body: bytes = rb"[\[$].*") -> Matcher:
-    """Return a matcher for a line command: lines that match ``body``, then ``ok`` or ``error:n``."""
-    belongs = re.compile(body)
-
-    def judge(message: bytes) -> Belongs:
-        if message == b"ok" or _ERROR.fullmatch(message):
-            return Belongs.END
-        return Belongs.PART if belongs.fullmatch(message) else Belongs.OTHER
-
-    return judge
+def line_matcher() -> Matcher:
+    """Return a matcher for a line command: what it prints, then ``ok`` or ``error:n``."""
+    return reply_until(rb"ok|error:\d{1,3}", rb"[\[$].*")
 
 
 def modes_matcher() -> Matcher:
     """Return a matcher for ``$G`` that no older ``ok`` can end: its own line must have come before."""
-    seen = False
-
-    def judge(message: bytes) -> Belongs:
-        nonlocal seen
-        if message.startswith(b"[GC:"):
-            seen = True
-            return Belongs.PART
-        if seen and message == b"ok":
-            seen = False  # the matcher is used again
-            return Belongs.END
-        return Belongs.OTHER
-
-    return judge
+    return reply_between(rb"\[GC:.*", rb"ok")
 
 
 def parse_error(line: bytes) -> int | None:

@@ -314,22 +314,10 @@ class IlluminateLedArray(LedArray):
         return stored
 
     def check(self, pattern: LedPattern) -> None:
-        """Refuse a pattern that the array cannot show.
-
-        Raises
-        ------
-        LimitError
-            When an index or a level is out of range.
-        """
-        geometry = self.geometry
+        """Refuse a pattern that the array cannot show, also one of colours where it has one only."""
+        super().check(pattern)
         for led, rgb in pattern.levels:
-            if not 0 <= led < len(geometry.positions_mm):
-                raise LimitError(
-                    self.name, f"has no LED {led}.", f"It has LEDs 0 to {len(geometry.positions_mm) - 1}."
-                )
-            if len(rgb) != 3 or not all(0 <= level <= 255 for level in rgb):
-                raise LimitError(self.name, f"cannot show level {rgb} on LED {led}.", "Levels are 0 to 255.")
-            if geometry.channels == 1 and len(set(rgb)) > 1:
+            if self.geometry.channels == 1 and len(set(rgb)) > 1:
                 raise LimitError(
                     self.name,
                     f"cannot show level {rgb} on LED {led}: its LEDs have one colour.",

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.common.framing import Belongs, Matcher
+from drivers.common.framing import Belongs, Matcher, reply_between
 
 TERMINATOR = b"-==-"
 _REFUSAL = re.compile(rb"ERROR ?\[(\d+)\]: *(.*)")
@@ -54,19 +54,7 @@ def reply_matcher(message: bytes) -> Belongs:
 
 def version_matcher() -> Matcher:
     """Return a matcher for the reply to ``version`` that no older reply can be taken for."""
-    seen = False
-
-    def judge(message: bytes) -> Belongs:
-        nonlocal seen
-        if _VERSION.fullmatch(message.strip()):
-            seen = True
-            return Belongs.PART
-        if seen and message.strip() == TERMINATOR:
-            seen = False  # the matcher is used again
-            return Belongs.END
-        return Belongs.OTHER
-
-    return judge
+    return reply_between(rb"\s*" + _VERSION.pattern + rb"\s*", rb"\s*" + TERMINATOR + rb"\s*")
 
 
 def payload(lines: list[bytes]) -> list[bytes]:

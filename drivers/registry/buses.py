@@ -10,7 +10,7 @@ from pathlib import Path
 from drivers.device import FoundDevice
 from drivers.errors import DeviceError
 
-_SERIAL_LINKS = Path("/dev/serial/by-id")
+_LASTING_LINKS = (Path("/dev/serial/by-id"), Path("/dev/v4l/by-id"))
 _USB_FOLDER = Path("/sys/bus/usb/devices")
 _VIDEO_FOLDER = Path("/sys/class/video4linux")
 _HUB_CLASS = 9
@@ -95,8 +95,8 @@ def serial_ports() -> tuple[FoundDevice, ...]:
 
 
 def lasting_name(port: str) -> str:
-    """Return the link to a serial port that stays the same when devices are plugged anew, or the port."""
-    for link in sorted(_SERIAL_LINKS.glob("*")):
+    """Return the link to a serial or video port that stays when devices are plugged anew, or the port."""
+    for link in sorted(link for folder in _LASTING_LINKS for link in folder.glob("*")):
         if link.resolve() == Path(port).resolve():
             return str(link)
     return port

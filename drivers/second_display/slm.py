@@ -6,26 +6,21 @@ import importlib.util
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
-from drivers.errors import DeviceError, DeviceNotOpenError, LimitError
+from drivers.errors import DeviceError, DeviceNotOpenError
 from drivers.second_display.outputs import Output, SecondDisplayOptions
-from drivers.slm import Slm
+from drivers.slm import Slm, read_only
+
+if TYPE_CHECKING:
+    from drivers.second_display.in_process import WindowHere
+    from drivers.second_display.process import WindowProcess
 
 _INSTALL = 'Install it: pip install "diffuserbench[gui]".'
-
-
-class _Window(Protocol):
-    """What ``WindowProcess`` and ``WindowHere`` have in common."""
-
-    def outputs(self) -> tuple[Output, ...]: ...
-    def open(self, options: SecondDisplayOptions) -> tuple[Output, str]: ...
-    def show(self, levels: npt.NDArray[np.uint8]) -> None: ...
-    def close(self) -> None: ...
 
 
 class SecondDisplaySlm(Slm):
@@ -42,7 +37,7 @@ class SecondDisplaySlm(Slm):
         self.options = options = SecondDisplayOptions.of(options)
         self._lock = threading.RLock()
         self._closing = threading.Event()
-        self._window: _Window | None = None
+        self._window: WindowHere | WindowProcess | None = None
         self._output: Output | None = None
         self._inhibited_by = ""
         self._lost: DeviceError | None = None
@@ -151,13 +146,8 @@ class SecondDisplaySlm(Slm):
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels: drawn, confirmed by the display server, sent and settled when this returns."""
         with self._lock:
-            output, window = self._require(), self._window
-            if levels.shape != (output.height, output.width) or levels.dtype != np.uint8:
-                raise LimitError(
-                    self.name,
-                    f"cannot show {levels.dtype} {levels.shape}.",
-                    f"It takes uint8 {(output.height, output.width)}.",
-                )
+            self._check(levels)
+            window = self._window
             assert window is not None
             shown = levels.copy()
             self._displayed = None
@@ -171,9 +161,7 @@ class SecondDisplaySlm(Slm):
         self._require()
         if self._displayed is None:
             raise DeviceError(self.name, "what it shows is unknown after a failure.", "Display again.")
-        view = self._displayed.view()
-        view.flags.writeable = False
-        return view
+        return read_only(self._displayed)
 
     def _require(self) -> Output:
         lost = self._lost
@@ -192,7 +180,7 @@ class SecondDisplaySlm(Slm):
             window.close()
 
 
-def _window(device: str, on_lost: Callable[[DeviceError], None]) -> _Window:
+def _window(device: str, on_lost: Callable[[DeviceError], None]) -> WindowHere | WindowProcess:
     """Return where a window is drawn: by the Qt program in this process, or in a process of its own."""
     if importlib.util.find_spec("PySide6") is None:
         raise DeviceError(device, "needs PySide6 (Qt), which is not installed.", _INSTALL)

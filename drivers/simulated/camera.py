@@ -74,14 +74,12 @@ class SimulatedCamera(SimulatedCameraSettings):
     # Taking images ---
     def snap(self) -> Frame:
         """Take one frame whose exposure begins now, and wait for it."""
-        self._require()
         self._require_idle("frame")
         self._abort.clear()
         return self._take()
 
     def start_sequence(self, n_buffers: int = 8) -> None:
         """Start continuous acquisition into a ring of frames."""
-        self._require()
         self._require_idle("second sequence")
         if n_buffers < 1:
             raise LimitError(self.name, f"cannot stream into {n_buffers} buffers.", "Ask for one or more.")

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from drivers.camera import Camera, Roi, TriggerMode
 from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import DeviceError, LimitError
+from drivers.errors import DeviceError
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
 
@@ -73,18 +73,7 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     def settings(self) -> Mapping[str, Setting]:
         """Read all settings."""
         self._require()
-        return {
-            "exposure_ms": self._exposure_ms,
-            "gain": self._gain,
-            "black_level": self.black_level,
-            "pixel_format": self._pixel_format,
-            "significant_bits": self.significant_bits,
-            "roi": self._roi.as_tuple(),
-            "binning": self._binning,
-            "trigger_mode": self._trigger_mode,
-            "sensor_shape": self._spec.shape,
-            "pixel_pitch_um": self._spec.pitch_um,
-        }
+        return self._common_settings()
 
     # What the sensor is ---
     @property
@@ -117,11 +106,9 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     def set_exposure_ms(self, exposure_ms: float) -> float:
         """Set the exposure; it counts whole microseconds."""
         self._require()
-        low, high = self._spec.exposure_limits_ms
-        if not low <= exposure_ms <= high:
-            raise LimitError(
-                self.name, f"cannot expose {exposure_ms:g} ms.", f"Its exposure is {low:g} to {high:g} ms."
-            )
+        self._require_within(
+            exposure_ms, self.exposure_limits_ms, f"cannot expose {exposure_ms:g} ms.", "Its exposure", " ms"
+        )
         self._exposure_ms = round(exposure_ms * 1e3) / 1e3
         return self._exposure_ms
 
@@ -138,9 +125,7 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     def set_gain(self, gain: float) -> float:
         """Set the gain factor; it has steps of 0.01."""
         self._require()
-        low, high = GAIN_LIMITS
-        if not low <= gain <= high:
-            raise LimitError(self.name, f"has no gain {gain:g}.", f"Its gain is {low:g} to {high:g}.")
+        self._require_within(gain, GAIN_LIMITS, f"has no gain {gain:g}.", "Its gain")
         self._gain = round(gain, 2)
         return self._gain
 
@@ -151,13 +136,9 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     def set_black_level(self, black_level: float) -> float:
         """Set the offset, up to an eighth of full scale."""
-        self._require()
         self._require_idle("black level")
-        highest = self._full_scale / 8
-        if not 0 <= black_level <= highest:
-            raise LimitError(
-                self.name, f"has no black level {black_level:g}.", f"It is 0 to {highest:g} counts."
-            )
+        limits = (0.0, self._full_scale / 8)
+        self._require_within(black_level, limits, f"has no black level {black_level:g}.", "It", " counts")
         self._black_fraction = black_level / self._full_scale
         return self.black_level
 
@@ -168,7 +149,6 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     def set_roi(self, roi: Roi | None) -> Roi:
         """Set the region of interest; its borders fall on multiples of 4 pixels inside the one asked for."""
-        self._require()
         self._require_idle("region of interest")
         height, width = self._spec.shape
         if roi is None:
@@ -179,12 +159,11 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
             end if end == side else end // ROI_STEP * ROI_STEP
             for end, side in ((roi.top + roi.height, height), (roi.left + roi.width, width))
         )
-        outside = roi.top < 0 or roi.left < 0 or roi.top + roi.height > height or roi.left + roi.width > width
-        if outside or bottom - top < ROI_STEP or right - left < ROI_STEP:
-            raise LimitError(
-                self.name,
-                f"cannot read the region (top, left, height, width) = {roi.as_tuple()}.",
-                f"The sensor has {height} x {width} pixels, the smallest region {ROI_STEP} x {ROI_STEP}.",
+        whole = Roi(0, 0, height, width)
+        if not whole.contains(roi) or bottom - top < ROI_STEP or right - left < ROI_STEP:
+            smallest = f"{ROI_STEP} x {ROI_STEP}"
+            raise self._no_region(
+                roi, f"The sensor has {height} x {width} pixels, the smallest region {smallest}."
             )
         self._roi = Roi(top, left, bottom - top, right - left)
         return self._roi
@@ -201,10 +180,8 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     def set_binning(self, binning: int) -> int:
         """Set the binning."""
-        self._require()
         self._require_idle("binning")
-        if binning not in self.binnings:
-            raise LimitError(self.name, f"has no binning {binning}.", f"It offers {self.binnings}.")
+        self._require_offered("binning", binning, self.binnings)
         self._binning = binning
         return binning
 
@@ -215,14 +192,8 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     def set_pixel_format(self, pixel_format: str) -> str:
         """Set the pixel format."""
-        self._require()
         self._require_idle("pixel format")
-        if pixel_format not in self.pixel_formats:
-            raise LimitError(
-                self.name,
-                f"has no pixel format {pixel_format!r}.",
-                f"It offers {', '.join(self.pixel_formats)}.",
-            )
+        self._require_offered("pixel format", pixel_format, self.pixel_formats)
         self._pixel_format = pixel_format
         return pixel_format
 
@@ -242,13 +213,12 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
 
     def set_trigger_mode(self, mode: TriggerMode) -> TriggerMode:
         """Choose what starts an exposure; nothing is wired to the hardware trigger."""
-        self._require()
         self._require_idle("trigger mode")
-        if mode not in ("free_run", "software"):
-            raise LimitError(self.name, f"has no trigger mode {mode!r}.", "It offers free_run, software.")
+        self._require_offered("trigger mode", mode, ("free_run", "software"))
         self._trigger_mode = mode
         return mode
 
     def _require_idle(self, what: str) -> None:
+        self._require()
         if self.is_streaming:
             raise DeviceError(self.name, f"streams: no new {what} now.", "Stop the sequence first.")

@@ -10,7 +10,6 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import LimitError
 from drivers.led_array import OFF, LedArray, LedPattern
 from drivers.simulated.scene_light import Lamp, SceneLight
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
@@ -94,15 +93,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     def set_pattern(self, pattern: LedPattern) -> LedPattern:
         """Show a pattern."""
         self._require()
-        for index, rgb in pattern.levels:
-            if not 0 <= index < self.options.leds:
-                raise LimitError(
-                    self.name, f"has no LED {index}.", f"It has LEDs 0 to {self.options.leds - 1}."
-                )
-            if len(rgb) != 3 or not all(0 <= level <= 255 for level in rgb):
-                raise LimitError(
-                    self.name, f"cannot show level {rgb} on LED {index}.", "Levels are 0 to 255."
-                )
+        self.check(pattern)
         self._show(pattern)
         return self._pattern
 

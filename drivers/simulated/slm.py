@@ -11,10 +11,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import LimitError
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
-from drivers.slm import Slm
+from drivers.slm import Slm, read_only
 
 Side = Annotated[int, Field(ge=1, le=8192)]
 
@@ -90,21 +89,14 @@ class SimulatedSlm(SimulatedDevice, Slm):
     def display(self, levels: npt.NDArray[np.uint8]) -> None:
         """Show grey levels and wait until the optics have settled."""
         self._require()
-        if levels.shape != self.options.shape or levels.dtype != np.uint8:
-            raise LimitError(
-                self.name,
-                f"cannot show {levels.dtype} {levels.shape}.",
-                f"It takes uint8 {self.options.shape}.",
-            )
+        self._check(levels)
         self._displayed = levels.copy()
         self.world.clock.wait(self.options.settle_ms * 1e-3, self._closing)
 
     @property
     def displayed(self) -> npt.NDArray[np.uint8]:
         """The grey levels shown now, read only."""
-        view = self._displayed.view()
-        view.flags.writeable = False
-        return view
+        return read_only(self._displayed)
 
     @property
     def phase_rad(self) -> npt.NDArray[np.float32]:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from drivers.common.camera_settings import GainScale
 from drivers.errors import DeviceError, LimitError
 from drivers.v4l2 import api
 from drivers.v4l2.device import VideoDevice
@@ -23,6 +24,11 @@ _SETTABLE = (
 )
 _MOST = 2000
 _ALL_BITS = 0xFFFFFFFF
+_AUTOMATICS = {
+    api.CID_AUTOGAIN: 0,
+    api.CID_EXPOSURE_AUTO_PRIORITY: 0,  # else the frame rate follows the exposure
+    api.CID_AUTO_WHITE_BALANCE: 0,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,12 @@ class Control:
             return value >= 0 and value & ~self.maximum == 0
         return value in self.menu if self.menu else self.minimum <= value <= self.maximum
 
+    def on_step(self, number: float) -> int:
+        """Return the value on the control's steps that is nearest to a number, inside its range."""
+        step = max(self.step, 1)
+        value = self.minimum + round((number - self.minimum) / step) * step
+        return min(max(value, self.minimum), self.maximum)
+
     @property
     def range_text(self) -> str:
         """What it takes, in words."""
@@ -96,6 +108,46 @@ class Controls:
                 control = self._control(found)
                 self.by_id[control.id] = control
                 self.by_name.setdefault(control.name, control)
+
+    def find(self, *ids: int) -> Control | None:
+        """Return the first of some controls that the device has; None when it has none of them."""
+        return next((self.by_id[i] for i in ids if i in self.by_id), None)
+
+    def named(self, name: str) -> Control:
+        """Return a control by its name; LimitError when there is none of it."""
+        try:
+            return self.by_name[name]
+        except KeyError:
+            raise LimitError(
+                self._device.name,
+                f"has no control {name!r}.",
+                f"It has {', '.join(sorted(self.by_name)) or 'none'}.",
+            ) from None
+
+    def switch_automatics_off(self) -> None:
+        """Have nothing set by the camera itself.
+
+        Raises
+        ------
+        DeviceError
+            When its exposure cannot be set by hand.
+        """
+        auto = self.find(api.CID_EXPOSURE_AUTO)
+        if auto is not None:
+            manual = [
+                mode for mode in (api.EXPOSURE_MANUAL, api.EXPOSURE_SHUTTER_PRIORITY) if mode in auto.menu
+            ]
+            if not manual:
+                raise DeviceError(
+                    self._device.name,
+                    f"its exposure cannot be set by hand: {auto.name} offers {auto.range_text}.",
+                    "Use another camera.",
+                )
+            self.set(auto, manual[0])
+        for number, off in _AUTOMATICS.items():
+            control = self.find(number)
+            if control is not None:
+                self.set(control, off)
 
     def get(self, control: Control) -> int:
         """Read a control."""
@@ -166,3 +218,27 @@ class Controls:
             menu=menu,
             flags=found.flags,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A control as what it sets: exposure in milliseconds, gain as a factor."""
+
+    controls: Controls
+    control: Control
+    scale: GainScale
+    """From the control's counts to the quantity."""
+
+    def read(self) -> float:
+        """Read it."""
+        return self.scale.factor(self.controls.get(self.control))
+
+    def limits(self, least: int | None = None) -> tuple[float, float]:
+        """Return its limits, the lower one of ``least`` counts or more."""
+        low = self.control.minimum if least is None else max(self.control.minimum, least)
+        return self.scale.factor(low), self.scale.factor(self.control.maximum)
+
+    def write(self, value: float) -> float:
+        """Set it to the nearest of its steps; returns what it is afterwards."""
+        self.controls.set(self.control, self.control.on_step(self.scale.number(value)))
+        return self.read()

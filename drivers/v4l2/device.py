@@ -14,35 +14,13 @@ from typing import Any
 import numpy as np
 
 from drivers.common.pixels import Bytes
+from drivers.device import DeviceIdentity
 from drivers.errors import DeviceError, DeviceLostError, DeviceNotOpenError
+from drivers.registry.buses import video_devices
 from drivers.registry.claim import DeviceBusyError
 from drivers.v4l2 import api
 
-_FOLDER = Path("/sys/class/video4linux")
-
-
-def usb_strings(node: str) -> dict[str, str]:
-    """Return ``manufacturer``, ``product`` and ``serial`` of a node, where it is on USB and has them."""
-    interface = (_FOLDER / Path(node).resolve().name / "device").resolve()
-    found = {}
-    for name in ("manufacturer", "product", "serial"):
-        try:
-            text = (interface.parent / name).read_text("utf-8", errors="replace").strip()
-        except OSError:
-            continue
-        if text:
-            found[name] = text
-    return found
-
-
-def lasting_path(node: str) -> str:
-    """Return the link in ``/dev/v4l/by-id`` to a node, which stays the same when cameras are plugged anew."""
-    for link in sorted(Path("/dev/v4l/by-id").glob("*")):
-        if link.resolve() == Path(node).resolve():
-            return str(link)
-    return node
-
-
+_VIRTUAL_DRIVERS = ("vivid", "vimc")
 _GONE = (errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN)
 
 
@@ -115,6 +93,23 @@ class VideoDevice:
         except BaseException:
             self.close()
             raise
+
+    def identity(self) -> DeviceIdentity:
+        """Return who the kernel says the camera is."""
+        found = self.capability()
+        driver = found.driver.decode(errors="replace")
+        node = str(Path(self.path).resolve())
+        usb = next((device for device in video_devices() if device.address == node), None)
+        version = found.version
+        return DeviceIdentity(
+            kind="camera",
+            driver="v4l2",
+            vendor=(usb and usb.vendor) or driver,
+            model=found.card.decode(errors="replace"),
+            serial_number=(usb and usb.serial_number) or found.bus_info.decode(errors="replace"),
+            firmware=f"{driver} of Linux {version >> 16}.{version >> 8 & 255}.{version & 255}",
+            simulated=driver in _VIRTUAL_DRIVERS,
+        )
 
     def close(self) -> None:
         """Close the node; closing twice does nothing."""

@@ -42,8 +42,6 @@ class Behaviour:
         Whether it must be given here, although the declaration lets it be left out.
     needed_when : callable, optional
         Called when it was left out; returns why it is needed, empty where it is not.
-    understand : callable, optional
-        Turns a text into the value in place of the declaration; BenchError with the reason where it cannot.
     require : callable, optional
         Called with a value that the declaration allows; returns why it cannot be all the same, empty where
         it can.
@@ -61,7 +59,6 @@ class Behaviour:
     must_exist: bool = False
     needed: bool = False
     needed_when: Callable[[], str] | None = None
-    understand: Callable[[str], Any] | None = None
     require: Callable[[Any], str] | None = None
     help_of: Callable[[str], str] | None = None
     offers: Callable[[], Sequence[str]] | None = None
@@ -305,7 +302,7 @@ class EntryField(OptionField):
         super().__init__(option, behaviour)
         optional = option.default is None and not behaviour.needed
         empty = default_shown(option) or ("none" if optional else "")
-        self.widget: Entry = Entry(self._understood, tip=self.tip, placeholder=empty)
+        self.widget: Entry = Entry(self._understood, self.tip, empty)
         self.whole = self.widget
         if option.kinds == (Path,):
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
@@ -318,8 +315,6 @@ class EntryField(OptionField):
                 raise BenchError(f"{self.bare_label} is needed here.")
             return self.option.default
         try:
-            if self.behaviour.understand is not None:
-                return self.behaviour.understand(text)
             value = read(self._spoken, self._parts(text))
         except InputError as error:
             raise BenchError(str(error)) from error

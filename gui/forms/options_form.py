@@ -54,7 +54,6 @@ class OptionsForm(QWidget):
         By name, what a field does besides what its declaration says.
     folded : collection of str
         Groups that are folded away.
-    parent : QWidget, optional
     """
 
     changed = Signal()

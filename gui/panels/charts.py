@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ from gui.widgets.building import button, cell, choice, fill, in_row, label, offe
 from gui.widgets.dialogues import choose_path
 from gui.widgets.plots import curve_colour, curve_pen, dots, plot_widget
 from gui.widgets.stability_view import StabilityView
-from instrument.evaluation.chart import read_chart, subject_of
+from instrument.evaluation.chart import point_of, read_chart, subject_of
 from instrument.files.errors import FileError
 from instrument.files.stability_file import read_stability
 from recon.base.declare import Imports, expression
-from recon.evaluation.scored import KINDS, Axis
+from recon.evaluation.scored import KINDS, Axis, Point, is_known, pareto
 from recon.verdict.cases import SHIPPED
 
 _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its chart.json."
@@ -78,7 +78,7 @@ class ChartsPanel(Panel):
             if left_out:
                 said += f"; {len(left_out)} settings could not be run or had no time"
             self._headings[self.chart] = (said, "\n".join([str(path), *left_out]))
-            self.chart.show_points(record["points"], record["kind"])
+            self.chart.show_points([point_of(p) for p in record["points"]], record["kind"])
             self.tabs.setCurrentWidget(self.chart)
         self._show_heading()
 
@@ -135,7 +135,6 @@ def _read(path: Path) -> dict[str, Any]:
             raise no_maps from None
 
 
-ScoredPoint = Mapping[str, Any]
 _NEAR_PX = 12.0
 _SHORT = {"seconds": "seconds", "peak_mib": "MiB", "images": "photographs"}
 """Costs as a column's heading."""
@@ -146,7 +145,7 @@ class ChartView(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self._points: Sequence[ScoredPoint] = ()
+        self._points: Sequence[Point] = ()
         self._kind = KINDS["reconstruction"]
         self.measure = choice((), "What is compared", lambda _: self._draw())
         self.cost = choice((), "What it is compared against", lambda _: self._draw())
@@ -160,18 +159,18 @@ class ChartView(QWidget):
         self.table.itemSelectionChanged.connect(self._setting_chosen)
         words = "The bold line is the front: no setting is both cheaper and better."
         self.place = label(words, "dim", selectable=True)
-        self.front: list[ScoredPoint] = []
+        self.front: list[Point] = []
         chosen = in_row(label("Compare"), self.measure, label("against"), self.cost, self.group, None)
         fill(self, chosen, (split(self.plot, self.table, sizes=[620, 330]), 1), self.place)
 
-    def show_points(self, points: Sequence[ScoredPoint], kind: str = "reconstruction") -> None:
-        """Show points of a chart of a kind (:data:`recon.evaluation.scored.KINDS`), as JSON has them."""
+    def show_points(self, points: Sequence[Point], kind: str = "reconstruction") -> None:
+        """Show points of a chart of a kind (:data:`recon.evaluation.scored.KINDS`)."""
         self._points, self._kind = points, KINDS[kind]
 
         def known(axes: Sequence[Axis]) -> list[tuple[str, str]]:
-            return [(a.words, a.key) for a in axes if any(p.get(a.key) is not None for p in points)]
+            return [(a.words, a.key) for a in axes if any(is_known(p, a.key) for p in points)]
 
-        groups = [str(g) for g in dict.fromkeys(p.get("group") or "" for p in points)]
+        groups = list(dict.fromkeys(p.group for p in points))
         self.group.setVisible(len(groups) > 1)
         offer(self.measure, known(self._kind.scores))
         offer(self.cost, known(self._kind.costs))
@@ -193,16 +192,11 @@ class ChartView(QWidget):
         return str(self.cost.currentData())
 
     # Inside --------------------------------------------------------------------------------------
-    def _known(self) -> list[ScoredPoint]:
+    def _known(self) -> list[Point]:
         """Return what can be drawn; costs stand on a logarithmic axis."""
-        group = self.group.currentData() or ""
-        return [
-            p
-            for p in self._points
-            if (p.get("group") or "") == group
-            and p.get(self.key) is not None
-            and (p.get(self.cost_key) or 0) > 0
-        ]
+        group, cost = self.group.currentData() or "", self.cost_key
+        here = [p for p in self._points if p.group == group and is_known(p, self.key) and is_known(p, cost)]
+        return [p for p in here if getattr(p, cost) > 0]
 
     def _axes(self) -> tuple[Axis, Axis]:
         """Return the cost and the score that are shown."""
@@ -216,26 +210,22 @@ class ChartView(QWidget):
             self.plot.clear()
             return
         cost, score = self._axes()
-        words, more = score.words, score.more_is_better
         known = self._known()
-        self.front = front_of(known, self.key, more_is_better=more, cost=cost.key)
-        best: dict[str, ScoredPoint] = {}
-        for point in known:
-            held = best.get(point["setting"])
-            if held is None or _better(point[self.key], held[self.key], more):
-                best[point["setting"]] = point
-        ranked = sorted(best.values(), key=lambda p: p[self.key], reverse=more)
-        on_front = {p["setting"] for p in self.front}
+        self.front = pareto(known, score, cost)
+        sign = -1.0 if score.more_is_better else 1.0
+        best: dict[str, Point] = {}
+        for point in sorted(known, key=lambda p: sign * getattr(p, score.key)):
+            best.setdefault(point.setting, point)
+        on_front = {p.setting for p in self.front}
         with QSignalBlocker(self.table):
-            self.table.setHorizontalHeaderLabels(["setting", words.split(" (")[0], _SHORT[cost.key]])
-            self.table.setRowCount(len(ranked))
-            for number, point in enumerate(ranked):
-                name = point["setting"]
+            self.table.setHorizontalHeaderLabels(["setting", score.words.split(" (")[0], _SHORT[cost.key]])
+            self.table.setRowCount(len(best))
+            for number, (name, point) in enumerate(best.items()):
+                value, spent = getattr(point, score.key), getattr(point, cost.key)
                 mark = "● " if name in on_front else ""
-                cells = (f"{mark}{name}", f"{point[self.key]:.4g}", f"{point[cost.key]:.3g}")
-                for place, text in enumerate(cells):
+                for place, text in enumerate((f"{mark}{name}", f"{value:.4g}", f"{spent:.3g}")):
                     self.table.setItem(number, place, cell(text, data=name))
-        self.plot.setLabel("left", words)
+        self.plot.setLabel("left", score.words)
         self.plot.setLabel("bottom", cost.words)
         self._draw_curves()
 
@@ -245,35 +235,38 @@ class ChartView(QWidget):
         chosen = self.table.selectedItems()
         if chosen:
             name = chosen[0].data(Qt.ItemDataRole.UserRole)
-            mine = [p for p in self._known() if p["setting"] == name]
+            mine = [p for p in self._known() if p.setting == name]
             score = self._axes()[1]
-            best = (max if score.more_is_better else min)(mine, key=lambda p: p[score.key])
+            best = (max if score.more_is_better else min)(mine, key=lambda p: getattr(p, score.key))
             self.place.setText(describe(best, self._kind.name))
 
     def _draw_curves(self) -> None:
         self.plot.clear()
         chosen = {item.data(Qt.ItemDataRole.UserRole) for item in self.table.selectedItems()}
-        known, at = self._known(), self.cost_key
-        for number, name in enumerate(dict.fromkeys(p["setting"] for p in known)):
-            mine = sorted((p for p in known if p["setting"] == name), key=lambda p: p[at])
-            x, y = np.array([(p[at], p[self.key]) for p in mine], float).T
+        known = self._known()
+        for number, name in enumerate(dict.fromkeys(p.setting for p in known)):
             bold = name in chosen
             look = dots(curve_colour(number), 8 if bold else 4)
-            self.plot.plot(x, y, pen=curve_pen(number, 3.0 if bold else 1.0), **look)
+            line = sorted(self._place(p) for p in known if p.setting == name)
+            self.plot.plot(*np.array(line).T, pen=curve_pen(number, 3.0 if bold else 1.0), **look)
         if known:
-            self.plot.getAxis("bottom").setTicks([_ticks([p[at] for p in known])])
+            self.plot.getAxis("bottom").setTicks([_ticks([self._place(p)[0] for p in known])])
         if self.front:
-            x, y = np.array(_steps([(p[at], p[self.key]) for p in self.front]), float).T
+            front = [self._place(p) for p in self.front]
             pen = pg.mkPen(colours().text, width=2.5)
-            self.plot.plot(x, y, pen=pen)
-            x, y = np.array([(p[at], p[self.key]) for p in self.front], float).T
-            self.plot.plot(x, y, pen=None, **(dots(None, 11) | {"symbolPen": pen}))
+            self.plot.plot(*np.array(_steps(front)).T, pen=pen)
+            self.plot.plot(*np.array(front).T, pen=None, **(dots(None, 11) | {"symbolPen": pen}))
+
+    def _place(self, point: Point) -> tuple[float, float]:
+        """Return cost and score of a point."""
+        return getattr(point, self.cost_key), getattr(point, self.key)
 
     def _moved(self, place: Any) -> None:
         nearest, distance = None, _NEAR_PX
         box = self.plot.getPlotItem().vb
         for point in self._known():
-            at = box.mapViewToScene(pg.Point(math.log10(point[self.cost_key]), point[self.key]))
+            spent, value = self._place(point)
+            at = box.mapViewToScene(pg.Point(math.log10(spent), value))
             away = math.hypot(at.x() - place.x(), at.y() - place.y())
             if away < distance:
                 nearest, distance = point, away
@@ -296,37 +289,15 @@ def _ticks(costs: Sequence[float]) -> list[tuple[float, str]]:
     return [(math.log10(value), f"{value:g}") for value in values]
 
 
-def describe(point: ScoredPoint, kind: str = "reconstruction") -> str:
+def describe(point: Point, kind: str = "reconstruction") -> str:
     """Return a point in words."""
-    count = point["iterations"]
-    said = [
-        str(point["setting"]),
-        f"{point['seconds']:.3g} s",
-        f"{count} iterations" if count else "one shot",
-    ]
-    if point.get("images") is not None:
-        said.append(f"{point['images']:.0f} photographs")
+    count = point.iterations
+    said = [point.setting, f"{point.seconds:.3g} s", f"{count} iterations" if count else "one shot"]
+    if is_known(point, "images"):
+        said.append(f"{point.images:.0f} photographs")
     for axis in KINDS[kind].scores:
-        if point.get(axis.key) is not None:
-            said.append(f"{axis.words} {point[axis.key]:.4g}")
-    if point.get("peak_mib") is not None:
-        said.append(f"memory {point['peak_mib']:.0f} MiB")
+        if is_known(point, axis.key):
+            said.append(f"{axis.words} {getattr(point, axis.key):.4g}")
+    if is_known(point, "peak_mib"):
+        said.append(f"memory {point.peak_mib:.0f} MiB")
     return ", ".join(said)
-
-
-def front_of(
-    points: Sequence[ScoredPoint], key: str, *, more_is_better: bool, cost: str = "seconds"
-) -> list[ScoredPoint]:
-    """Return the points that no other is both cheaper and better than, the cheapest first."""
-    sign = 1.0 if more_is_better else -1.0
-    front: list[ScoredPoint] = []
-    best = -math.inf
-    for point in sorted(points, key=lambda p: (p[cost], -sign * p[key])):
-        if sign * point[key] > best:
-            front.append(point)
-            best = sign * point[key]
-    return front
-
-
-def _better(value: float, than: float, more_is_better: bool) -> bool:
-    return value > than if more_is_better else value < than

@@ -40,11 +40,7 @@ from recon.holography.display import require_defocus
 _IMAGES = "Pictures (*.png *.tif *.tiff *.jpg *.bmp *.npy)"
 _PREVIEW_ITERATIONS = 8
 _AVERAGE = 4
-_MODES: dict[str, WeightsMode] = {
-    "all alike": "uniform",
-    "a fovea, dragged": "fovea",
-    "painted": "painted",
-}
+_MODES: dict[str, WeightsMode] = {"all alike": "uniform", "a fovea, dragged": "fovea", "painted": "painted"}
 _BY_MOUSE = ("centre", "radius")
 """Options of the fovea, which is dragged."""
 
@@ -57,11 +53,7 @@ class _PanelOptions:
         "all alike", help="Which part of the picture counts.", choices=tuple(_MODES), group="What counts"
     )
     brush: float = option(
-        0.06,
-        help="Radius of the brush, as a fraction of the field.",
-        above=0,
-        most=1,
-        group="What counts",
+        0.06, help="Radius of the brush, as a fraction of the field.", above=0, most=1, group="What counts"
     )
     correction: Path | None = option(
         None,

@@ -11,15 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QHideEvent
-from PySide6.QtWidgets import (
-    QComboBox,
-    QHBoxLayout,
-    QLabel,
-    QLineEdit,
-    QPushButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QLineEdit, QPushButton, QVBoxLayout, QWidget
 
 from gui.background import LiveFollower
 from gui.forms.options_form import FOLDED, OptionsForm
@@ -114,11 +106,7 @@ class LiveReconstructionPanel(Panel):
         self.refine_button.setToolTip("Reconstruct the newest frame with the full solver; again ends it")
         self.refine_button.clicked.connect(self.refine)
         self.budget = NumberEdit(
-            "ms",
-            _BUDGET_MS,
-            minimum=5.0,
-            maximum=5000.0,
-            tip="Time for one picture: quality gives way",
+            "ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip="Time for one picture: quality gives way"
         )
         self.budget.setFixedWidth(80)
         self.budget.submitted.connect(self._set_budget)

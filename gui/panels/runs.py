@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QFileSystemWatcher, QSignalBlocker, Qt, QUrl
 from PySide6.QtGui import QDesktopServices
@@ -34,13 +33,12 @@ from gui.widgets.building import (
     table,
     text_view,
 )
-from gui.widgets.image_view import ImageView
+from gui.widgets.image_view import ImageView, usual_levels
 from instrument.runs.inspection import RunSummary, run_paths, summary
 from instrument.runs.run import Run, RunCondition
 from recon.base.declare import Imports, expression
 
 _COLUMNS = ("run", "became", "frames", "kind", "bench")
-_LEVELS = (0.1, 99.9)
 _REST_MS = 500
 """Rest after a change in the folder before it is read."""
 
@@ -326,17 +324,13 @@ def _read_frame(run: Run, index: int) -> _Picture | str:
         image, metadata = run.frame(index), run.metadata(index)
     except Exception as error:  # noqa: BLE001 - a damaged file is named, whatever it raises
         return str(error)
-    low, high = np.percentile(image[::4, ::4], _LEVELS)
-    words = [
-        f"Frame {index} of {run.n_frames}",
-        f"{metadata.exposure_ms:.4g} ms",
-        metadata.led_pattern or "",
-    ]
+    low, high = usual_levels(image)
+    words = [f"Frame {index} of {run.n_frames}", f"{metadata.exposure_ms:.4g} ms", metadata.led_pattern or ""]
     place = ", ".join(_axis_words(axis, value) for axis, value in (metadata.stage_position or {}).items())
     return _Picture(
         image,
-        float(low),
-        float(max(high, low + 1)),
+        low,
+        high,
         (1 << metadata.significant_bits) - 1,
         ", ".join(word for word in (*words, place) if word),
     )

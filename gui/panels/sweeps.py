@@ -8,14 +8,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 from PySide6.QtGui import QImage, QPixmap
 from PySide6.QtWidgets import QWidget
 
-from calibration_routines import Photograph, SweepCalibration
+from calibration_routines.optics.photograph import Photograph
 from calibration_routines.plan_procedures import PlanProcedure
 from calibration_routines.procedure import Outcome, Outlook, Routine, routines
+from calibration_routines.psf.sweep import SweepCalibration
 from calibration_routines.psf.sweep_watch import PointTaken
 from gui.background import NewestOnly
 from gui.procedure_panel import ProcedurePanel
@@ -23,7 +23,7 @@ from gui.procedure_run import Situation
 from gui.session import BenchSession
 from gui.widgets.building import fill, label, split, tabs
 from gui.widgets.dialogues import elided
-from gui.widgets.image_view import ImageView
+from gui.widgets.image_view import ImageView, usual_levels
 from gui.widgets.sweep_views import PathPlot, Picture, PsfPictures, PsfTable
 from instrument.bench.photograph import Snapshot
 from instrument.files.errors import BenchError, FileError, SettingsError, count
@@ -32,8 +32,6 @@ from instrument.plan.model import load_plan, plan_toml
 from recon.base.declare import option
 
 Image = npt.NDArray[Any]
-_LEVELS = (0.1, 99.9)
-"""Percentiles that frames are stretched to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,8 +164,7 @@ class SweepsPanel(ProcedurePanel):
         elided(self.frame_words, ", ".join(words))
 
     def _show_image(self, image: Image, full_scale: int | None = None) -> None:
-        low, high = np.percentile(image[::4, ::4], _LEVELS)
-        self.frame.show_image(image, float(low), float(max(high, low + 1)), full_scale)
+        self.frame.show_image(image, *usual_levels(image), full_scale)
 
     def _read_plan(self) -> None:
         """Show the plan of a file that was chosen."""

@@ -68,12 +68,7 @@ class Question(QMessageBox):
 
 
 def choose_path(
-    parent: QWidget,
-    browse: Browse,
-    title: str,
-    start: str,
-    then: Callable[[Path], object],
-    filters: str = "",
+    parent: QWidget, browse: Browse, title: str, start: str, then: Callable[[Path], object], filters: str = ""
 ) -> QFileDialog:
     """Let a file or folder be chosen; ``then`` is called with it. Returns at once.
 
@@ -138,7 +133,6 @@ class TextWindow(QDialog):
     Parameters
     ----------
     title, text : str
-    parent : QWidget, optional
     """
 
     def __init__(self, title: str, text: str, parent: QWidget | None = None) -> None:

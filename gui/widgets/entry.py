@@ -48,7 +48,6 @@ class Entry(_Refusing):
     ----------
     understand : callable
         Turns the text into a value; BenchError with the reason where it cannot.
-    text : str
     tip : str
         The tool tip: what may be written, with units.
 
@@ -60,16 +59,8 @@ class Entry(_Refusing):
 
     understood = Signal()
 
-    def __init__(
-        self,
-        understand: Callable[[str], Any],
-        text: str = "",
-        *,
-        tip: str = "",
-        placeholder: str = "",
-        parent: QWidget | None = None,
-    ) -> None:
-        super().__init__(text, parent)
+    def __init__(self, understand: Callable[[str], Any], tip: str, placeholder: str) -> None:
+        super().__init__()
         self._understand = understand
         self._tip = tip
         self.setToolTip(tip)
@@ -182,7 +173,6 @@ class NumberEdit(_Refusing):
         The tool tip; the limits are added.
     empty : str
         What an empty field means, shown in it; where this is empty, a number is needed.
-    parent : QWidget, optional
     """
 
     submitted = Signal(float)

@@ -347,10 +347,7 @@ def _facts(computed: Computed) -> list[tuple[str, str]]:
     return [
         *facts,
         ("Stopped", f"{stopped}: {result.hologram.stop_reason}"),
-        (
-            "Expansion",
-            f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm",
-        ),
+        ("Expansion", f"{display.expansion}x on {columns} x {rows} pixels, {display.wavelength_nm:g} nm"),
         *(("Pattern", str(path)) for path in computed.patterns),
     ]
 

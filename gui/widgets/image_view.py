@@ -10,15 +10,22 @@ import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QObject, QPointF, QRectF, Qt, Signal
 from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from gui.theme import colours, grey_indices, indices_of, spares_hues, table
+from gui.widgets.building import fill
 from instrument.live.frame_view import SATURATED, fill_indices, index_table
 
 Image = npt.NDArray[Any]
 
 _PAN = 0.05
 """An arrow key moves what is shown by this part of it, where arrows mean nothing else."""
+
+
+def usual_levels(image: Image) -> tuple[float, float]:
+    """Return the values that an image is shown with: nearly the least and largest of every fourth pixel."""
+    low, high = np.percentile(image[::4, ::4], (0.1, 99.9))
+    return float(low), float(max(high, low + 1))
 
 
 class ImageView(QWidget):
@@ -47,7 +54,6 @@ class ImageView(QWidget):
     ----------
     colour_map : str, optional
         A name of ``colour_maps.NAMES``; None means the theme's.
-    parent : QWidget, optional
     """
 
     hovered = Signal(str)
@@ -75,9 +81,7 @@ class ImageView(QWidget):
         """What the image is shown with: low, high, full scale."""
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.graphics)
+        fill(self, self.graphics)
         scene = self.graphics.scene()
         scene.sigMouseMoved.connect(self._moved)
         scene.sigMouseClicked.connect(self._mouse_clicked)
@@ -242,7 +246,6 @@ class StretchedImage(ImageView):
     ----------
     keep_aspect : bool
         Whether voxels are square on the screen; without, the image fills its place.
-    parent : QWidget, optional
     """
 
     def __init__(self, *, keep_aspect: bool = True, parent: QWidget | None = None) -> None:

@@ -83,9 +83,9 @@ class _View:
 
     def __init__(self, across: str, down: str) -> None:
         self.axes = across, down
-        labels = [_label(name) for name in self.axes]
-        self.plot: Any = plot_widget(labels[0][0], labels[1][0], x_unit=labels[0][1], y_unit=labels[1][1])
-        self._scales = [_scale(name) for name in self.axes]
+        (x, x_unit, x_scale), (y, y_unit, y_scale) = (_shown(name) for name in self.axes)
+        self.plot: Any = plot_widget(x, y, x_unit=x_unit, y_unit=y_unit)
+        self._scales = (x_scale, y_scale)
         self._line: Any = self.plot.plot([], [])
         self._first: Any = self.plot.plot([], [])
         self._now: Any = self.plot.plot([], [])
@@ -131,13 +131,10 @@ def _pairs(places: Sequence[Place]) -> list[tuple[str, str]]:
     return [(moving[0], (moving[1:] or other or moving)[0])]
 
 
-def _label(name: str) -> tuple[str, str]:
+def _shown(name: str) -> tuple[str, str, float]:
+    """Return the name of ``x_um`` without its unit, the unit that it is shown in, and the factor to that."""
     axis, _, unit = name.rpartition("_")
-    return axis, _SHOWN.get(unit, (unit, 1.0))[0]
-
-
-def _scale(name: str) -> float:
-    return _SHOWN.get(name.rpartition("_")[2], ("", 1.0))[1]
+    return (axis, *_SHOWN.get(unit, (unit, 1.0)))
 
 
 _COLUMNS = (

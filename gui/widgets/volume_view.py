@@ -46,7 +46,6 @@ class VolumeView(QWidget):
     Parameters
     ----------
     jobs : JobRunner
-    parent : QWidget, optional
 
     Signals
     -------
@@ -135,7 +134,9 @@ class VolumeView(QWidget):
         grid.setRowStretch(3, 2)
         grid.setColumnStretch(0, 3)
         grid.setColumnStretch(1, 2)
-        bar = in_row(self.brightest_button, self.slices_button, (self.slider, 1), None, self.plane_label)
+        bar = in_row(self.brightest_button, self.slices_button, (self.slider, 1))
+        bar.addStretch()  # only where the slider is hidden
+        bar.addWidget(self.plane_label)
         fill(self, bar, self.progress, (grid, 1), self.levels)
 
     # What is shown -------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
+import time
 import weakref
 from collections.abc import Callable, Collection, Iterable
 from typing import Protocol
@@ -84,6 +85,8 @@ class ClosingAtExit:
                 EXIT_WAIT_S,
             )
 
+
+_STOP_REPEAT_S, _STOP_WAIT_S = 0.005, 2.0
 
 SafeStep = tuple[str, Callable[[], None]]
 """A step in words, e.g. ``"light off, led_array (illuminate)"``, and what does it."""
@@ -197,3 +200,26 @@ def try_all(steps: Iterable[SafeStep]) -> None:
         interruption.add_note(str(failed))
         raise interruption
     raise failed
+
+
+def stop_until(stop: Callable[[], None], ended: threading.Event, *, once: bool = False) -> None:
+    """Stop again and again until what runs has ended, or for two seconds.
+
+    Once is not enough: another thread may have been about to start a move, an exposure or a light.
+
+    Raises
+    ------
+    StepsFailedError
+        The last, when a device could not be made safe; all were tried.
+    """
+    failure: StepsFailedError | None = None
+    deadline_s = time.monotonic() + _STOP_WAIT_S
+    while True:
+        try:
+            stop()
+        except StepsFailedError as error:
+            failure = error
+        if once or ended.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
+            break
+    if failure is not None:
+        raise failure

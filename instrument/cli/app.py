@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,7 @@ import typer
 from drivers.errors import DeviceError, LimitError
 from instrument.cli.options import GroupedCommand, flat
 from instrument.files.errors import BenchError, OperatorNeededError, in_words
+from recon.base.declare import option
 
 if TYPE_CHECKING:
     from instrument.bench.bench import Bench
@@ -34,6 +36,20 @@ BenchOption = Annotated[
         show_default=False,
     ),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFolder:
+    """Where a run goes."""
+
+    out: Path | None = option(
+        None,
+        help="Where the run's folder is made.",
+        default_words="data_folder of bench.toml",
+        metavar="FOLDER",
+        flags=("--out", "-o"),
+        group="Files",
+    )
 
 
 class App(typer.Typer):

@@ -178,13 +178,14 @@ class TerminalListener(Listener):
 
     def exposures(self, found: SweepExposures) -> None:
         """Print them."""
-        self._print(exposure_lines(found))
+        self.print(exposure_lines(found))
 
     def planned(self, lines: Sequence[str]) -> None:
         """Print what will be taken."""
-        self._print(lines)
+        self.print(lines)
 
-    def _print(self, lines: Sequence[str]) -> None:
+    def print(self, lines: Sequence[str]) -> None:
+        """Print lines between two bars."""
         words, self._words = self._words, ""
         self.pause()
         print_lines(self._console, lines)

@@ -17,8 +17,16 @@ from instrument.bench.photograph import (
     switch_light,
     write_snapshot,
 )
-from instrument.cli.app import App, BenchOption, examples, naming_as_is, open_and_say, saying_what_is_left
-from instrument.cli.progress import keys, progress_bar
+from instrument.cli.app import (
+    App,
+    BenchOption,
+    RunFolder,
+    examples,
+    naming_as_is,
+    open_and_say,
+    saying_what_is_left,
+)
+from instrument.cli.progress import keys, one_task
 from instrument.files.errors import duration, size
 from instrument.runs.recorder import RecordingOptions, RecordingStatus, prepare_recording
 from instrument.runs.run import Run
@@ -58,10 +66,7 @@ class CaptureOptions:
     def light(self) -> LightState:
         """Return the light asked for.
 
-        Raises
-        ------
-        typer.BadParameter
-            When more than one is.
+        Raises typer.BadParameter when more than one is.
         """
         flags = {LightState.SCENE: self.scene, LightState.SOURCE: self.source, LightState.DARK: self.dark}
         chosen = [name for name, is_set in flags.items() if is_set]
@@ -100,20 +105,6 @@ class SnapOptions(CaptureOptions):
     force: bool = option(False, help="Overwrite the file if it exists.", group=_FILES)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordingFiles:
-    """Where a recording goes."""
-
-    out: Path | None = option(
-        None,
-        help="Where the run's folder is made.",
-        default_words="data_folder of bench.toml",
-        metavar="FOLDER",
-        flags=("--out", "-o"),
-        group=_FILES,
-    )
-
-
 @snap_app.command(
     epilog=examples(
         "diffuserbench snap --out photo.tif",
@@ -134,15 +125,10 @@ def snap(options: SnapOptions, bench: BenchOption = None) -> None:
     with saying_what_is_left(target), naming_as_is(), open_and_say(bench, as_is=options.as_is) as opened:
         options.set_camera(opened)
         switch_light(opened, light)
-        taken = _photograph(opened, options.average)
+        with one_task("Frames") as advance:
+            taken = opened.snap(options.average, on_progress=advance)
         write_snapshot(opened, target, taken, light, operator_asked=not options.as_is)
     _report(target, taken, light)
-
-
-def _photograph(bench: Bench, average: int) -> Snapshot:
-    with progress_bar() as bar:
-        task = bar.add_task("Frames", total=average, note="")
-        return bench.snap(average, on_progress=lambda taken, _: bar.update(task, completed=taken))
 
 
 def _report(target: Path, taken: Snapshot, light: LightState) -> None:
@@ -175,7 +161,7 @@ def _report(target: Path, taken: Snapshot, light: LightState) -> None:
     ),
 )
 def record(
-    capture: CaptureOptions, options: RecordingOptions, files: RecordingFiles, bench: BenchOption = None
+    capture: CaptureOptions, options: RecordingOptions, files: RunFolder, bench: BenchOption = None
 ) -> None:
     """Record every frame of the camera with its metadata, until a number of frames or seconds, or until q.
 
@@ -187,11 +173,8 @@ def record(
         capture.set_camera(opened)
         switch_light(opened, light)
         recorder = prepare_recording(opened, files.out, options)
-        with progress_bar() as bar:
-            task = bar.add_task("Frames", total=options.n_frames, note="q ends")
-            recorder.on_progress = lambda status: bar.update(
-                task, completed=status.numbered, note=_note(status)
-            )
+        with one_task("Frames", options.n_frames, note="q ends") as advance:
+            recorder.on_progress = lambda status: advance(status.numbered, note=_note(status))
             with keys({"q": recorder.stop}):
                 run = recorder.execute()
     _last_words(run)

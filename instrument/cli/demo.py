@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -11,15 +9,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from calibration_routines import SweepCalibration, SweepExposures, sweep_plan
-from calibration_routines.demo.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.psf.sweep_plan import plan_lines
-from calibration_routines.psf.sweep_procedure import exposure_lines, quality_lines
-from instrument.bench.bench import Bench
+from calibration_routines.demo import DemoResult, DemoSettings, run_demo
 from instrument.cli.app import App, examples
-from instrument.cli.calibrate import print_lines
-from instrument.cli.progress import one_task
+from instrument.cli.calibrate import TerminalListener
 
 app = App()
 
@@ -37,33 +29,17 @@ def demo(
     along the axis, checks the PSFs, photographs a picture on a screen, reconstructs it, compares it with the
     ground truth, and writes everything into one folder. Ctrl-C stops it at any moment, the bench safe.
     """
-    audience = _Terminal(Console(highlight=False))
-    result = run_demo(out, audience, options)
-    audience.verdict(result)
+    with _Terminal(Console(highlight=False)) as listener:
+        result = run_demo(out, listener, options)
+    listener.verdict(result)
 
 
-class _Terminal:
-    """Tells the terminal what the demo does."""
+class _Terminal(TerminalListener):
+    """Shows on the terminal what the demo does, and prints what it says on the way."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[Advance]:
-        with one_task(name[0].upper() + name[1:]) as advance:
-            yield advance
-
-    def on_bench(self, bench: Bench, folder: Path) -> None:
-        self._say(f"Bench: {bench.label}")
-        self._say(f"Everything goes to {folder}")
-
-    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
-        print_lines(self._console, exposure_lines(exposures))
-        sweep = settings.sweep.points()
-        print_lines(self._console, plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), None))
-
-    def on_sweep(self, done: SweepCalibration) -> None:
-        print_lines(self._console, quality_lines(done))
+    def said(self, words: str) -> None:
+        """Print it."""
+        self.print([words])
 
     def verdict(self, result: DemoResult) -> None:
         self._console.print("\nSeconds")

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from instrument.cli.app import App, BenchOption, examples, load_and_say, saying_what_is_left
-from instrument.cli.progress import first_interrupt_cancels, progress_bar
+from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
 from instrument.display.hologram import (
     HologramResult,
     bench_display,
@@ -193,7 +193,7 @@ def table(options: TableOptions) -> None:
             bar.update(task, advance=1, note=f"{cell.expansion}x {cell.picture} {cell.method}")
 
         loaders = {name: partial(load_sample, name) for name in names}
-        cells = run_table(loaders, shape, expansions=factors, iterations=options.iterations, progress=show)
+        cells = run_table(loaders, shape, expansions=factors, iterations=options.iterations, on_progress=show)
         note = f"{shape[1]} x {shape[0]} SLM pixels, {options.iterations} iterations, "
         note += f"pictures: {', '.join(names)}"
         write_csv(files[0], cells)
@@ -309,7 +309,7 @@ def hologram(
                 result = _compute(display, targets, options, initial[channel], cancel, label)
                 initial[channel] = result.hologram.slm if inputs.video else None
                 writer.write(number, channel, result)
-                _tell(label, result, options)
+                _print(label, result, options)
                 if result.hologram.stop_reason is HologramStop.CANCELLED:
                     typer.echo("Interrupted: this is the pattern so far.", err=True)
                     raise typer.Exit(130)
@@ -318,14 +318,13 @@ def hologram(
 def _compute(
     display: Display, targets: list[Target], options: HologramOptions, initial: Any, cancel: Any, label: str
 ) -> HologramResult:
-    with progress_bar() as bar:
-        task = bar.add_task(label, total=options.iterations, note="")
+    with one_task(label, options.iterations) as advance:
 
         def show(record: HologramRecord, _slm: object) -> None:
             done = float(record.iteration)
             if options.time_s is not None:
                 done = max(done, options.iterations * record.seconds / options.time_s)
-            bar.update(task, completed=done, note=f"{record.psnr_db:.2f} dB")
+            advance(done, note=f"{record.psnr_db:.2f} dB")
 
         return compute_and_judge(display, targets, options, initial=initial, callback=show, cancel=cancel)
 
@@ -347,7 +346,7 @@ def _channel(picture: Pixels, channel: int | None) -> npt.NDArray[Any]:
     return np.ascontiguousarray(picture[..., channel])
 
 
-def _tell(label: str, result: HologramResult, options: HologramOptions) -> None:
+def _print(label: str, result: HologramResult, options: HologramOptions) -> None:
     """Say how good the hologram is, for which grid, envelope and frame count."""
     history = result.hologram.history
     typer.echo(

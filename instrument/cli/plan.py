@@ -15,9 +15,15 @@ from instrument.cli.app import App, BenchOption, examples, open_and_say
 from instrument.files.atomic import require_new, write_text
 from instrument.files.errors import BenchError, FileError, duration, size
 from instrument.plan import BenchAbilities, Light, Plan, check, estimate
-from instrument.plan.illumination import group_lights, groups_from_text, illumination_plan
-from instrument.plan.model import load_plan, save_plan
-from instrument.plan.patterns import LED_PATTERNS, led_shape, pattern_help, shape_from_text
+from instrument.plan.model import illumination_plan, load_plan, save_plan
+from instrument.plan.patterns import (
+    LED_PATTERNS,
+    group_lights,
+    groups_from_text,
+    led_shape,
+    pattern_help,
+    shape_from_text,
+)
 from instrument.runs.acquire import abilities_of
 from recon.base.declare import option
 

@@ -12,6 +12,7 @@ import tty
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -58,18 +59,25 @@ def first_interrupt_cancels() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-Advance = Callable[[float, float], None]
-"""Takes how much is done, and how much there is to do."""
+class Advance(Protocol):
+    """Advances a bar."""
+
+    def __call__(self, done: float, total: float | None = None, *, note: str | None = None) -> None:
+        """Show how much is done, how much there is to do, and a word beside it; None leaves it as it was."""
 
 
 @contextmanager
-def one_task(description: str) -> Iterator[Advance]:
+def one_task(
+    description: str, total: float | None = None, *, done: int = 0, note: str = ""
+) -> Iterator[Advance]:
     """Show the bar of a single task while the block runs; gives what advances it."""
     with progress_bar() as bar:
-        task = bar.add_task(description, total=None, note="")
+        task = bar.add_task(description, total=total, completed=done, note=note)
 
-        def advance(done: float, total: float) -> None:
+        def advance(done: float, total: float | None = None, *, note: str | None = None) -> None:
             bar.update(task, completed=done, total=total)
+            if note is not None:
+                bar.update(task, note=note)
 
         yield advance
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from instrument.bench.bench import Bench
 from instrument.bench.config_file import load_config
 from instrument.bench.safety import StepsFailedError
-from instrument.cli.app import App, BenchOption, examples, open_and_say
+from instrument.cli.app import App, BenchOption, RunFolder, examples, open_and_say
 from instrument.cli.options import Given
-from instrument.cli.progress import keys, one_task, progress_bar
+from instrument.cli.progress import keys, one_task
 from instrument.files.errors import FileError, duration, size
 from instrument.files.volumes import is_zarr_name, uneven_steps
 from instrument.plan import Plan, check
@@ -83,9 +82,8 @@ def verify(
     sound = True
     for path in runs:
         run = Run.open(path)
-        with progress_bar() as bar:
-            bar.add_task(path.name, total=len(run.records), note="")
-            found = verify_run(run, partial(_advance, bar))
+        with one_task(path.name) as advance:
+            found = verify_run(run, advance)
         for frame in found.damaged:
             typer.echo(f"{path}: frame {frame.index}: {frame.problem}", err=True)
         for problem in found.problems:
@@ -98,16 +96,12 @@ def verify(
         raise typer.Exit(1)
 
 
-def _advance(bar: Progress, done: int, _total: int) -> None:
-    bar.update(bar.task_ids[0], completed=done)
-
-
 def _slice(text: str) -> slice:
+    if not re.fullmatch(r"-?\d+|-?\d*:-?\d*(:-?[1-9]\d*)?", text):
+        raise ValueError("give A:B, e.g. 0:100, or one number.")
     numbers = [int(part) if part else None for part in text.split(":")]
     if len(numbers) == 1 and numbers[0] is not None:
         return slice(numbers[0], numbers[0] + 1)
-    if len(numbers) > 3 or numbers[2:] == [0]:
-        raise ValueError("give A:B, e.g. 0:100, or one number.")
     return slice(*numbers)
 
 
@@ -168,15 +162,8 @@ def export(
     if options.label is not None:
         wanted &= {step.index for step in found.steps(options.label)}
     indices = [index for index in sorted(found.records) if index in wanted]
-    with progress_bar() as bar:
-        task = bar.add_task("Frames", total=len(indices), note="")
-        export_run(
-            found,
-            target,
-            indices,
-            frames_per_s=options.frames_per_s,
-            on_progress=lambda done, _: bar.update(task, completed=done),
-        )
+    with one_task("Frames") as advance:
+        export_run(found, target, indices, frames_per_s=options.frames_per_s, on_progress=advance)
     typer.echo(f"Wrote {len(indices)} frames: {target}")
     if absent := len(wanted) - len(indices):
         typer.echo(f"Warning: {absent} frames that are not in the run were left out.", err=True)
@@ -208,17 +195,8 @@ def _export_result(path: Path, target: Path) -> None:
 )
 def run(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The plan, .toml or .json.")],
+    files: RunFolder,
     bench: BenchOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FOLDER",
-            help="Where the run's folder is made. Default: data_folder of bench.toml.",
-            show_default=False,
-        ),
-    ] = None,
 ) -> None:
     """Carry out a plan: one run folder, every frame with its metadata.
 
@@ -228,7 +206,7 @@ def run(
     """
     plan = load_plan(file)
     with open_and_say(bench) as opened:
-        folder = out or opened.config.data_folder
+        folder = files.out or opened.config.data_folder
         check(plan, replace(abilities_of(opened, folder), stage_homed=True))
         home_if_needed(opened, plan)
         runner = prepare(opened, plan, folder)
@@ -246,14 +224,13 @@ def home_if_needed(bench: Bench, plan: Plan) -> None:
 def carry_out(bench: Bench, runner: Runner) -> Run:
     """Execute a runner with a progress bar and keys, and say how it ended and what to do next."""
     free_at_s, free = 0.0, 0
-    with progress_bar() as bar:
-        task = bar.add_task("Frames", total=runner.status.total, note="")
+    with one_task("Frames", runner.status.total) as advance:
 
         def report(status: RunStatus) -> None:
             nonlocal free_at_s, free
             if time.monotonic() - free_at_s > 1:
                 free_at_s, free = time.monotonic(), free_bytes(runner.path)
-            bar.update(task, completed=status.done, note=_note(status, free))
+            advance(status.done, note=_note(status, free))
 
         runner.on_progress = report
 
@@ -328,11 +305,8 @@ def resume(
         return
     with open_and_say(bench or run / BENCH_TOML) as opened:
         home_if_needed(opened, found.plan)
-        with progress_bar() as bar:
-            task = bar.add_task("Verifying", total=len(found.records), note="")
-            runner, findings = prepare_resume(
-                opened, run, on_verify=lambda done, _: bar.update(task, completed=done)
-            )
+        with one_task("Verifying") as advance:
+            runner, findings = prepare_resume(opened, run, on_verify=advance)
         typer.echo(f"Found {findings}", err=True)
         routine = routine_of(run)
         if routine is not None and routine.watch is not None:

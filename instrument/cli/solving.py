@@ -7,7 +7,7 @@ import time
 import typer
 
 from instrument.cli.app import saying_what_is_left
-from instrument.cli.progress import first_interrupt_cancels, one_task, progress_bar
+from instrument.cli.progress import first_interrupt_cancels, one_task
 from instrument.files.errors import duration
 from instrument.files.volumes import uneven_steps
 from instrument.reconstruction.checkpointing import checkpoint_for, settle_checkpoint
@@ -36,7 +36,7 @@ def reconstruct_photograph(
 ) -> None:
     """Reconstruct, tell, write; exit code 130 where it was interrupted. ``explain``: only say what with."""
     if output.explain:
-        tell_choice(request.explain(request.prepare()))
+        _print_choice(request.explain(request.prepare()))
         return
     outputs.check(0, overwrite=output.force)
     is_volume = isinstance(request, VolumeRequest)
@@ -44,21 +44,18 @@ def reconstruct_photograph(
         job = request.prepare()
         planes = len(job.calibration.psfs) if is_volume else 1
         outputs.check(planes * job.measurement.size, overwrite=output.force)
-        _tell_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
+        _print_job(job, f"{'PSFs' if is_volume else 'PSF'} or image come from the simulated bench")
         keeper = checkpoint_for(output.checkpoint, job, request)
-        with progress_bar() as bar, first_interrupt_cancels() as cancel:
-            total = iteration_limit(request.options) or 1000
-            task = bar.add_task("volume" if is_volume else "picture", total=total, note="")
+        total = iteration_limit(request.options) or 1000
+        what = "volume" if is_volume else "picture"
+        with one_task(what, total) as advance, first_interrupt_cancels() as cancel:
 
             def show(record: IterationRecord, _picture: object) -> None:
-                bar.update(
-                    task,
-                    completed=round(total * done_share(request.options, record)),
-                    note=f"change {record.change:.1e}",
-                )
+                share = done_share(request.options, record)
+                advance(round(total * share), note=f"change {record.change:.1e}")
 
             result = request.solve(job, watch=show, cancel=cancel, keeper=keeper)
-        _tell(result)
+        _print(result)
         if is_volume:
             write_volume(outputs, result, job)
             if steps := uneven_steps(result.grid.z_um):
@@ -68,7 +65,7 @@ def reconstruct_photograph(
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
         for name, text in settle_checkpoint(keeper, result.stop_reasons).items():
             typer.echo(f"{name:<12}{text}")
-    _end(result, "volume" if is_volume else "picture")
+    _end(result, what)
 
 
 def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: OutputOptions) -> None:
@@ -79,21 +76,23 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
             prepared = prepare_patterned(request, advance)
         job = prepared.job
         outputs.check(job.measurement.size, overwrite=output.force)
-        _tell_job(job, "calibration or frames come from the simulated bench")
-        with progress_bar() as bar, first_interrupt_cancels() as cancel:
-            task = bar.add_task("picture", total=request.iterations or ITERATIONS, note="")
+        _print_job(job, "calibration or frames come from the simulated bench")
+        with (
+            one_task("picture", request.options.iterations or ITERATIONS) as advance,
+            first_interrupt_cancels() as cancel,
+        ):
 
             def show(record: IterationRecord) -> None:
-                bar.update(task, completed=record.iteration, note=f"change {record.change:.1e}")
+                advance(record.iteration, note=f"change {record.change:.1e}")
 
             result = solve_patterned(prepared, watch=show, cancel=cancel)
-        _tell_end(result)
+        _print_end(result)
         write_reconstruction(outputs, result, job, rotate_deg=int(output.rotate_deg))
         typer.echo(f"{'Wrote':<12}{', '.join(map(str, outputs.files()))}")
     _end(result, "picture")
 
 
-def tell_choice(choice: Choice) -> None:
+def _print_choice(choice: Choice) -> None:
     """Print what was chosen and why, and what one step up and down would cost."""
     for line in choice.lines():
         typer.echo(line)
@@ -103,13 +102,13 @@ def tell_choice(choice: Choice) -> None:
     )
 
 
-def tell_verdict(verdict: Verdict | None) -> None:
+def _print_verdict(verdict: Verdict | None) -> None:
     """Print the verdict, one sentence a line; nothing where none was asked for."""
     for index, sentence in enumerate(verdict.sentences if verdict is not None else ()):
         typer.echo(f"{'Verdict' if not index else '':<12}{sentence}")
 
 
-def _tell_job(job: Job, simulated: str) -> None:
+def _print_job(job: Job, simulated: str) -> None:
     for name, text in job.notes.items():
         typer.echo(f"{name:<12}{text}")
     if job.simulated:
@@ -118,7 +117,7 @@ def _tell_job(job: Job, simulated: str) -> None:
         typer.echo(f"Warning: {warning}", err=True)
 
 
-def _tell(result: Reconstruction) -> None:
+def _print(result: Reconstruction) -> None:
     weight = "" if result.tau is None else f", tau {result.tau:.3g}"
     if result.choice is not None:
         for line in result.choice.brief():
@@ -128,13 +127,13 @@ def _tell(result: Reconstruction) -> None:
     typer.echo(f"{'Method':<12}{result.solver}, prior {result.prior}{weight}")
     if memory := result.provenance.get("memory"):
         typer.echo(f"{'Memory':<12}{memory}")
-    _tell_end(result)
-    tell_verdict(result.verdict)
+    _print_end(result)
+    _print_verdict(result.verdict)
     for warning in result.warnings:
         typer.echo(f"Warning: {warning}", err=True)
 
 
-def _tell_end(result: Reconstruction) -> None:
+def _print_end(result: Reconstruction) -> None:
     count = _iterations(result)
     if not count:
         typer.echo(f"{'Done':<12}in one step, {result.seconds:.1f} s")
@@ -216,17 +215,16 @@ def _solve(prepared: PreparedVideo, workers: int | None, scheduler: str | None) 
     total = len(prepared.job.plan.frames)
     before = _frames_done(prepared)
     began_s = time.monotonic()
-    with progress_bar() as bar, first_interrupt_cancels() as cancel:
-        task = bar.add_task("frames", total=total, completed=before, note="")
+    with one_task("frames", total, done=before) as advance, first_interrupt_cancels() as cancel:
         done = before
 
-        def told(report: BlockReport) -> None:
+        def on_progress(report: BlockReport) -> None:
             nonlocal done
             done += len(prepared.job.blocks[report.block])
             rate = (done - before) / max(time.monotonic() - began_s, 1e-9)
-            bar.update(task, completed=done, note=f"{rate:.1f} frames/s")
+            advance(done, note=f"{rate:.1f} frames/s")
 
-        return solve_video(prepared, told, cancel, workers=workers, scheduler=scheduler)
+        return solve_video(prepared, on_progress, cancel, workers=workers, scheduler=scheduler)
 
 
 def _frames_done(prepared: PreparedVideo) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -53,16 +53,8 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     top, bottom = 1 - _HEAD_IN / height_in, (_FOOT_IN + notes_in + 0.35) / height_in
-    grid = figure.add_gridspec(
-        rows,
-        _COLUMNS,
-        left=0.05,
-        right=0.715,
-        top=top,
-        bottom=bottom,
-        hspace=0.44,
-        wspace=0.27,
-    )
+    sides: dict[str, Any] = {"left": 0.05, "right": 0.715, "top": top, "bottom": bottom}
+    grid = figure.add_gridspec(rows, _COLUMNS, **sides, hspace=0.44, wspace=0.27)
     for number, draw in enumerate(panels):
         axes = figure.add_subplot(grid[divmod(number, _COLUMNS)])
         draw(axes)
@@ -77,17 +69,9 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
     figure.text(0.05, 1 - 0.42 / height_in, title, fontsize=18, color=_INK, weight="bold", va="center")
     figure.text(0.05, 1 - 0.78 / height_in, subtitle, fontsize=10.5, color=_INK, va="center")
     if simulated:
-        figure.text(
-            0.985,
-            1 - 0.45 / height_in,
-            "SIMULATED",
-            fontsize=14,
-            weight="bold",
-            color="white",
-            ha="right",
-            va="center",
-            bbox={"boxstyle": "round,pad=0.35", "facecolor": _ACCENT, "edgecolor": "none"},
-        )
+        box: dict[str, Any] = {"boxstyle": "round,pad=0.35", "facecolor": _ACCENT, "edgecolor": "none"}
+        bold: dict[str, Any] = {"fontsize": 14, "weight": "bold", "color": "white"}
+        figure.text(0.985, 1 - 0.45 / height_in, "SIMULATED", ha="right", va="center", bbox=box, **bold)
     return figure
 
 
@@ -160,12 +144,8 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
             um = tests.lateral_px * a.pitch_um * a.z_um / a.distance_um
             lines.append(("two points across", f"{tests.lateral_px:.2g} px, {um:.3g} µm"))
         if tests.axial_per_um is not None:
-            lines.append(
-                (
-                    "two points along",
-                    f"{1e6 * tests.axial_per_um:.3g} /m, {_mm(tests.axial_per_um * a.z_um**2)}",
-                )
-            )
+            apart = _mm(tests.axial_per_um * a.z_um**2)
+            lines.append(("two points along", f"{1e6 * tests.axial_per_um:.3g} /m, {apart}"))
         if tests.sixteen_factor is not None:
             lines.append(("16 points need", f"{tests.sixteen_factor:.2g} times these separations"))
     holds = "not known" if a.convolution_holds_deg is None else f"to {a.convolution_holds_deg:.3g}°"
@@ -211,6 +191,13 @@ def _style(axes: Axes, title: str, x: str = "", y: str = "") -> None:
         spine.set_edgecolor(_FAINT)
 
 
+def _note(
+    axes: Axes, text: str, at: tuple[float, float], color: str, offset: tuple[float, float], **how: Any
+) -> None:
+    """Write beside a place, so many points off it."""
+    axes.annotate(text, at, fontsize=9, color=color, xytext=offset, textcoords="offset points", **how)
+
+
 def _psf(axes: Axes, a: Analysis) -> None:
     white = float(np.percentile(a.psf, 99.8)) or 1.0
     half_y, half_x = (n * a.pitch_um / 2e3 for n in a.psf.shape)
@@ -232,14 +219,7 @@ def _autocorrelation(axes: Axes, a: Analysis) -> None:
         (0.8, a.lateral_inner.half_width_px[1], _COLORS[2]),
     ):
         axes.plot([0, resolution, resolution], [level, level, 0], color=color, linewidth=1, linestyle="--")
-        axes.annotate(
-            f"{level:g} at {resolution:.2f} px",
-            (resolution, level),
-            fontsize=9,
-            color=color,
-            xytext=(4, 2),
-            textcoords="offset points",
-        )
+        _note(axes, f"{level:g} at {resolution:.2f} px", (resolution, level), color, (4, 2))
     axes.set_xlim(0, shown - 1)
     axes.set_ylim(0, 1.02)
     _style(axes, "Autocorrelation", "shift, pixels (along x)", "inner product")
@@ -251,32 +231,19 @@ def _depth_of_field(axes: Axes, a: Analysis) -> None:
     reach = [sum(a.axial.depth_of_field_um(float(v))) for v in z]
     axes.loglog(z / 1e3, np.array(reach) / 1e3, color=_COLORS[0], linewidth=1.8)
     axes.axvline(hyperfocal / 1e3, color=_ACCENT, linestyle=":", linewidth=1.5)
-    axes.annotate(
-        f"hyperfocal {_mm(hyperfocal)}",
-        (hyperfocal / 1e3, reach[len(reach) // 2] / 1e3),
-        fontsize=9,
-        color=_ACCENT,
-        rotation=90,
-        ha="right",
-        va="center",
-        xytext=(-2, 0),
-        textcoords="offset points",
-    )
+    place = (hyperfocal / 1e3, reach[len(reach) // 2] / 1e3)
+    aside: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center"}
+    _note(axes, f"hyperfocal {_mm(hyperfocal)}", place, _ACCENT, (-2, 0), **aside)
     _style(axes, "Depth of field", "depth, mm", "depth of field, mm")
 
 
 def _depth(axes: Axes, a: Analysis) -> None:
     assert a.depth is not None  # else there is no such panel
     axes.plot(a.depth.z_um / 1e3, a.depth.to_middle, "o-", color=_COLORS[0], markersize=3, linewidth=1.4)
-    axes.axhline(float(a.depth.cross_cut.max()), color=_COLORS[2], linewidth=1, linestyle="--")
-    axes.annotate(
-        "nearest with farthest, at any shift",
-        (a.depth.z_um[0] / 1e3, a.depth.cross_cut.max()),
-        fontsize=9,
-        color=_COLORS[2],
-        xytext=(2, 3),
-        textcoords="offset points",
-    )
+    level = float(a.depth.cross_cut.max())
+    axes.axhline(level, color=_COLORS[2], linewidth=1, linestyle="--")
+    place = (float(a.depth.z_um[0]) / 1e3, level)
+    _note(axes, "nearest with farthest, at any shift", place, _COLORS[2], (2, 3))
     axes.set_ylim(0, 1.03)
     _style(axes, f"Similarity to the PSF at {a.depth.middle_um / 1e3:.3g} mm", "depth, mm", "inner product")
 
@@ -299,16 +266,9 @@ def _condition(axes: Axes, curves: Sequence[ConditionCurve]) -> None:
     counts = sorted({c.count for c in curves})
     for curve in curves:
         color = _COLORS[counts.index(curve.count) % len(_COLORS)]
-        axes.semilogy(
-            curve.separations,
-            curve.values,
-            styles[curve.direction],
-            color=color,
-            marker="o",
-            markersize=3,
-            linewidth=1.3,
-            label=f"{curve.count} in {curve.direction}",
-        )
+        named: dict[str, Any] = {"label": f"{curve.count} in {curve.direction}", "color": color}
+        style = f"o{styles[curve.direction]}"
+        axes.semilogy(curve.separations, curve.values, style, markersize=3, linewidth=1.3, **named)
     axes.legend(fontsize=8.5, frameon=False, ncols=2)
     # Plain numbers: the range is often less than a decade, where powers of ten say little.
     axes.yaxis.set_major_formatter("{x:g}")

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from multiprocessing import forkserver, resource_tracker
@@ -105,16 +105,8 @@ class ChartData:
             "kind": self.kind_name,
             "about": dict(self.about),
             "points": [p.to_json() for p in self.points],
-            "pareto": [
-                {"group": g, "setting": p.setting, "iterations": p.iterations}
-                for g, front in self.fronts().items()
-                for p in front
-            ],
-            "even_with_best": [
-                {"group": g, "setting": p.setting, "iterations": p.iterations}
-                for g, even in self.even().items()
-                for p in even
-            ],
+            "pareto": _listed(self.fronts()),
+            "even_with_best": _listed(self.even()),
             "failed": dict(self.failed),
             "missing": list(self.missing),
         }
@@ -136,6 +128,14 @@ class ChartData:
             shown = ["" if v != v else f"{v:.6g}" if isinstance(v, float) else v for v in values]
             writer.writerow([*shown, int((p.group, p.setting, p.iterations) in front)])
         return text.getvalue()
+
+
+def _listed(groups: Mapping[str, Sequence[Point]]) -> list[dict[str, Any]]:
+    return [
+        {"group": group, "setting": p.setting, "iterations": p.iterations}
+        for group, points in groups.items()
+        for p in points
+    ]
 
 
 def colours_of(data: ChartData) -> dict[str, str]:
@@ -393,12 +393,13 @@ def _kept(path: Path, key: str) -> tuple[list[Point], dict[str, str], set[str]]:
             "Name another folder with --out.",
         )
     try:
-        points = [_point(p) for p in record["points"]]
+        points = [point_of(p) for p in record["points"]]
     except TypeError as error:
         raise FileError(path, f"is no chart of this program ({error}).", "Name another folder.") from error
     return points, dict(record["failed"]), set(record["missing"])
 
 
-def _point(record: dict[str, Any]) -> Point:
+def point_of(record: dict[str, Any]) -> Point:
+    """Return a point of a chart's record."""
     values: dict[str, Any] = {k: float("nan") if v is None else v for k, v in record.items()}
     return Point(**{**values, "held_out_parts": tuple(values.get("held_out_parts", ()))})

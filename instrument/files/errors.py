@@ -151,6 +151,19 @@ def count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def ranges(numbers: Sequence[int], most: int | None = None) -> str:
+    """Return ascending numbers for people: ``0-7, 9``; of more than ``most`` pieces only how many follow."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs[:most])
+    left = sum(b - a + 1 for a, b in runs[len(runs) if most is None else most :])
+    return f"{text} and {left} more" if left else text
+
+
 def duration(seconds: float) -> str:
     """Return a time for people."""
     if seconds < 120:

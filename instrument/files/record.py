@@ -87,10 +87,8 @@ class RecordFormat:
 
         Fields that this program does not know are among them, and told of once.
 
-        Raises
-        ------
-        FileError
-            When there is no such file, it is something else, damaged, or of a version that is not known.
+        Raises FileError when there is no such file, it is something else, damaged, or of a version that is
+        not known.
         """
         try:
             found = json.loads(path.read_text("utf-8"))
@@ -129,7 +127,7 @@ class RecordFormat:
             for old in range(major, self.major):
                 fields = self.migrate[old](fields)
         if self.fields is not None:
-            self.tell_unknown(path, [name for name in fields if name not in self.fields])
+            self.warn_unknown(path, [name for name in fields if name not in self.fields])
         elif (major, minor) > (self.major, self.minor):
             _say(path, f"is of version {version}, newer than this program's: what is new in it is left out.")
         return fields
@@ -137,18 +135,15 @@ class RecordFormat:
     def value(self, kind: type[T], fields: Any, path: Path) -> T:
         """Return the value of a type that part of a record describes, telling of fields that are not known.
 
-        Raises
-        ------
-        FileError
-            When it does not describe one.
+        Raises FileError when it does not describe one.
         """
         unknown: Unknown = {}
         with self.damaged(path):
             value = value_of(kind, fields, unknown)
-        self.tell_unknown(path, list(unknown))
+        self.warn_unknown(path, list(unknown))
         return value
 
-    def tell_unknown(self, path: Path, names: Sequence[str]) -> None:
+    def warn_unknown(self, path: Path, names: Sequence[str]) -> None:
         """Say once that a file has fields which this program does not know."""
         if names:
             _say(path, f"holds {', '.join(map(repr, names))}, which this program does not know: left out.")

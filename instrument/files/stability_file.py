@@ -16,7 +16,7 @@ from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.files.record import Fields, RecordFormat
 from recon.verdict.cases import OF_VOLUMES
-from recon.verdict.map import Axis, Cell, Size, StressMap, boundary, severity_grid
+from recon.verdict.map import Cell, Size, Stress, StressMap, boundary, severity_grid
 
 
 def _named(method: str) -> str:
@@ -158,7 +158,7 @@ def read_stability(path: Path) -> dict[str, Any]:
     return record
 
 
-def _axis(axis: Axis, size: Size) -> dict[str, Any]:
+def _axis(axis: Stress, size: Size) -> dict[str, Any]:
     ticks = {} if axis.named is None else {"ticks": [axis.named(v, size) for v in axis.at(size)]}
     return {
         "key": axis.key,

@@ -1,6 +1,6 @@
 """Plans: what an acquisition will do, as data that counts, checks and iterates itself into steps."""
 
-from instrument.plan.abilities import BenchAbilities, PlanEstimate, check, estimate, stored_dtype
+from instrument.plan.abilities import BenchAbilities, PlanEstimate, check, estimate
 from instrument.plan.model import Part, Plan, PlanError, Step
 from instrument.plan.patterns import OFF, SOURCE, Light
 from instrument.plan.positions import SourceGrid, SourcePoints, SourcePosition, Span, StagePoints
@@ -22,5 +22,4 @@ __all__ = [
     "Step",
     "check",
     "estimate",
-    "stored_dtype",
 ]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.stage import StageAxis
-from instrument.files.errors import FileError
+from instrument.files.errors import FileError, ranges
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan.led_shapes import LedPlaces
 from instrument.plan.model import Plan, PlanError, Step
@@ -70,16 +70,10 @@ class PlanEstimate:
     exposures: int
     """Frames taken, averaged ones counted singly."""
     moves: int
-    image_bytes: int
     total_bytes: int
     """Everything the run will write, metadata included."""
     seconds: float
     """Exposures, moves, settling and waiting; read-out and disk are not known beforehand."""
-
-
-def stored_dtype(plan: Plan, camera_dtype: np.dtype[np.uint8] | np.dtype[np.uint16]) -> np.dtype[np.generic]:
-    """Return the type frames are stored with: the camera's own, float32 as soon as any step averages."""
-    return np.dtype(np.float32) if plan.averages else np.dtype(camera_dtype)
 
 
 def estimate(
@@ -91,7 +85,8 @@ def estimate(
 ) -> PlanEstimate:
     """Return what a plan, or the steps of it that are ``todo``, will cost on a bench."""
     steps = _steps(plan, todo, start)
-    frame_bytes = math.prod(abilities.frame_shape) * stored_dtype(plan, abilities.frame_dtype).itemsize
+    bytes_a_pixel = 4 if plan.averages else abilities.frame_dtype.itemsize  # a mean is float32
+    frame_bytes = math.prod(abilities.frame_shape) * bytes_a_pixel
     speeds = {axis.name: axis.speed_per_s for axis in abilities.stage_axes}
     position = dict(abilities.stage_position or {})
     seconds, part_start, part, moves = 0.0, 0.0, -1, 0
@@ -115,7 +110,6 @@ def estimate(
         frames=n,
         exposures=sum(step.average for step in steps),
         moves=moves,
-        image_bytes=n * frame_bytes,
         total_bytes=n * (frame_bytes + BYTES_A_FRAME_BESIDE_THE_IMAGE),
         seconds=seconds,
     )
@@ -140,17 +134,16 @@ def check(
     Only the steps that are ``todo`` (None: all) are looked at; ``start`` is the bench's state before the
     first, for what the plan leaves as it is.
 
-    Raises
-    ------
-    PlanError
-        Naming every reason with the steps it concerns.
+    Raises PlanError naming every reason with the steps it concerns.
     """
     found: dict[str, list[int]] = {}
     steps = _steps(plan, todo, start)
     for step in steps:
         for problem in _step_problems(step, abilities):
             found.setdefault(problem, []).append(step.index)
-    problems = [f"{_ranges(steps)}: {problem}" for problem, steps in found.items()]
+    problems = [
+        f"step{'s' if len(steps) > 1 else ''} {ranges(steps)}: {problem}" for problem, steps in found.items()
+    ]
     for path in sorted({step.slm_image for step in steps if step.slm_image is not None}):
         problems.extend(_slm_image_problems(path, abilities))
     need = estimate(plan, abilities, todo=todo, start=start).total_bytes
@@ -217,15 +210,3 @@ def _slm_image_problems(path: Path, abilities: BenchAbilities) -> Iterable[str]:
         return
     if shape != abilities.slm_shape:
         yield f"SLM image {path} is {shape}, but the SLM has {abilities.slm_shape} pixels."
-
-
-def _ranges(steps: list[int]) -> str:
-    """Return ``"step 3"`` or ``"steps 0-7, 9"``."""
-    runs: list[list[int]] = []
-    for step in steps:
-        if runs and step == runs[-1][1] + 1:
-            runs[-1][1] = step
-        else:
-            runs.append([step, step])
-    text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
-    return f"step{'s' if len(steps) > 1 else ''} {text}"

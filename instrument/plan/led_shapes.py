@@ -39,6 +39,8 @@ class LedShape(ABC):
     name: ClassVar[str]
     help: ClassVar[str]
     """One line for those who choose."""
+    called: ClassVar[str]
+    """What logs and metadata call it, with its options in braces: ``"DPC {side} NA {na:g}"``."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """What the window offers as buttons: their words, and the options that differ from the defaults."""
 
@@ -51,9 +53,9 @@ class LedShape(ABC):
         return (self,)
 
     @property
-    @abstractmethod
     def words(self) -> str:
         """What logs and metadata call it."""
+        return self.called.format(**vars(self))
 
     def on(self, array: LedPlaces, rgb: Rgb = WHITE) -> LedPattern:
         """Return the pattern for an array."""
@@ -76,17 +78,13 @@ class BrightField(LedShape):
 
     name = "bright-field"
     help = "All LEDs inside the numerical aperture"
+    called = "bright field NA {na:g}"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"Bright field": {}}
     na: float = _na()
 
     def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         return _radius(array) <= self.na
-
-    @property
-    def words(self) -> str:
-        """What logs and metadata call it."""
-        return f"bright field NA {self.na:g}"
 
 
 @dataclass(frozen=True)
@@ -95,17 +93,13 @@ class DarkField(LedShape):
 
     name = "dark-field"
     help = "All LEDs outside the numerical aperture"
+    called = "dark field NA {na:g}"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"Dark field": {}}
     na: float = _na()
 
     def lit(self, array: LedPlaces) -> LitLeds:
         """Return which LEDs are lit."""
         return _radius(array) > self.na
-
-    @property
-    def words(self) -> str:
-        """What logs and metadata call it."""
-        return f"dark field NA {self.na:g}"
 
 
 SIDES = ("left", "right", "top", "bottom")
@@ -117,6 +111,7 @@ class HalfCircle(LedShape):
 
     name = "half"
     help = "One half of the bright field, as for differential phase contrast"
+    called = "DPC {side} NA {na:g}"
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {f"DPC {side}": {"side": side} for side in SIDES}
     side: str = option("left", help="Which half.", choices=SIDES)
     na: float = _na()
@@ -130,11 +125,6 @@ class HalfCircle(LedShape):
     def series(self, array: LedPlaces) -> Sequence[Self]:
         """Return the four halves."""
         return [replace(self, side=side) for side in SIDES]
-
-    @property
-    def words(self) -> str:
-        """What logs and metadata call it."""
-        return f"DPC {self.side} NA {self.na:g}"
 
 
 @dataclass(frozen=True)
@@ -164,6 +154,7 @@ class Single(LedShape):
 
     name = "single"
     help = "One LED, by its number"
+    called = "LED {led}"
     led: int = option(0, help="Its number.", label="LED", least=0)
 
     def lit(self, array: LedPlaces) -> LitLeds:
@@ -174,11 +165,6 @@ class Single(LedShape):
         """Return every LED of the array."""
         return [replace(self, led=led) for led in range(len(array.led_na))]
 
-    @property
-    def words(self) -> str:
-        """What logs and metadata call it."""
-        return f"LED {self.led}"
-
 
 @dataclass(frozen=True)
 class GridCell(LedShape):
@@ -186,6 +172,7 @@ class GridCell(LedShape):
 
     name = "grid"
     help = "The LEDs in one cell of a square grid over the array"
+    called = "cell {cell} of {side} x {side}"
     side: int = option(3, help="Cells along each axis.", least=1)
     cell: int = option(0, help="Which one, row by row from the smallest x and y.", least=0)
 
@@ -201,8 +188,3 @@ class GridCell(LedShape):
         """Return the cells that hold an LED, row by row."""
         cells = (replace(self, cell=cell) for cell in range(self.side**2))
         return [one for one in cells if one.lit(array).any()]
-
-    @property
-    def words(self) -> str:
-        """What logs and metadata call it."""
-        return f"cell {self.cell} of {self.side} x {self.side}"

@@ -8,12 +8,14 @@ They are written ``NAME OPTION=VALUE ...``: ``"half side=left na=0.3"``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from drivers.led_array import LedPattern
+from instrument.files.errors import BenchError
 from instrument.plan.led_shapes import (
     WHITE,
     Annulus,
@@ -41,10 +43,7 @@ LED_PATTERNS: Registry[type[LedShape]] = Registry("LED pattern", "diffuserbench.
 def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
     """Return a named pattern with options.
 
-    Raises
-    ------
-    InputError
-        When nothing has the name, or an option is not known or out of its limits.
+    Raises InputError when nothing has the name, or an option is not known or out of its limits.
     """
     shape = with_overrides(LED_PATTERNS.named(name)(), options or {})
     require(shape)
@@ -54,10 +53,7 @@ def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
 def shape_from_text(text: str) -> tuple[str, dict[str, Any]]:
     """Return name and options of a pattern written ``"half side=left na=0.3"``; not looked up yet.
 
-    Raises
-    ------
-    InputError
-        When it is written otherwise.
+    Raises InputError when it is written otherwise.
     """
     name, *words = text.split()
     options: dict[str, Any] = {}
@@ -203,3 +199,57 @@ class Light(PlanData):
 
 OFF = Light(kind="off")
 SOURCE = Light(kind="source")
+
+MOST_NAMED = 8
+"""LEDs of a group that its description names."""
+
+
+def group_lights(groups: Sequence[Sequence[int]], level: int = 255) -> list[Light]:
+    """Return the lights of groups of LEDs by number, every LED at one level.
+
+    Raises BenchError when a group is empty, or the level out of range.
+    """
+    if not all(len(group) for group in groups):
+        raise BenchError("Active illumination needs groups of LEDs, each with one at least.")
+    if not 1 <= level <= 255:
+        raise BenchError(f"An LED's level lies between 1 and 255, not {level}.")
+    return [
+        Light(
+            kind="pattern",
+            description=f"group {number}: {_in_words(group)}",
+            leds=tuple((led, level, level, level) for led in group),
+        )
+        for number, group in enumerate(groups)
+    ]
+
+
+def _in_words(group: Sequence[int]) -> str:
+    if len(group) > MOST_NAMED:
+        return f"{len(group)} LEDs"
+    return f"LEDs {', '.join(map(str, group))}"
+
+
+def groups_from_text(text: str) -> list[list[int]]:
+    """Return groups of LEDs written as ``"0-3,8;4;5,6"``: semicolons between groups, commas in them.
+
+    Raises BenchError when it is something else.
+    """
+    groups = []
+    for group in text.split(";"):
+        numbers: list[int] = []
+        for item in filter(None, (word.strip() for word in group.split(","))):
+            span = re.fullmatch(r"(\d+)(?:\s*-\s*(\d+))?", item)
+            if span is None:
+                raise BenchError(
+                    f"--groups: {item!r} is neither an LED's number nor a span of them; write '0-3,8;4;5,6'."
+                )
+            first, last = int(span[1]), int(span[2] or span[1])
+            if last < first:
+                raise BenchError(f"--groups: the span {item!r} ends before it begins.")
+            numbers += range(first, last + 1)
+        if not numbers:
+            raise BenchError("--groups: a group is empty; write '0-3,8;4;5,6'.")
+        if len(set(numbers)) < len(numbers):
+            raise BenchError(f"--groups: a group names an LED twice: {group.strip()!r}.")
+        groups.append(numbers)
+    return groups

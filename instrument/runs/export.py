@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,15 +73,12 @@ def export(
     if target.is_dir() or not target.suffix:
         _png(run, target, indices, images())
         return indices
-    writers: Mapping[str, Callable[[Path], None]] = {
-        ".ome.tif": lambda path: _tiff(run, path, indices, images(), ome=True),
-        ".ome.tiff": lambda path: _tiff(run, path, indices, images(), ome=True),
-        ".tif": lambda path: _tiff(run, path, indices, images(), ome=False),
-        ".tiff": lambda path: _tiff(run, path, indices, images(), ome=False),
-        ".h5": lambda path: _hdf5(run, path, indices, images()),
-        ".hdf5": lambda path: _hdf5(run, path, indices, images()),
-        ".npy": lambda path: _npy(run, path, indices, images()),
-        ".mp4": lambda path: _mp4(run, path, images(), frames_per_s or _rate(run)),
+    writers: dict[str, Callable[[Run, Path, list[int], Iterator[Image]], None]] = {
+        **dict.fromkeys((".ome.tif", ".ome.tiff"), partial(_tiff, ome=True)),
+        **dict.fromkeys((".tif", ".tiff"), partial(_tiff, ome=False)),
+        **dict.fromkeys((".h5", ".hdf5"), _hdf5),
+        ".npy": _npy,
+        ".mp4": partial(_mp4, frames_per_s=frames_per_s),
     }
     writer = next((write for suffix, write in writers.items() if name.endswith(suffix)), None)
     if writer is None:
@@ -90,12 +88,8 @@ def export(
     require_new(target)
     check_writable(target, 0 if name.endswith(".mp4") else sum(run.records[i].n_bytes for i in indices))
     with whole_file(target) as temporary:
-        writer(temporary)
+        writer(run, temporary, indices, images())
     return indices
-
-
-def _rate(run: Run) -> float:
-    return 1 / run.frame_period_s if run.frame_period_s else 10.0
 
 
 def _tiff(run: Run, path: Path, indices: list[int], images: Iterator[Image], *, ome: bool) -> None:
@@ -185,7 +179,11 @@ def _png(run: Run, folder: Path, indices: list[int], images: Iterator[Image]) ->
         write_image(path, image)
 
 
-def _mp4(run: Run, path: Path, images: Iterator[Image], frames_per_s: float) -> None:
+def _mp4(
+    run: Run, path: Path, _indices: list[int], images: Iterator[Image], *, frames_per_s: float | None
+) -> None:
+    if frames_per_s is None:
+        frames_per_s = 1 / run.frame_period_s if run.frame_period_s else 10.0
     height, width = run.array.frame_shape[:2]
     # Coders of video want even sides.
     height, width = height // 2 * 2, width // 2 * 2

@@ -144,7 +144,7 @@ def _end(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseExcep
     try:
         try_all(
             [
-                ("bench made safe", bench.safe_state),
+                ("bench made safe", bench.stop),
                 ("run finished", lambda: ended.append(writer.finish(reason, text))),
             ]
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from instrument.bench.photograph import Progress
+from instrument.files.errors import ranges
 from instrument.files.figures import save_figure
 from instrument.runs.run import STATE, DamagedFrame, FinishReason, Run, RunCondition, RunError
 
@@ -43,15 +44,15 @@ def _contradictions(run: Run) -> list[str]:
     if run.torn_bytes:
         problems.append(f"the log ends in a half line of {run.torn_bytes} bytes")
     if run.reason is FinishReason.COMPLETED and run.plan is not None and run.missing():
-        problems.append(f"marked as completed, but frames {_few(run.missing())} are not there")
+        problems.append(f"marked as completed, but frames {ranges(run.missing(), 8)} are not there")
     beyond = [index for index in run.records if not 0 <= index < run.n_frames]
     if beyond:
-        problems.append(f"the log has frames {_few(beyond)}, beyond the plan's {run.n_frames}")
+        problems.append(f"the log has frames {ranges(beyond, 8)}, beyond the plan's {run.n_frames}")
     gaps = [index for gap in run.gaps for index in range(gap.first, gap.first + gap.count)]
     if both := sorted(set(gaps) & set(run.records)):
-        problems.append(f"frames {_few(both)} are both stored and lost")
+        problems.append(f"frames {ranges(both, 8)} are both stored and lost")
     if run.plan is None and (nowhere := sorted(set(run.missing()) - set(gaps))):
-        problems.append(f"frames {_few(nowhere)} are neither stored nor accounted for as lost")
+        problems.append(f"frames {ranges(nowhere, 8)} are neither stored nor accounted for as lost")
     if run.has_frames:
         problems += _array_contradictions(run)
     if run.plan is not None:
@@ -79,11 +80,6 @@ def _array_contradictions(run: Run) -> list[str]:
     return problems
 
 
-def _few(indices: list[int]) -> str:
-    text = ", ".join(map(str, indices[:8]))
-    return text if len(indices) <= 8 else f"{text} and {len(indices) - 8} more"
-
-
 COLUMNS, ROWS = 4, 3
 
 
@@ -92,12 +88,7 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
 
     Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red.
 
-    Raises
-    ------
-    RunError
-        When the run has no frames.
-    FileError
-        When ``path`` cannot be written.
+    Raises RunError when the run has no frames; FileError when ``path`` cannot be written.
     """
     from matplotlib.figure import Figure
 

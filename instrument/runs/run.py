@@ -117,7 +117,7 @@ class Run:
                 gaps.append(Gap.from_json(line))
             else:
                 events.append(line)
-        RUN_STATE.tell_unknown(
+        RUN_STATE.warn_unknown(
             path / LOG, sorted({name for r in self.records.values() for name in r.unknown})
         )
         self.gaps = tuple(gaps)
@@ -127,10 +127,7 @@ class Run:
     def open(cls, path: Path | str) -> Run:
         """Open a run folder.
 
-        Raises
-        ------
-        RunError
-            When there is none, or it is not one of this program's.
+        Raises RunError when there is none, or it is not one of this program's.
         """
         path = Path(path)
         if not path.is_dir():
@@ -180,7 +177,7 @@ class Run:
             return None
         with RUN_STATE.damaged(path):
             plan, unknown = Plan.with_unknown(self._json(PLAN), path)
-        RUN_STATE.tell_unknown(path, unknown)
+        RUN_STATE.warn_unknown(path, unknown)
         return plan.with_slm_images(lambda image: self.path / image)
 
     @cached_property
@@ -248,10 +245,7 @@ class Run:
     def frame(self, index: int | Step) -> npt.NDArray[Any]:
         """Return one stored frame, ``(height, width)`` or ``(height, width, 3)``.
 
-        Raises
-        ------
-        RunError
-            When it was not stored.
+        Raises RunError when it was not stored.
         """
         index = index.index if isinstance(index, Step) else index
         if index not in self.records:
@@ -271,10 +265,7 @@ class Run:
     def images(self, label: str) -> npt.NDArray[Any]:
         """Return the frames of all steps of one label, stacked along the first axis.
 
-        Raises
-        ------
-        RunError
-            When there are none, or one was not stored.
+        Raises RunError when there are none, or one was not stored.
         """
         steps = self.steps(label)
         if not steps:

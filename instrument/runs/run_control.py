@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from instrument.bench.bench import Bench
-from instrument.bench.safety import StepsFailedError
+from instrument.bench.safety import StepsFailedError, stop_until
 from instrument.files.errors import BenchError
 from instrument.runs.run import FinishReason
 from instrument.runs.runner import Runner
-
-_STOP_REPEAT_S = 0.005
-_STOP_WAIT_S = 2.0
 
 
 class EndedEarlyError(BenchError):
@@ -75,32 +71,18 @@ class RunControl:
     def stop(self) -> None:
         """End at once: light off and motion stopped when this returns, whatever was going on.
 
-        Raises
-        ------
-        StepsFailedError
-            When a device could not be made safe; all were tried.
+        Raises StepsFailedError when a device could not be made safe; all were tried.
         """
         with self._condition:
             self._ending = FinishReason.STOPPED
             runner, bench = self._runner, self._bench
             self._condition.notify_all()
-        failure: StepsFailedError | None = None
-        if runner is not None:
-            try:
+        try:
+            if runner is not None:
                 runner.stop()
-            except StepsFailedError as error:
-                failure = error
-        deadline_s = time.monotonic() + _STOP_WAIT_S
-        # Once is not enough: the procedure may have been about to turn on a light or to start a move.
-        while bench is not None and not self._idle.is_set():
-            try:
-                bench.stop()
-            except StepsFailedError as error:
-                failure = error
-            if self._idle.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
-                break
-        if failure is not None:
-            raise failure
+        finally:
+            if bench is not None and not self._idle.is_set():
+                stop_until(bench.stop, self._idle)
 
     # In the procedure's thread -------------------------------------------------------------------
     @contextmanager
@@ -114,7 +96,7 @@ class RunControl:
             yield
         except BaseException as error:
             try:
-                bench.safe_state()
+                bench.stop()
             except StepsFailedError as failure:
                 error.add_note(str(failure))
             raise
@@ -137,10 +119,7 @@ class RunControl:
     def check(self) -> None:
         """Wait, everything dark, while the procedure is paused.
 
-        Raises
-        ------
-        EndedEarlyError
-            When it was aborted or stopped.
+        Raises EndedEarlyError when it was aborted or stopped.
         """
         if self.is_pausing and self.ending is None and (bench := self._bench) is not None:
             if bench.can_switch_source:

@@ -25,16 +25,13 @@ from typing import Any
 from drivers.errors import StoppedError
 from instrument.bench.bench import Bench
 from instrument.bench.photograph import Snapshot
-from instrument.bench.safety import StepsFailedError
+from instrument.bench.safety import stop_until
 from instrument.files.errors import BenchError
 from instrument.files.slm_image import read_slm_levels
 from instrument.plan import Light, Plan, Step
 from instrument.runs.finish import end_run
 from instrument.runs.run import FinishReason, Run
 from instrument.runs.writer import FrameToStore, RunWriter
-
-_STOP_REPEAT_S = 0.005
-_STOP_WAIT_S = 2.0
 
 
 class RunState(StrEnum):
@@ -239,28 +236,18 @@ class Runner:
     def stop(self) -> None:
         """End at once: light off and motion stopped when this returns, whatever was going on.
 
-        Raises
-        ------
-        StepsFailedError
-            When a device could not be made safe; all were tried.
+        Raises StepsFailedError when a device could not be made safe; all were tried.
         """
         self._stopping.set()
         with self._condition:
             self._condition.notify_all()
-        failure: StepsFailedError | None = None
-        deadline_s = time.monotonic() + _STOP_WAIT_S
-        # Once is not enough: the executing thread may have been about to start a move or an exposure.
-        while True:
+
+        def stop() -> None:
             if self.status.state is not RunState.ENDING:
-                try:
-                    self._bench.stop()
-                except StepsFailedError as error:
-                    failure = error
-            executes_here = self._thread in (None, threading.current_thread())
-            if executes_here or self._finished.wait(_STOP_REPEAT_S) or time.monotonic() > deadline_s:
-                break
-        if failure is not None:
-            raise failure
+                self._bench.stop()
+
+        executes_here = self._thread in (None, threading.current_thread())
+        stop_until(stop, self._finished, once=executes_here)
 
     # In one thread -------------------------------------------------------------------------------
     def execute(self) -> Run:

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from drivers.frame import FrameMetadata
 from instrument.files.atomic import make_folder, sync_folder, write_bytes, write_json
+from instrument.files.record import plain
 from instrument.plan import Plan
 from instrument.runs.frame_array import FrameArray
 from instrument.runs.log import AppendOnlyLog, FrameRecord, Gap
@@ -168,10 +169,7 @@ class RunWriter:
 
         The folder appears under its name only when it is whole.
 
-        Raises
-        ------
-        RunError
-            When the folder cannot be written to.
+        Raises RunError when the folder cannot be written to.
         """
         parent = Path(parent)
         with _disk(parent, "no run can be kept there"):
@@ -182,18 +180,10 @@ class RunWriter:
             try:
                 if plan is not None:
                     write_bytes(draft / PLAN, plan_with_copies(plan, draft).to_json().encode())
-                write_json(draft / BENCH, bench.config)
-                write_bytes(draft / BENCH_TOML, bench.toml.encode())
-                origin = {
-                    **provenance(),
-                    "simulated": bench.simulated,
-                    "devices": dict(bench.devices),
-                    "pixel_pitch_um": bench.pixel_pitch_um,
-                    "camera": dict(bench.camera),
-                    "stage": dict(bench.stage),
-                    "calibrations": list(calibrations),
-                }
-                write_json(draft / PROVENANCE, origin)
+                facts = plain(bench)
+                write_json(draft / BENCH, facts.pop("config"))
+                write_bytes(draft / BENCH_TOML, facts.pop("toml").encode())
+                write_json(draft / PROVENANCE, {**provenance(), **facts, "calibrations": list(calibrations)})
                 state = {
                     "label": label,
                     "simulated": bench.simulated,
@@ -216,10 +206,7 @@ class RunWriter:
     def reopen(cls, path: Path | str) -> RunWriter:
         """Open a run folder to continue it.
 
-        Raises
-        ------
-        RunError
-            When it is no run, or some program writes to it now.
+        Raises RunError when it is no run, or some program writes to it now.
         """
         path = Run.open(path).path
         with _disk(path, "cannot be continued"):
@@ -238,11 +225,8 @@ class RunWriter:
     def write(self, frames: Sequence[FrameToStore]) -> None:
         """Store frames with their metadata, and return once all of it is on the disk.
 
-        Raises
-        ------
-        RunError
-            When the disk is full or not writable, or a frame does not fit the run. What was on the disk
-            before stays.
+        Raises RunError when the disk is full or not writable, or a frame does not fit the run. What was on
+        the disk before stays.
         """
         if not frames:
             return

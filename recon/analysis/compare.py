@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, similarity
+from recon.analysis.correlation import autocorrelate, correlate, cut_to_light, lit_extent, similarity
 from recon.camera.refocus import central_psfs, refocus
 from recon.camera.registration import register
 from recon.errors import InputError
@@ -177,11 +177,11 @@ def _fit(new: Array, old: Array, shift: complex) -> tuple[complex, complex, bool
 def _block_displacements(
     moved: Array, old: Array
 ) -> tuple[npt.NDArray[np.complex128], npt.NDArray[np.complex128]]:
-    rows, columns = (np.flatnonzero(old.max(axis=1 - a) > 0.01 * old.max()) for a in (0, 1))
     places, displacements = [], []
     height, width = old.shape
-    edges_y = np.linspace(rows[0], rows[-1] + 1, BLOCKS + 1).astype(int)
-    edges_x = np.linspace(columns[0], columns[-1] + 1, BLOCKS + 1).astype(int)
+    edges_y, edges_x = (
+        np.linspace(first, last + 1, BLOCKS + 1).astype(int) for first, last in lit_extent(old)
+    )
     for top, bottom in pairwise(edges_y):
         for left, right in pairwise(edges_x):
             one, two = (image[top:bottom, left:right] for image in (moved, old))

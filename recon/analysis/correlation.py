@@ -145,14 +145,20 @@ def cut_to_light(image: Array, margin: int = 8) -> Array:
 
     ``margin`` pixels are kept around it, as far as there are any.
     """
-    cut = []
-    for axis in (0, 1):
-        profile = image.max(axis=1 - axis)
+    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in lit_extent(image))
+    return image[rows, columns]
+
+
+def lit_extent(image: Array) -> list[tuple[int, int]]:
+    """Return the first and last row, and column, with light: above a hundredth of the peak."""
+    extent = []
+    for axis in (1, 0):
+        profile = image.max(axis=axis)
         used = np.flatnonzero(profile > 0.01 * float(profile.max()))
         if not used.size:
             raise InputError("The PSF holds no light.")
-        cut.append(slice(max(int(used[0]) - margin, 0), int(used[-1]) + 1 + margin))
-    return image[cut[0], cut[1]]
+        extent.append((int(used[0]), int(used[-1])))
+    return extent
 
 
 def centre_of_light(psf: Array) -> tuple[float, float]:

@@ -154,23 +154,6 @@ def _product(planes: Array, first: Voxel, second: Voxel) -> float:
 
 
 # Windows --------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class WindowSolution:
-    """What a window was reconstructed to.
-
-    Attributes
-    ----------
-    volume : ndarray, float64, (n_z, height, width)
-    iterations : int
-    change : float
-        Relative change in the last iteration.
-    """
-
-    volume: Floats
-    iterations: int
-    change: float
-
-
 class WindowProblem:
     """Reconstructs windows about the axis with tau = 0: least squares with non-negativity (Eq. 4.2).
 
@@ -212,18 +195,18 @@ class WindowProblem:
 
     def solve(
         self, data: Array, *, iterations: int = MOST_ITERATIONS, tolerance: float = TOLERANCE
-    ) -> WindowSolution:
+    ) -> Floats:
         """Reconstruct from an image (height, width): accelerated projected gradient with restart.
 
-        The step is 1 over a bound of the norm of ``A^T A``. In units of the PSFs as given.
+        The step is 1 over a bound of the norm of ``A^T A``. It ends where a relative change is below
+        ``tolerance``. Returns float64, (n_z, rows, columns) of the window, in units of the PSFs as given.
         """
         if data.shape != self.sensor_shape:
             raise InputError(f"The image is {data.shape}, the PSFs are {self.sensor_shape}.")
         target = self.adjoint(data)
         x = np.zeros_like(target)
-        y, t, change = x, 1.0, np.inf
-        done = 0
-        for done in range(1, iterations + 1):  # noqa: B007 (how many it took)
+        y, t = x, 1.0
+        for _ in range(iterations):
             new = np.maximum(y - (self._normal(y) - target) / self._lipschitz, 0.0)
             step = new - x
             if float(np.vdot(y - new, step)) > 0:  # the momentum points against the descent
@@ -232,10 +215,9 @@ class WindowProblem:
             y = new + (t - 1) / t_next * step
             x, t = new, t_next
             size = float(np.linalg.norm(x))
-            change = float(np.linalg.norm(step)) / size if size > 0 else 0.0
-            if change < tolerance:
+            if size == 0 or float(np.linalg.norm(step)) / size < tolerance:
                 break
-        return WindowSolution(x / self._norms[:, None, None], done, change)
+        return np.asarray(x / self._norms[:, None, None])
 
     def _normal(self, x: Floats) -> Floats:
         """``A^T A x`` in the window."""

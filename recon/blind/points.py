@@ -238,7 +238,44 @@ def overlooked(camera: PointImages, left: Array, points: Points, noise: float) -
     return Points(np.concatenate([points.places, added]), np.concatenate([points.light, lights]))
 
 
-class PointMixer:
+class Mixer:
+    """A linear map from PSFs to images in which each image is a sum of the PSFs' convolutions, cropped.
+
+    Subclasses fill ``_spectra``: of what image ``i`` has of PSF ``k``, (n_images, n_psfs, *spectrum).
+    """
+
+    _spectra: npt.NDArray[np.complex64]
+
+    def __init__(self, psf_shape: tuple[int, int], sensor_shape: tuple[int, int]) -> None:
+        self._psf, self._sensor = psf_shape, sensor_shape
+        self._grid = fft.fast_shape(field_of(sensor_shape, psf_shape)[0])
+
+    def forward(self, psfs: Numbers) -> Array:
+        """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
+        padded = np.zeros((len(psfs), *self._grid), np.float32)
+        padded[:, : self._psf[0], : self._psf[1]] = psfs
+        spectra = fft.rfft(padded)
+        seen = np.stack([np.einsum("kyx,kyx->yx", row, spectra) for row in self._spectra])
+        return np.ascontiguousarray(fft.irfft(seen, self._grid[1])[self._window])
+
+    def adjoint(self, images: Numbers) -> Array:
+        """Return the exact transpose."""
+        padded = np.zeros((len(images), *self._grid), np.float32)
+        padded[self._window] = images
+        spectra = np.conj(fft.rfft(padded))
+        total = np.zeros(self._spectra.shape[1:], np.complex64)
+        for row, image in zip(self._spectra, spectra, strict=True):
+            total += row * image
+        back = fft.irfft(np.conj(total), self._grid[1])
+        return np.ascontiguousarray(back[:, : self._psf[0], : self._psf[1]])
+
+    @property
+    def _window(self) -> tuple[slice, slice, slice]:
+        (top, left), (height, width) = ((n - 1 for n in self._psf), self._sensor)
+        return slice(None), slice(top, top + height), slice(left, left + width)
+
+
+class PointMixer(Mixer):
     """The map from PSFs to images with points fixed: ``b_i = C sum_b a_b sum_k phi_k(x_b) p_k(u - x_b)``.
 
     Parameters
@@ -263,9 +300,8 @@ class PointMixer:
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        self._psf, self._sensor = psf_shape, sensor_shape
-        field_shape, centre = field_of(sensor_shape, psf_shape)
-        self._grid = fft.fast_shape(field_shape)
+        super().__init__(psf_shape, sensor_shape)
+        _, centre = field_of(sensor_shape, psf_shape)
         f_y, f_x = np.fft.fftfreq(self._grid[0]), np.fft.rfftfreq(self._grid[1])
         self._spectra = np.empty((len(beads), functions.count, len(f_y), len(f_x)), np.complex64)
         for points, out in zip(beads, self._spectra, strict=True):
@@ -275,30 +311,6 @@ class PointMixer:
             for k in range(functions.count):
                 out[k] = rows.T @ (weights[:, k, None] * columns).astype(np.complex64)
         self.lipschitz = self._largest()
-
-    def forward(self, psfs: Numbers) -> Array:
-        """Return images (n_images, height, width) of PSFs (n_functions, psf height, psf width)."""
-        padded = np.zeros((len(psfs), *self._grid), np.float32)
-        padded[:, : self._psf[0], : self._psf[1]] = psfs
-        spectra = fft.rfft(padded)
-        seen = np.stack([np.einsum("kyx,kyx->yx", row, spectra) for row in self._spectra])
-        return np.ascontiguousarray(fft.irfft(seen, self._grid[1])[self._window])
-
-    def adjoint(self, images: Numbers) -> Array:
-        """Return the exact transpose."""
-        padded = np.zeros((len(images), *self._grid), np.float32)
-        padded[self._window] = images
-        spectra = np.conj(fft.rfft(padded))
-        total = np.zeros(self._spectra.shape[1:], np.complex64)
-        for row, image in zip(self._spectra, spectra, strict=True):
-            total += row * image
-        back = fft.irfft(np.conj(total), self._grid[1])
-        return np.ascontiguousarray(back[:, : self._psf[0], : self._psf[1]])
-
-    @property
-    def _window(self) -> tuple[slice, slice, slice]:
-        (top, left), (height, width) = ((n - 1 for n in self._psf), self._sensor)
-        return slice(None), slice(top, top + height), slice(left, left + width)
 
     def _largest(self) -> float:
         largest = 0.0

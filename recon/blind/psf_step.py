@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.base import fft
-from recon.blind.points import Points
+from recon.blind.points import Mixer, Points
 from recon.camera.base import Array
 from recon.camera.convolution import field_of
 from recon.camera.registration import LOCAL_MEAN_PX
@@ -84,7 +84,7 @@ def _noise(image: Floats) -> float:
     return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6))
 
 
-class BeadMixer:
+class BeadMixer(Mixer):
     """The map from PSFs to images with the beads fixed: ``b_i = C sum_j h_j * (M_j y_i)`` (Eq. 5.11).
 
     Parameters
@@ -111,9 +111,8 @@ class BeadMixer:
         psf_shape: tuple[int, int],
         sensor_shape: tuple[int, int],
     ) -> None:
-        self.psf_shape, self.sensor_shape = psf_shape, sensor_shape
+        super().__init__(psf_shape, sensor_shape)
         field_shape, _ = field_of(sensor_shape, psf_shape)
-        self._grid = fft.fast_shape(field_shape)
         self._spectra = np.empty((len(beads), len(weights), *fft.spectrum_shape(self._grid)), np.complex64)
         padded = np.zeros((len(weights), *self._grid), np.float32)
         sums = np.empty((len(beads), len(weights)))
@@ -122,32 +121,6 @@ class BeadMixer:
             sums[i] = padded.sum(axis=(1, 2), dtype=np.float64)
             fft.rfft(padded, out=self._spectra[i])
         self.lipschitz = float(np.linalg.norm(sums, 2) ** 2)
-
-    def forward(self, psfs: Array) -> Floats:
-        """Return images (n_images, height, width) of PSFs (n_psfs, psf height, psf width)."""
-        padded = np.zeros((len(psfs), *self._grid), np.float32)
-        padded[:, : self.psf_shape[0], : self.psf_shape[1]] = psfs
-        spectra = fft.rfft(padded)
-        seen = np.stack([np.einsum("jyx,jyx->yx", row, spectra) for row in self._spectra])
-        images = fft.irfft(seen, self._grid[1])
-        return np.ascontiguousarray(images[self._sensor])
-
-    def adjoint(self, images: Array) -> Floats:
-        """Return the exact transpose."""
-        padded = np.zeros((len(images), *self._grid), np.float32)
-        padded[self._sensor] = images
-        spectra = np.conj(fft.rfft(padded))
-        total = np.zeros(self._spectra.shape[1:], np.complex64)
-        for row, image in zip(self._spectra, spectra, strict=True):
-            total += row * image
-        # corr(y, r) = irfft(conj(Y) R) = irfft(conj(Y conj(R)))
-        back = fft.irfft(np.conj(total), self._grid[1])
-        return np.ascontiguousarray(back[:, : self.psf_shape[0], : self.psf_shape[1]])
-
-    @property
-    def _sensor(self) -> tuple[slice, slice, slice]:
-        (top, left), (height, width) = ((n - 1 for n in self.psf_shape), self.sensor_shape)
-        return slice(None), slice(top, top + height), slice(left, left + width)
 
 
 def limit_rank(psfs: Array, rank: int) -> Array:

@@ -163,9 +163,12 @@ def _settings_for(problem: ChartProblem) -> tuple[Setting, ...]:
     asked = _asked(problem)
     own = [m for m in MODELS if m != "auto" and (_varies(problem) or m == "convolution")]
     devices: list[Device] = ["cpu", "gpu"] if _has_gpu() else ["cpu"]
-    ways = product(SOLVERS, (*own, *CAMERAS), PRIORS, problem.binnings, (False, True), PRECISIONS, devices)
-    taken = (setting for setting in (Setting(*way) for way in ways) if setting.refusal(asked) is None)
-    return tuple(sorted(taken, key=lambda setting: setting.cost(volume=problem.volume)))
+    ways = product(SOLVERS, (*own, *CAMERAS), PRIORS, (1,), (False, True), PRECISIONS[:1], devices)
+    taken = [setting for setting in (Setting(*way) for way in ways) if setting.refusal(asked) is None]
+    # No solver refuses a binning or a precision: each is asked once for all of them.
+    finer = product(taken, problem.binnings, PRECISIONS)
+    found = (replace(setting, binning=factor, precision=precision) for setting, factor, precision in finer)
+    return tuple(sorted(found, key=lambda setting: setting.cost(volume=problem.volume)))
 
 
 @lru_cache(maxsize=2)

@@ -35,7 +35,7 @@ from recon.evaluation.scene_trial import (
 )
 from recon.evaluation.trial import own_methods
 from recon.verdict.cases import OF_VOLUMES
-from recon.verdict.map import Axis, Cell, Size, StressMap, Trial, cell_of
+from recon.verdict.map import Cell, Size, Stress, StressMap, Trial, cell_of
 
 # Scenes ---------------------------------------------------------------------------------------------
 PICTURE = SceneSpec("sparse-picture")
@@ -62,18 +62,18 @@ def _width(sigma_deg: float, size: Size) -> str:
 
 # Stresses: key, what, unit, full values, quick values, logarithmic ----------------------------------
 _LIGHT = ("photons", "light at the brightest pixel", "electrons")
-ELECTRONS = Axis(*_LIGHT, (10, 30, 100, 300, 1000, 3000, 30_000), (10, 100, 1000, 10_000), True)
-LIGHT_OF_VIDEO = Axis(*_LIGHT, (10, 30, 100, 300, 1000), (30, 300), True)
-READ_NOISE = Axis("read_noise_e", "read noise", "electrons", (1, 3, 10, 30, 100), (1, 10, 100), True)
-ERASED = Axis("erased", "erased pixels", "share", (0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95), (0, 0.4, 0.8, 0.95))
-SATURATED = Axis(
+ELECTRONS = Stress(*_LIGHT, (10, 30, 100, 300, 1000, 3000, 30_000), (10, 100, 1000, 10_000), True)
+LIGHT_OF_VIDEO = Stress(*_LIGHT, (10, 30, 100, 300, 1000), (30, 300), True)
+READ_NOISE = Stress("read_noise_e", "read noise", "electrons", (1, 3, 10, 30, 100), (1, 10, 100), True)
+ERASED = Stress("erased", "erased pixels", "share", (0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95), (0, 0.4, 0.8, 0.95))
+SATURATED = Stress(
     "saturation",
     "full scale",
     "of the brightest pixel",
     (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1),
     (0.2, 0.4, 0.6, 1),
 )
-BACKGROUND = Axis(
+BACKGROUND = Stress(
     "background",
     "smooth background",
     "of the scene's mean",
@@ -81,8 +81,8 @@ BACKGROUND = Axis(
     (0.1, 1, 10, 30),
     True,
 )
-DEPTHS = Axis("depths", "depth planes over the same range", "planes", (2, 4, 8, 12), (2, 8), True)
-FARTHEST = Axis(
+DEPTHS = Stress("depths", "depth planes over the same range", "planes", (2, 4, 8, 12), (2, 8), True)
+FARTHEST = Stress(
     "z_far",
     "farthest plane (nearest: 3)",
     "distances from diffuser to sensor",
@@ -90,23 +90,23 @@ FARTHEST = Axis(
     (4, 6, 9, 15),
     True,
 )
-SIZE_ERROR = Axis(
+SIZE_ERROR = Stress(
     "size_error", "depth error: PSF too large by", "%", (0.5, 1, 2, 3, 5, 8), (1, 3, 5, 8), True
 )
-ROTATION = Axis("drift_deg", "rotation", "degrees", (0.3, 1, 3, 5, 8, 12), (1, 3, 5, 8), True)
-FINE_ROTATION = Axis("drift_deg", "rotation", "degrees", (0.1, 0.3, 0.6, 1, 2, 4), (0.1, 0.5, 2), True)
-SWELLING = Axis(
+ROTATION = Stress("drift_deg", "rotation", "degrees", (0.3, 1, 3, 5, 8, 12), (1, 3, 5, 8), True)
+FINE_ROTATION = Stress("drift_deg", "rotation", "degrees", (0.1, 0.3, 0.6, 1, 2, 4), (0.1, 0.5, 2), True)
+SWELLING = Stress(
     "drift_scale", "swelling", "relative", (0.003, 0.01, 0.03, 0.1, 0.2), (0.01, 0.03, 0.1, 0.2), True
 )
-FINE_SWELLING = Axis(
+FINE_SWELLING = Stress(
     "drift_scale", "swelling", "relative", (0.001, 0.003, 0.01, 0.03), (0.001, 0.005, 0.02), True
 )
-SHIFT = Axis("drift_px", "shift", "pixels", (0.1, 0.3, 0.6, 1, 2, 4), (0.3, 1, 4), True)
-COLOUR = Axis("colour", "deflection at another colour", "% more", (0.3, 1, 3, 5, 10, 20), (1, 5, 20), True)
-POINTS_A_SIDE = Axis(
+SHIFT = Stress("drift_px", "shift", "pixels", (0.1, 0.3, 0.6, 1, 2, 4), (0.3, 1, 4), True)
+COLOUR = Stress("colour", "deflection at another colour", "% more", (0.3, 1, 3, 5, 10, 20), (1, 5, 20), True)
+POINTS_A_SIDE = Stress(
     "grid", "calibration points along a side", "points", (1, 2, 3, 5, 7), (1, 3, 5), named=_spacing
 )
-FALL_OFF = Axis(
+FALL_OFF = Stress(
     "fall_off_deg",
     "angular response, sigma",
     "degrees; um in the scene",
@@ -114,7 +114,7 @@ FALL_OFF = Axis(
     (9, 13, 40),
     named=_width,
 )
-VOXELS = Axis(
+VOXELS = Stress(
     "lit",
     "voxels that are not dark",
     "share",
@@ -122,28 +122,28 @@ VOXELS = Axis(
     (0.0003, 0.001, 0.003, 0.01),
     True,
 )
-PLANES = Axis("depths", "voxels per pixel (depth planes)", "planes", (1, 2, 4, 8), (1, 2, 8), True)
-LEAVES = Axis("leaves", "edges: shapes in the picture", "shapes", (4, 10, 25, 60, 150), (4, 20, 100), True)
-PER_PIXEL = Axis(
+PLANES = Stress("depths", "voxels per pixel (depth planes)", "planes", (1, 2, 4, 8), (1, 2, 8), True)
+LEAVES = Stress("leaves", "edges: shapes in the picture", "shapes", (4, 10, 25, 60, 150), (4, 20, 100), True)
+PER_PIXEL = Stress(
     "per_pixel", "unknowns per measured pixel", "by erasing", (1, 1.5, 2.5, 5, 10), (1, 2, 4), True
 )
-SEPARATION = Axis(
+SEPARATION = Stress(
     "separation", "separation of neighbours", "pixels", (1, 1.5, 2, 2.5, 3, 4, 5, 6), (1.5, 2.5, 4, 6)
 )
-SOURCES = Axis("sources", "points in a row", "points", (2, 3, 4, 6, 8, 12, 16), (2, 4, 8), True)
-ITERATIONS = Axis("iterations", "iterations", "", (30, 100, 300, 1000), (30, 100), True)
-SIDE = Axis("pixels", "size of the picture", "pixels", (32, 64, 128, 256), (32, 64), True)
-PENALTY = Axis("penalty", "penalty or step", "of the default", (0.1, 0.3, 1, 3, 10), (0.1, 1, 10), True)
-WEIGHT = Axis("weight", "weight of the prior", "of the default", (0.1, 0.3, 1, 3, 10), (0.1, 1, 10), True)
-MOTION = Axis("motion", "motion", "pixels a frame", (0, 0.03, 0.1, 0.3, 1, 3), (0, 0.3, 3))
-ACTIVE = Axis(
+SOURCES = Stress("sources", "points in a row", "points", (2, 3, 4, 6, 8, 12, 16), (2, 4, 8), True)
+ITERATIONS = Stress("iterations", "iterations", "", (30, 100, 300, 1000), (30, 100), True)
+SIDE = Stress("pixels", "size of the picture", "pixels", (32, 64, 128, 256), (32, 64), True)
+PENALTY = Stress("penalty", "penalty or step", "of the default", (0.1, 0.3, 1, 3, 10), (0.1, 1, 10), True)
+WEIGHT = Stress("weight", "weight of the prior", "of the default", (0.1, 0.3, 1, 3, 10), (0.1, 1, 10), True)
+MOTION = Stress("motion", "motion", "pixels a frame", (0, 0.03, 0.1, 0.3, 1, 3), (0, 0.3, 3))
+ACTIVE = Stress(
     "active", "points that flash in a frame", "share", (0.01, 0.03, 0.1, 0.3, 0.5), (0.03, 0.5), True
 )
 _OF_MASK = ("mask pixels", (0, 0.1, 0.25, 0.5, 1, 2), (0, 0.25, 1))
-MASK_SHIFT = Axis("shift_x", "shift of the mask", *_OF_MASK)
-ROLL = Axis("roll", "rotation: shift at the edge", *_OF_MASK)
-DEFOCUS = Axis("z_um", "mask too far by", "um", (0, 5, 12, 25, 50, 100), (0, 25, 100))
-DISTORTION = Axis("cubic", "distortion: shift at the corners", *_OF_MASK)
+MASK_SHIFT = Stress("shift_x", "shift of the mask", *_OF_MASK)
+ROLL = Stress("roll", "rotation: shift at the edge", *_OF_MASK)
+DEFOCUS = Stress("z_um", "mask too far by", "um", (0, 5, 12, 25, 50, 100), (0, 25, 100))
+DISTORTION = Stress("cubic", "distortion: shift at the corners", *_OF_MASK)
 
 # Rows -----------------------------------------------------------------------------------------------
 _TV_L1 = ("admm tv" + OF_VOLUMES, "admm l1" + OF_VOLUMES)
@@ -156,7 +156,7 @@ Changes = Callable[[float, float, int], Mapping[str, Any]]
 def _of_scene(
     title: str,
     question: str,
-    what: tuple[SceneSpec, Axis, Axis],
+    what: tuple[SceneSpec, Stress, Stress],
     methods: tuple[str, ...],
     options: Options | None = None,
     changes: Changes | None = None,

@@ -27,8 +27,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recon.analysis.correlation import RESOLUTION_LEVEL
 from recon.analysis.resolution import axial_resolution, lateral_resolution
 from recon.camera.camera_model import ModelName
+from recon.camera.refocus import central_psfs
 from recon.errors import InputError
 from recon.evaluation.scene import SceneSpec, TestScene, make_scene
 from recon.evaluation.trial import Setting
@@ -38,6 +40,7 @@ from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
 from recon.reconstruction.solvers import SOLVERS
 from recon.verdict.cases import OF_VOLUMES
+from recon.verdict.evidence import SMOOTH_PX
 from recon.verdict.map import (
     WORST,
     Failure,
@@ -56,8 +59,6 @@ Floats = npt.NDArray[np.float64]
 Chosen = npt.NDArray[np.bool_]
 
 PIXELS: Mapping[Size, int] = {"quick": 48, "full": 64}
-LEVEL = 0.7
-"""Autocorrelation taken for resolved (Kuo 2020, sec. 3.2)."""
 LEAST_RESOLVED_PX = 2.0
 """No grid of pixels tells neighbours apart that are nearer: there must be a darker pixel between them."""
 LOST_SHARE = 0.1
@@ -69,8 +70,6 @@ ENOUGH = round(1 / LOST_SHARE)
 points has no others."""
 PEAK_SHARE = 0.25
 """A peak counts from this share of the median height at the true points."""
-SMOOTHING_PX = 0.7
-"""A point between pixels is shared by up to four: smooth before peaks are looked for."""
 ITERATIONS = {"quick": 150, "full": 200}
 LEFT_OUT, SUBTRACTED = ", left out", ", subtracted"
 """Behind a method's name: that saturated pixels are left out, that the true background is subtracted."""
@@ -173,8 +172,8 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     """Return error and severities of a picture or volume (n_z, height, width)."""
     from scipy.ndimage import gaussian_filter
 
-    psf = central_psfs(scene)
-    resolved_px = lateral_resolution(psf[len(psf) // 2], LEVEL).mean_px
+    psf = central_psfs(scene.calibration)[1].mean(axis=1)
+    resolved_px = lateral_resolution(psf[len(psf) // 2]).mean_px
     # What lies within the optics' own spot cannot be asked for.
     blur = (0.7 if len(found) > 1 else 0.0, 0.5 * resolved_px, 0.5 * resolved_px)
     seen, wanted, back = (
@@ -190,17 +189,6 @@ def judge_image(scene: TestScene, found: Image, truth: Image) -> tuple[float, Se
     elif len(found) == 1:
         severities[Failure.RESOLUTION] = resolution_severity(seen[0], wanted[0], nominal_px)
     return error, severities
-
-
-def central_psfs(scene: TestScene) -> Image:
-    """Return the PSF nearest to the axis at each depth, the nearest depth first, (n_z, height, width)."""
-    positions = scene.calibration.source_positions_um
-    planes = []
-    for z in scene.z_um:
-        members = np.flatnonzero(positions[:, 2] == z)
-        nearest = members[np.argmin(np.hypot(*positions[members, :2].T))]
-        planes.append(scene.calibration.psfs[nearest].mean(axis=0))
-    return np.stack(planes)
 
 
 def back_projection(scene: TestScene, psf: Image) -> Image:
@@ -222,7 +210,7 @@ def _depth_reach(scene: TestScene, psf: Image) -> float:
         return REACH_PX
     middle = len(psf) // 2
     step = axial_resolution(
-        psf[middle], float(scene.z_um[middle]), scene.camera.distance_um, LEVEL
+        psf[middle], float(scene.z_um[middle]), scene.camera.distance_um, RESOLUTION_LEVEL
     ).step_per_um
     spacing = float(np.abs(np.diff(1 / scene.z_um)).mean())
     return max(REACH_PX, step / spacing) if np.isfinite(step) else REACH_PX
@@ -335,7 +323,7 @@ def _peaks(image: Image) -> tuple[Floats, Floats]:
     """Return places (n, 3) and heights of the local maxima."""
     from scipy.ndimage import gaussian_filter, maximum_filter
 
-    smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX)
+    smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTH_PX)
     at = np.argwhere((smooth == maximum_filter(smooth, 3)) & (smooth > 0))
     return at.astype(np.float64), smooth[tuple(at.T)]
 

@@ -84,6 +84,9 @@ class HologramModel:
     ) -> None:
         if not targets:
             raise InputError("A hologram needs at least one target.")
+        from recon.holography import _kernels  # late: numba takes half a second to import
+
+        self._kernels = _kernels
         options = with_overrides(options or HologramOptions(), overrides)
         self.display = display
         self.targets = tuple(targets)
@@ -131,20 +134,18 @@ class HologramModel:
 
     def evaluate(self, slm: ComplexArray) -> Evaluation:
         """Return loss, gradient and PSNR for SLM patterns, complex (n_frames, height, width)."""
-        from recon.holography import _kernels
-
         patterns = self._check(slm)
         gradient = np.zeros((self.frames, *self.display.slm_shape), self.dtype)
         loss = 0.0
         errors = []
         for plane in range(len(self.targets)):
             self._intensity_spectrum(patterns, plane)
-            error = _kernels.filtered_power(
+            error = self._kernels.filtered_power(
                 self._spectrum, self._wanted[plane], self.band.cutoff, self.band.top, self.band.full
             )
             errors.append(error / self.peaks[plane] ** 2)
             loss += self._loss(plane, error)
-            _kernels.columns(self._spectrum, False, get_threads())
+            self._kernels.columns(self._spectrum, False, get_threads())
             for frame in range(self.frames):
                 self._backward(frame, plane, gradient[frame])
         gradient *= self._real.type(self.display.dc.modulated)
@@ -175,12 +176,10 @@ class HologramModel:
         ``amplitude`` is complex on the band's ``shape`` in FFT order (Kuo 2020, Eqs. 7.11 and 7.12, without
         taking the phase).
         """
-        from recon.holography import _kernels
-
         self._field[0] = amplitude
         spectrum = np.zeros_like(self._spectrum)
         spectrum[:, 0] = 1
-        _kernels.rows_from_spectrum(
+        self._kernels.rows_from_spectrum(
             self._field[0],
             spectrum,
             np.ones_like(self._ey),
@@ -200,12 +199,10 @@ class HologramModel:
 
     def _mean_power(self) -> float:
         """Return the mean light that passes from an SLM of random phases, relative to a mask in place."""
-        from recon.holography import _kernels
-
         display = self.display
         if self._nodes is None:
             return 1.0
-        mixed, covered = _kernels.mean_power(
+        mixed, covered = self._kernels.mean_power(
             self._nodes, display.mask.shape, display.slm_shape, display.factor
         )
         if covered == 0:
@@ -223,8 +220,6 @@ class HologramModel:
 
     def _intensity_spectrum(self, patterns: ComplexArray, plane: int) -> None:
         """Fill ``_field`` with the image plane's fields and ``_spectrum`` with the intensity's kept lags."""
-        from recon.holography import _kernels
-
         mask, k = self.display.mask.levels, self.display.factor
         height, width = mask.shape
         hy, hx = self._defocus[plane]
@@ -234,41 +229,39 @@ class HologramModel:
 
             def fill(start: int, stop: int, field: Any = field, pattern: Any = pattern) -> None:
                 if self._nodes is None:
-                    _kernels.fill(field, pattern, mask, self._table, hy, hx, k, start, stop)
+                    self._kernels.fill(field, pattern, mask, self._table, hy, hx, k, start, stop)
                 else:
-                    _kernels.fill_displaced(
+                    self._kernels.fill_displaced(
                         field, pattern, mask, self._table, hy, hx, self._nodes, k, start, stop
                     )
 
             in_blocks(fill, height, grain=64)
-            _kernels.columns(field[:, :width], True, get_threads())
+            self._kernels.columns(field[:, :width], True, get_threads())
             scale = 1.0 / np.prod(self.band.shape)
 
             def rows(start: int, stop: int, field: Any = field, scale: float = scale) -> None:
-                _kernels.rows_to_spectrum(
+                self._kernels.rows_to_spectrum(
                     field, self._spectrum, self._ey, self._ex, width, scale, start, stop
                 )
 
             in_blocks(rows, self.band.shape[0], grain=64)
-        _kernels.columns(self._spectrum, True, get_threads())
+        self._kernels.columns(self._spectrum, True, get_threads())
 
     def _loss(self, plane: int, error: float) -> float:
         """Return the loss and turn the kept lags into those of ``dL/dI`` (Kuo 2020, Eq. A.9)."""
-        from recon.holography import _kernels
-
         band, spectrum = self.band, self._spectrum
         if self._cutoff == 0:
-            error = _kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
-        _kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)
+            error = self._kernels.filtered_power(spectrum, self._wanted[plane], 0.0, band.top, band.full)
+        self._kernels.subtract_and_filter(spectrum, self._wanted[plane], self._cutoff, band.top)
         loss = error / 2
         if not self.loss.mean_square:
-            _kernels.copy_kept(spectrum, self._small, *band.kept, band.top)
+            self._kernels.copy_kept(spectrum, self._small, *band.kept, band.top)
             irfft(self._small, self._seen.shape[1], out=self._seen)
             self._seen *= self._real.type(self._seen.size)
             loss, gradient = self.loss.evaluate(self._seen, self._wanted_images[plane], self._weights)
             rfft(np.ascontiguousarray(gradient, self._real), out=self._small)
-            _kernels.copy_kept(self._small, spectrum, *band.kept, band.top)
-        _kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
+            self._kernels.copy_kept(self._small, spectrum, *band.kept, band.top)
+        self._kernels.low_pass(spectrum, band.kept[0], self._cutoff, band.top)
         return loss
 
     def _image(self, spectrum: ComplexArray) -> npt.NDArray[Any]:
@@ -277,40 +270,34 @@ class HologramModel:
 
     def _image_of(self, spectrum: ComplexArray, cutoff: float) -> npt.NDArray[Any]:
         """Return the image of a half spectrum in FFT order, low-passed where the cut-off is above 0."""
-        from recon.holography import _kernels
-
         height, width = self.band.seen_shape
         small = np.empty((height, width // 2 + 1), self.dtype)
-        _kernels.copy_kept(spectrum, small, *self.band.kept, self.band.top)
-        _kernels.low_pass(small, self.band.kept[0], cutoff, self.band.top)
+        self._kernels.copy_kept(spectrum, small, *self.band.kept, self.band.top)
+        self._kernels.low_pass(small, self.band.kept[0], cutoff, self.band.top)
         image = irfft(small, width)
         image *= self._real.type(height * width)
         return image
 
     def _backward(self, frame: int, plane: int, out: ComplexArray) -> None:
-        from recon.holography import _kernels
-
         field = self._field[frame]
         scale = 1.0 / np.prod(self.band.shape)
 
         def rows(start: int, stop: int) -> None:
-            _kernels.rows_from_spectrum(field, self._spectrum, self._ey, self._ex, scale, start, stop)
+            self._kernels.rows_from_spectrum(field, self._spectrum, self._ey, self._ex, scale, start, stop)
 
         in_blocks(rows, self.band.shape[0], grain=64)
         self._columns_and_gather(frame, plane, out)
 
     def _columns_and_gather(self, frame: int, plane: int, out: ComplexArray) -> None:
-        from recon.holography import _kernels
-
         mask, k, nodes = self.display.mask.levels, self.display.factor, self._nodes
         height, width = mask.shape
         hy, hx = self._defocus[plane]
         field = self._field[frame]
-        _kernels.columns(field[:, :width], False, get_threads())
+        self._kernels.columns(field[:, :width], False, get_threads())
         if nodes is None:
 
             def gather(start: int, stop: int) -> None:
-                _kernels.gather(out, field, mask, self._table, hy, hx, k, start, stop)
+                self._kernels.gather(out, field, mask, self._table, hy, hx, k, start, stop)
 
             in_blocks(gather, out.shape[0], grain=16)
             return
@@ -321,7 +308,7 @@ class HologramModel:
         def scatter(start: int, stop: int) -> None:
             for n in range(start, stop):
                 moved = nodes - np.array([parts[n][0] * k, 0], nodes.dtype)
-                _kernels.gather_displaced(
+                self._kernels.gather_displaced(
                     sums[n], field, mask, self._table, hy, hx, moved, k, edges[n], edges[n + 1]
                 )
 

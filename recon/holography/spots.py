@@ -46,10 +46,6 @@ class PoseProbe:
     and ``a-`` comes ``g_p = (a+ - a-) / (a+ + a-)``, zero at the right pose. How ``g`` depends on a small
     error in every parameter is computed once, from the fields themselves; errors in all parameters then
     follow from one linear system.
-
-    Parameters
-    ----------
-    maker : SpotMaker
     """
 
     def __init__(self, maker: SpotMaker) -> None:

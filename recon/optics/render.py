@@ -18,7 +18,7 @@ from scipy import fft
 from recon.optics.fall_off import FallOff, response_on
 from recon.optics.grid import PixelGrid, mixed_spectrum
 from recon.optics.scene import Layer, Scene
-from recon.optics.wave import Propagator
+from recon.optics.wave import WavePropagator
 
 Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
@@ -46,7 +46,7 @@ def render(
     scene: Scene,
     weights: Weights,
     grid: PixelGrid,
-    propagator: Propagator,
+    propagator: WavePropagator,
     fall_off: FallOff,
     *,
     layer_photons: float,
@@ -99,7 +99,7 @@ def _render_layer(
     layer: Layer,
     weights: Weights,
     grid: PixelGrid,
-    propagator: Propagator,
+    propagator: WavePropagator,
     fall_off: FallOff,
     settings: RenderSettings,
 ) -> Image:
@@ -129,7 +129,7 @@ class _LayerRenderer:
         pick: Weights,
         spectral_weights: Weights,
         grid: PixelGrid,
-        propagator: Propagator,
+        propagator: WavePropagator,
         fall_off: FallOff,
         settings: RenderSettings,
     ) -> None:

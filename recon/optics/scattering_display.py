@@ -140,14 +140,14 @@ class ScatteringDisplay:
         _resample(
             (modulated + stray).astype(np.complex64),
             field,
-            spec.mask_pitch_um / spec.oversampling,
-            spec.slm_pitch_um,
-            pose.shift_x_um,
-            pose.shift_y_um,
-            (1 + spec.magnification) * np.cos(pose.roll_mrad * 1e-3),
-            (1 + spec.magnification) * np.sin(pose.roll_mrad * 1e-3),
+            (spec.mask_pitch_um / spec.oversampling, spec.slm_pitch_um),
+            (pose.shift_x_um, pose.shift_y_um),
+            (
+                (1 + spec.magnification) * np.cos(pose.roll_mrad * 1e-3),
+                (1 + spec.magnification) * np.sin(pose.roll_mrad * 1e-3),
+            ),
             spec.relay_distortion_um / corner_um**3,
-            *spec.relay_centre_um,
+            spec.relay_centre_um,
         )
         tilted = pose.pitch_mrad != 0 or pose.yaw_mrad != 0
         if pose.z_um == 0 and not tilted:
@@ -202,21 +202,22 @@ class ScatteringDisplay:
 
 
 @compiled
-def _resample(  # noqa: PLR0913 - compiled
+def _resample(
     slm: Complex,
     field: Complex,
-    pitch_um: float,
-    slm_pitch_um: float,
-    shift_x_um: float,
-    shift_y_um: float,
-    cosine: float,
-    sine: float,
+    pitches_um: tuple[float, float],
+    shift_um: tuple[float, float],
+    turn: tuple[float, float],
     cubic: float,
-    centre_x_um: float,
-    centre_y_um: float,
+    centre_um: tuple[float, float],
 ) -> None:
-    """Average the SLM's image over every cell of the mask's frame; dark outside the SLM."""
+    """Average the SLM's image over every cell of the mask's frame; dark outside the SLM.
+
+    Pitches are of the cells and of the SLM; ``turn`` is cosine and sine, times the scale.
+    """
     height, width = field.shape
+    (pitch_um, slm_pitch_um), (cosine, sine) = pitches_um, turn
+    (shift_x_um, shift_y_um), (centre_x_um, centre_y_um) = shift_um, centre_um
     part = pitch_um / slm_pitch_um
     for i in range(height):
         y_mask = (i - 0.5 * (height - 1)) * pitch_um

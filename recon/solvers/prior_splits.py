@@ -8,7 +8,7 @@ split ``z = y`` with its own prox and penalty, which adds to the pixels'.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy as shallow_copy
 from typing import Any
 
@@ -307,8 +307,15 @@ class PriorSplits:
         return thresholds
 
 
-def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable, tuple[Prior, ...]]:
-    """Take a prior apart: total variation in two dimensions, the separable part, and all others.
+def is_plain(tv: TotalVariation) -> bool:
+    """Whether differences wrap around and weigh alike, as the sweeps of pictures have them."""
+    return np.array_equal(tv.axis_weights, (1.0, 1.0)) and tv.wrap in (None, (True, True))
+
+
+def split_prior(
+    prior: Prior, has_sweep: Callable[[TotalVariation], bool] = is_plain
+) -> tuple[TotalVariation | None, Separable, tuple[Prior, ...]]:
+    """Take a prior apart: total variation of the kind that a solver has a sweep for, separable part, others.
 
     Raises
     ------
@@ -319,17 +326,12 @@ def split_prior(prior: Prior) -> tuple[TotalVariation | None, Separable, tuple[P
     for term in prior.terms():
         if isinstance(term, Separable):
             separable = separable.with_separable(term)
-        elif tv is None and isinstance(term, TotalVariation) and _is_plain(term):
+        elif tv is None and isinstance(term, TotalVariation) and has_sweep(term):
             tv = term
         else:
             others.append(term)
     require_exact(*others)
     return tv, separable, tuple(others)
-
-
-def _is_plain(tv: TotalVariation) -> bool:
-    """Whether differences wrap around and weigh alike."""
-    return np.array_equal(tv.axis_weights, (1.0, 1.0)) and tv.wrap in (None, (True, True))
 
 
 def require_exact(*priors: Prior) -> None:

@@ -6,6 +6,7 @@ their compiled subclasses replace single steps where the arrays are NumPy's and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +20,9 @@ from recon.camera.convolution import Convolution
 from recon.camera.factors import BackgroundRemoval
 from recon.solvers.base import Solver
 from recon.solvers.memory import Storage
+
+MOST_STEPS, MOST_STEPS_OF_OPERATOR = 30, 8
+"""Conjugate gradient steps of one iteration at most."""
 
 
 class SensorSystem:
@@ -37,15 +41,16 @@ class SensorSystem:
     grid_shape : (int, int)
     window : tuple of slice
         Where the sensor lies on the grid.
-    valid : ndarray of bool, (height, width), optional
-        Pixels that were measured; default all.
-    background : BackgroundRemoval, optional
-        A smooth background to be estimated as well, for the same valid pixels: a projection that is a further
+    measured : SensorData
+        Its valid pixels, and a smooth background to be estimated as well: a projection that is a further
         factor of ``C``.
     dtype : dtype
-    max_steps : int
     xp : module
         Whose arrays: ``numpy`` or ``cupy``.
+    bend : callable, optional
+        ``bend(e)`` returns ``A T^-1 A^H e`` of a camera that is no convolution: ``q`` is then that of the
+        convolution that the system is preconditioned with. Each of its few steps costs as much as an
+        iteration of FISTA.
 
     Attributes
     ----------
@@ -57,17 +62,18 @@ class SensorSystem:
         self,
         grid_shape: tuple[int, int],
         window: tuple[slice, slice],
-        valid: npt.NDArray[np.bool_] | None = None,
-        background: BackgroundRemoval | None = None,
+        measured: SensorData,
         *,
         dtype: npt.DTypeLike = np.float32,
-        max_steps: int = 30,
         xp: Namespace = np,
+        bend: Callable[[Array], Array] | None = None,
     ) -> None:
+        valid, background = measured.valid, measured.background
         self.xp = xp
         self.window = window
         self.tolerance = 1e-4
-        self.max_steps = max_steps
+        self.max_steps = MOST_STEPS if bend is None else MOST_STEPS_OF_OPERATOR
+        self._operator_bend = bend
         self.dtype = np.dtype(dtype)
         self._basis = None if background is None else [xp.asarray(part) for part in background.basis(0)]
         self._mask = None if valid is None or valid.all() else xp.asarray(valid.astype(self.dtype))
@@ -124,7 +130,9 @@ class SensorSystem:
 
     def _bend(self, e: Array) -> Array:
         """``C q C^T e``."""
-        return self._filtered(e, self._q)
+        return (
+            self._filtered(e, self._q) if self._operator_bend is None else self.masked(self._operator_bend(e))
+        )
 
     def solve(self, right: Array, e: Array) -> None:
         """Improve ``e`` in place until the residual is down to the tolerance."""
@@ -240,6 +248,9 @@ class VolumeSplitting(Solver):
     room : Room
     relaxation : float
         The method's own, where ``tuning`` names none.
+    bend : callable, optional
+        Of a camera that is no convolution, as :class:`SensorSystem`; ``operator`` is what it is
+        preconditioned with.
     """
 
     def __init__(
@@ -249,6 +260,7 @@ class VolumeSplitting(Solver):
         tuning: Tuning | None,
         room: Room | None,
         relaxation: float,
+        bend: Callable[[Array], Array] | None = None,
     ) -> None:
         super().__init__()
         if operator.domain_shape[0] != 1:
@@ -262,10 +274,10 @@ class VolumeSplitting(Solver):
         self.system = SensorSystem(
             operator.grid_shape,
             operator.sensor_window,
-            data.valid,
-            data.background,
+            data,
             dtype=operator.dtype,
             xp=self.xp,
+            bend=bend,
         )
         image = np.array(data.image, operator.dtype).reshape(operator.sensor_shape)
         self.data = self.system.masked(self.xp.asarray(image))

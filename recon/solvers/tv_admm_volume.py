@@ -14,10 +14,10 @@ from recon.base.threads import get_threads, in_blocks
 from recon.camera.base import Array
 from recon.camera.convolution import Convolution
 from recon.priors.base import Prior
-from recon.priors.total_variation import TotalVariation
 from recon.solvers.douglas_rachford import DouglasRachford, SparseDouglasRachford
+from recon.solvers.prior_splits import split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning
-from recon.solvers.volume_admm import VolumeAdmm, split_volume_prior
+from recon.solvers.volume_admm import VolumeAdmm, is_lateral_periodic
 
 _POSITIVE = 3
 """Which of the four states is that of non-negativity."""
@@ -35,7 +35,7 @@ class LeanTotalVariation(VolumeAdmm):
     @staticmethod
     def knows(prior: Prior) -> bool:
         """Whether a prior is total variation (of any weight) with non-negativity, and nothing else."""
-        _, separable, others = split_volume_prior(prior)
+        _, separable, others = split_prior(prior, is_lateral_periodic)
         bounds = (separable.weight, separable.lower, separable.upper)
         return not others and bounds == (0.0, 0.0, np.inf)
 
@@ -111,7 +111,7 @@ class LeanTotalVariation(VolumeAdmm):
         total = self._totals[0]
         for other in self._totals[1:]:
             total += other
-        return total, np.asarray(self._statistics.sum(axis=0))
+        return self.system.from_spectrum(total), np.asarray(self._statistics.sum(axis=0))
 
     def _boundaries(self, starts: list[int], p: Array) -> tuple[dict[int, Array], dict[int, Array]]:
         """Return the estimate at each worker's first plane, and the z reflections of the plane before it."""
@@ -131,8 +131,8 @@ class LeanTotalVariation(VolumeAdmm):
             )  # fmt: skip
         return first, before
 
-    def _update(self, E: Array) -> None:
-        k = self._kernels
+    def _update(self) -> None:
+        k, E = self._kernels, self._weighted_spectrum()
         dtype = self.operator.dtype
         X, g, E = self.X.view(dtype), self.g.view(dtype), E.view(dtype)
 
@@ -164,10 +164,9 @@ def volume_solver(
         When the prior's prox is not that of its value.
     """
     compiled = room is None or room.xp is np
-    _, separable, others = split_volume_prior(prior)
-    varies = any(isinstance(term, TotalVariation) and term not in others for term in prior.terms())
+    tv, separable, others = split_prior(prior, is_lateral_periodic)
     kind: type[VolumeAdmm | DouglasRachford]
-    if varies or len(others) > 1 or (others and not separable.is_zero):
+    if tv is not None or len(others) > 1 or (others and not separable.is_zero):
         kind = LeanTotalVariation if compiled and LeanTotalVariation.knows(prior) else VolumeAdmm
     else:
         kind = SparseDouglasRachford if compiled and SparseDouglasRachford.knows(prior) else DouglasRachford

@@ -32,7 +32,7 @@ from recon.camera.convolution import Convolution
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
 from recon.solvers.base import IterationRecord
-from recon.solvers.prior_splits import ProxSplit, kept_splits, require_exact, restore_splits
+from recon.solvers.prior_splits import ProxSplit, kept_splits, restore_splits, split_prior
 from recon.solvers.splitting import Room, SensorData, Tuning, VolumeSplitting, is_due, residual_norm, squares
 
 FIRST_PENALTY = 0.5
@@ -41,34 +41,172 @@ _VOLUMES = 16
 """X, H, g, the tridiagonal factors, four states, and what an update of them passes through."""
 
 
-def split_volume_prior(prior: Prior) -> tuple[TotalVariation, Separable, tuple[Prior, ...]]:
-    """Take a prior of a volume apart: total variation without wrap-around in depth, bounds and l1, others.
-
-    Raises
-    ------
-    StructureError
-        When a prior's prox is not that of its value.
-    """
-    tv, separable, others = None, Separable(), []
-    for term in prior.terms():
-        if isinstance(term, Separable):
-            separable = separable.with_separable(term)
-        elif tv is None and isinstance(term, TotalVariation) and _is_lateral_periodic(term):
-            tv = term
-        else:
-            others.append(term)
-    require_exact(*others)
-    return tv or TotalVariation(0.0, axis_weights=(0.0, 0.0, 0.0)), separable, tuple(others)
-
-
-def _is_lateral_periodic(tv: TotalVariation) -> bool:
-    """Whether differences wrap around as this solver's do: in the plane only."""
+def is_lateral_periodic(tv: TotalVariation) -> bool:
+    """Whether differences wrap around as the sweeps of volumes have them: in the plane only."""
     axes = np.shape(tv.axis_weights)[-1]
     wrap = (True,) * axes if tv.wrap is None else tv.wrap
     return axes in (2, 3) and wrap == (False, True, True)[3 - axes :]
 
 
-class VolumeAdmm(VolumeSplitting):
+class ExactAdmm(VolumeSplitting):
+    """The driver of iterations: a data term solved exactly on the sensor, priors split off.
+
+    A subclass says what the object is kept as, how ``T`` is inverted and what the sensor sees
+    (:meth:`_iterate`, :meth:`_predict`, :meth:`_update`), and how differences are taken.
+
+    Attributes
+    ----------
+    S : ndarray, (3, ...)
+        State of the differences; nothing without total variation.
+    splits : tuple of ProxSplit
+        Of the bounds and l1, and of any other prior.
+    """
+
+    S: Array
+    splits: tuple[ProxSplit, ...]
+    separable: Separable
+    kappa: np.floating[Any]
+    _q: Array
+
+    def _begin(self, tv: TotalVariation | None, seen: Array | None, power: Array) -> None:
+        """Set out from an object of which the sensor sees so much; ``power``: the data term's curvature."""
+        self.weight, self.isotropic = (tv.weight, tv.isotropic) if tv else (0.0, False)
+        self.e = self.data.copy() if seen is None else self.data - seen
+        first = self.tuning.first
+        self.penalty = FIRST_PENALTY * float(power.mean()) if first is None else float(first)
+        self._used_penalty = self.penalty
+        self._misfit = 0.5 * squares(self.e)
+
+    # What depends on the camera ----------------------------------------------------------------------
+    def _iterate(self) -> Array:
+        """Return the object, (1, n_z, height, width)."""
+        raise NotImplementedError
+
+    def _differences(self, x: Array) -> Array:
+        """Return ``Psi x``."""
+        raise NotImplementedError
+
+    def _back(self, d: Array) -> Array:
+        """Return ``Psi^T d``."""
+        raise NotImplementedError
+
+    def _predict(self, r: Array) -> Array:
+        """Take the right-hand side; return what the sensor would see of ``T^-1 r``, masked."""
+        raise NotImplementedError
+
+    def _update(self) -> None:
+        """``x <- T^-1 (r + A^H e / mu)``."""
+        raise NotImplementedError
+
+    # -------------------------------------------------------------------------------------------------
+    def step(self) -> IterationRecord:
+        """Do one iteration. ``objective`` is that of the iterate before, negative parts aside."""
+        seen, sums = self._sweep()
+        self._used_penalty = self.penalty
+        self.system.set_curvature(self._q / self.operator.dtype.type(self.penalty))
+        self.system.solve(self.data - seen, self.e)
+        self._update()
+        record = self._record(sums)
+        self.system.follow(max(record.primal_residual, record.dual_residual))
+        return record
+
+    def _sweep(self) -> tuple[Array, Array]:
+        """Update the states from x and take the next right-hand side.
+
+        Returns
+        -------
+        ndarray, (height, width)
+            What the sensor would see of ``T^-1 r``.
+        ndarray, (9,)
+            TV; squared primal residual, dual residual, size of ``Psi x`` and of the multipliers; those four
+            of the splits of x itself.
+        """
+        x = self._iterate()
+        relax = self.relaxation if self.iteration else 1.0
+        sums = np.zeros(9)
+        r = self._advance(x, relax, sums) if self.S.size else self.xp.zeros_like(x)
+        size = squares(x)
+        for one in self.splits:
+            one.set_penalty(self.penalty * float(self.kappa))
+            one.meet(x, relax)
+            r += self.kappa * (2 * one.split - one.state)
+            primal, change, _, multiplier = one.sums
+            sums[5:] += primal, change, size, multiplier
+        return self._predict(r), sums
+
+    def _advance(self, x: Array, relax: float, sums: Array) -> Array:
+        """Advance the differences' state to the present penalty; return its part of the right-hand side."""
+        f, mu, used = x.dtype.type, self.penalty, self._used_penalty
+        d = self._differences(x)
+        taken = self._multiplier(self.S, self.weight / used)
+        before = self.S - taken
+        taken *= f(used / mu)
+        taken += before
+        taken += f(relax) * (d - before)
+        self.S = taken
+        multiplier = self._multiplier(self.S, self.weight / mu)
+        split = self.S - multiplier
+        sizes = self.xp.sqrt((d * d).sum(axis=0)) if self.isotropic else abs(d)
+        sums[0] = float(sizes.sum(dtype=np.float64))
+        sums[1:5] = [squares(v) for v in (d - split, split - before, d, multiplier)]
+        split -= multiplier
+        return self._back(split)
+
+    def _multiplier(self, s: Array, threshold: float) -> Array:
+        """Return the part of the differences' states that shrinking takes away."""
+        xp, t = self.xp, s.dtype.type(threshold)
+        if self.isotropic:
+            least = max(t, xp.finfo(s.dtype).tiny)
+            taken: Array = s * (t / xp.maximum(xp.sqrt((s * s).sum(axis=0)), least))
+        else:
+            taken = xp.clip(s, -t, t)
+        return taken
+
+    def _record(self, sums: Array) -> IterationRecord:
+        tv, primal, dual, kx, y, primal_p, dual_p, xx, y_p = sums
+        kappa = float(self.kappa)
+        # Relative to both sides of the constraint, in the metric of the augmented Lagrangian.
+        primal_residual = float(np.sqrt((primal + kappa * primal_p) / max(kx + kappa * xx, 1e-300)))
+        dual_residual = float(np.sqrt((dual + kappa * dual_p) / max(y + kappa * y_p, 1e-300)))
+        objective = self._misfit + self.weight * float(tv) + self._value()
+        self._misfit = 0.5 * float(self.xp.vdot(self.e, self.e))
+        if self.balance and is_due(self.iteration) and dual_residual > 0:
+            ratio = np.sqrt(primal_residual / dual_residual)
+            self.penalty *= float(np.clip(ratio, 0.2, 5.0))
+        return IterationRecord(
+            0,
+            0.0,
+            objective,
+            residual_norm(self.e),
+            primal_residual,
+            dual_residual,
+            change=float(np.sqrt(dual_p / max(xx, 1e-300))),
+        )
+
+    def _value(self) -> float:
+        """Value of the priors other than total variation, of their split variables."""
+        return sum(one.prior.value(one.split) for one in self.splits)
+
+    @property
+    def solution(self) -> Array:
+        """The split variable that obeys the bounds (without any, the first other prior's), in host memory."""
+        first = self.splits[1 if self.separable.is_zero and len(self.splits) > 1 else 0]
+        return np.array(to_host(first.split))
+
+    def _end(self) -> Array:
+        return self.solution
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with that of the priors' splits."""
+        return {**super().checkpoint(copy=copy), **kept_splits(self.splits)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
+        super().restore(state)
+        restore_splits(self.splits, state)
+
+
+class VolumeAdmm(ExactAdmm):
     """ADMM for one channel of a volume, or of a picture as a volume of one plane.
 
     Parameters
@@ -103,9 +241,8 @@ class VolumeAdmm(VolumeSplitting):
     ) -> None:
         super().__init__(operator, data, tuning, room, 1.8)
         dtype, (_, nz, _, _) = operator.dtype, operator.domain_shape
-        tv, self.separable, self._others = split_volume_prior(prior)
-        self.weight, self.isotropic = tv.weight, tv.isotropic
-        weights = np.asarray(tv.axis_weights, dtype)
+        tv, self.separable, self._others = split_prior(prior, is_lateral_periodic)
+        weights = np.asarray((0.0, 0.0, 0.0) if tv is None else tv.axis_weights, dtype)
         if weights.shape[-1] == 2:
             weights = np.concatenate([np.zeros_like(weights[..., :1]), weights], axis=-1)
         self.axis_weights = np.ascontiguousarray(np.broadcast_to(weights, (nz, 3)))
@@ -113,14 +250,9 @@ class VolumeAdmm(VolumeSplitting):
         start = (
             None if initial is None else np.ascontiguousarray(initial, dtype).reshape(operator.domain_shape)
         )
-        self.e = self.data.copy()
         self._allocate(start)
-        if start is not None:
-            self.e -= self._forward(self.xp.asarray(start[0]))
-        first = self.tuning.first
-        self.penalty = FIRST_PENALTY * float(operator.power().mean()) if first is None else float(first)
-        self._used_penalty = self.penalty
-        self._misfit = 0.5 * squares(self.e)
+        seen = None if start is None else self._forward(self.xp.asarray(start[0]))
+        self._begin(tv, seen, operator.power())
 
     # Steps that compiled code replaces ---------------------------------------------------------------
     def _allocate(self, start: Array | None) -> None:
@@ -171,8 +303,11 @@ class VolumeAdmm(VolumeSplitting):
             R[z] += self._ratio[z] * R[z + 1]
         return R
 
+    def _iterate(self) -> Array:
+        return fft.irfft(self.X, self.operator.grid_shape[1])[None]
+
     def _differences(self, x: Array) -> Array:
-        xp = self.xp
+        xp, x = self.xp, x[0]
         d: Array = xp.empty((3, *x.shape), x.dtype)
         d[0, :-1] = x[1:] - x[:-1]
         d[0, -1] = 0
@@ -181,120 +316,28 @@ class VolumeAdmm(VolumeSplitting):
         d *= self._weights
         return d
 
-    def _multiplier(self, s: Array, threshold: float) -> Array:
-        """Return the part of the differences' states that shrinking takes away."""
-        xp, t = self.xp, self.operator.dtype.type(threshold)
-        if self.isotropic:
-            least = max(t, xp.finfo(s.dtype).tiny)
-            taken: Array = s * (t / xp.maximum(xp.sqrt((s * s).sum(axis=0)), least))
-        else:
-            taken = xp.clip(s, -t, t)
-        return taken
-
-    def _sweep(self) -> tuple[Array, Array]:
-        """Update the states from x and put the next right-hand side's transform R in the place of X.
-
-        Returns
-        -------
-        ndarray, (grid_height, grid_width // 2 + 1)
-            ``sum_z conj(g_z) R_z``.
-        ndarray, (9,)
-            TV; squared primal residual, dual residual, size of ``Psi x`` and of the multipliers; those four
-            of the splits of x itself.
-        """
-        xp, f = self.xp, self.operator.dtype.type
-        mu, used = self.penalty, self._used_penalty
-        relax, dual_scale = f(self.relaxation if self.iteration else 1.0), f(used / mu)
-        x = fft.irfft(self.X, self.operator.grid_shape[1])
-        d = self._differences(x)
-        tv = xp.sqrt((d * d).sum(axis=0)) if self.isotropic else abs(d)
-        c = self._multiplier(self.S, self.weight / used)
-        u = self.S - c
-        self.S = u + dual_scale * c + relax * (d - u)
-        c = self._multiplier(self.S, self.weight / mu)
-        split = self.S - c
-        sums = [
-            float(tv.sum(dtype=np.float64)),
-            squares(d - split),
-            squares(split - u),
-            squares(d),
-            squares(c),
-        ]
-        v = self._weights * (split - c)
-        r = xp.roll(v[1], 1, 1) - v[1] + xp.roll(v[2], 1, 2) - v[2] - v[0]
+    def _back(self, d: Array) -> Array:
+        v = self._weights * d
+        r: Array = self.xp.roll(v[1], 1, 1) - v[1] + self.xp.roll(v[2], 1, 2) - v[2] - v[0]
         r[1:] += v[0, :-1]
-        pixels = np.zeros(4)
-        for one in self.splits:
-            one.set_penalty(mu * float(self.kappa))
-            one.meet(x[None], float(relax))
-            r += self.kappa * (2 * one.split - one.state)[0]
-            primal, change, _, multiplier = one.sums
-            pixels += (primal, change, squares(x), multiplier)
-        self.X = fft.rfft(r)
-        return (xp.conj(self.g) * self.X).sum(axis=0), np.array([*sums, *pixels])
+        return r[None]
 
-    def _update(self, E: Array) -> None:
-        """``X <- T^-1 R + g E``, from R in the place of X."""
-        self.X = self._solve_depths(self.X) + self.g * E
+    def _predict(self, r: Array) -> Array:
+        self.X = fft.rfft(r[0])
+        return self.system.from_spectrum((self.xp.conj(self.g) * self.X).sum(axis=0))
+
+    def _update(self) -> None:
+        self.X = self._solve_depths(self.X) + self.g * self._weighted_spectrum()
 
     # -------------------------------------------------------------------------------------------------
-    def step(self) -> IterationRecord:
-        """Do one iteration. ``objective`` is that of the iterate before, negative parts aside."""
-        total, sums = self._sweep()
-        mu = self.penalty
-        f = self.operator.dtype.type
-        self.system.set_curvature(self._q / f(mu))
-        self.system.solve(self.data - self.system.from_spectrum(total), self.e)
+    def _weighted_spectrum(self) -> Array:
+        """Spectrum of ``e / mu``."""
         E = self.system.spectrum_of(self.e)
-        E /= f(mu)
-        self._update(E)
-        self._used_penalty = mu
-        record = self._record(sums)
-        self.system.follow(max(record.primal_residual, record.dual_residual))
-        return record
-
-    def _record(self, sums: Array) -> IterationRecord:
-        tv, primal, dual, kx, y, primal_p, dual_p, xx, y_p = sums
-        kappa = float(self.kappa)
-        # Relative to both sides of the constraint, in the metric of the augmented Lagrangian.
-        primal_residual = float(np.sqrt((primal + kappa * primal_p) / max(kx + kappa * xx, 1e-300)))
-        dual_residual = float(np.sqrt((dual + kappa * dual_p) / max(y + kappa * y_p, 1e-300)))
-        objective = self._misfit + self.weight * float(tv) + self._value()
-        self._misfit = 0.5 * float(self.xp.vdot(self.e, self.e))
-        if self.balance and is_due(self.iteration) and dual_residual > 0:
-            ratio = np.sqrt(primal_residual / dual_residual)
-            self.penalty *= float(np.clip(ratio, 0.2, 5.0))
-        return IterationRecord(
-            0,
-            0.0,
-            objective,
-            residual_norm(self.e),
-            primal_residual,
-            dual_residual,
-            change=float(np.sqrt(dual_p / max(xx, 1e-300))),
-        )
-
-    def _value(self) -> float:
-        """Value of the priors other than total variation, of their split variables."""
-        return sum(one.prior.value(one.split) for one in self.splits)
-
-    @property
-    def solution(self) -> Array:
-        """The split variable that obeys the bounds (without any, the first other prior's), in host memory."""
-        first = self.splits[1 if self.separable.is_zero and len(self.splits) > 1 else 0]
-        return np.array(to_host(first.split))
+        E /= self.operator.dtype.type(self._used_penalty)
+        return E
 
     def _end(self) -> Array:
         solution = self.solution
         if not self.room.keep_state:
             del self.X, self.g
         return solution
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with that of the priors' splits."""
-        return {**super().checkpoint(copy=copy), **kept_splits(self.splits)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint of a solver of the same problem, whichever device it was taken on."""
-        super().restore(state)
-        restore_splits(self.splits, state)

@@ -44,7 +44,6 @@ WORST = 99.0
 RING_CORRELATION = 0.5
 RING_WIDTH = 0.2
 """Half width of the ring, relative to its frequency."""
-DIP = 0.2
 PSNR_DB = 20.0
 PRECISION = 0.01
 
@@ -127,7 +126,7 @@ def convergence_severity(
 
 # Maps -----------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
-class Axis:
+class Stress:
     """A stress.
 
     Attributes
@@ -187,7 +186,7 @@ class StressMap:
     name, title : str
     question : str
         What it answers, in plain words.
-    x, y : Axis
+    x, y : Stress
     methods : tuple of str
     trial : callable
     error : str
@@ -201,8 +200,8 @@ class StressMap:
     name: str
     title: str
     question: str
-    x: Axis
-    y: Axis
+    x: Stress
+    y: Stress
     methods: tuple[str, ...]
     trial: TrialFunction
     error: str = "NRMSE"

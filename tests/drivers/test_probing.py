@@ -89,7 +89,7 @@ def test_the_lines_name_the_port_as_it_stays_and_pass_the_check_or_say_what_to_f
     link = tmp_path / "by-id" / "usb-Maker_Board_12345-if00"
     link.parent.mkdir()
     link.symlink_to(plugged_in(make).link)
-    monkeypatch.setattr(buses, "_SERIAL_LINKS", link.parent)
+    monkeypatch.setattr(buses, "_LASTING_LINKS", (link.parent,))
     (found,) = (found for found in list_devices(probe=True).found if found.bus == "serial")
     lines = found.bench_lines()
     assert f'port = "{link}"' in lines

@@ -25,9 +25,8 @@ from drivers.errors import (
 from drivers.registry.claim import DeviceBusyError
 from drivers.testing.camera import CameraContract
 from drivers.v4l2 import api
-from drivers.v4l2.camera import V4l2Camera
+from drivers.v4l2.camera import V4l2Camera, V4l2Options
 from drivers.v4l2.formats import FORMATS, decode
-from drivers.v4l2.settings import V4l2Options
 from tests.mocks import v4l2_kernel as fake
 from tests.mocks.v4l2_kernel import FakeKernel
 

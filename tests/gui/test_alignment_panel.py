@@ -87,10 +87,10 @@ def test_frames_and_time_that_are_bounds_are_shown_as_bounds(
 ) -> None:
     bar = RunBar(ProcedureRun(make_session()), "Start")
     qtbot.addWidget(bar)
-    bar.show_situation(Situation("aligning the mask", 20, 100, at_most=True, seconds=20, seconds_left=80))
+    bar.show_situation(Situation("aligning the mask", 20, 100, at_most=True, seconds_left=80))
     assert "20 of at most 100" in bar.words.text()
     assert "at most" in bar.words.text().split(", ")[-1]
-    bar.show_situation(Situation("sweep", 20, 100, seconds=20, seconds_left=80))
+    bar.show_situation(Situation("sweep", 20, 100, seconds_left=80))
     assert "at most" not in bar.words.text()
 
 

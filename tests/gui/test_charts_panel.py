@@ -161,7 +161,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     view = panel.chart
     qtbot.waitUntil(lambda: bool(view.front), timeout=WAIT_MS)
     assert panel.tabs.currentWidget() is view
-    assert [(p["setting"], p["iterations"]) for p in view.front] == [
+    assert [(p.setting, p.iterations) for p in view.front] == [
         ("wiener", 0), ("admm tv", 10), ("admm tv", 40),
     ]  # fmt: skip
     rows = [[view.table.item(r, c).text() for c in range(3)] for r in range(view.table.rowCount())]
@@ -172,7 +172,7 @@ def test_a_chart_shows_the_front_and_ranks_the_settings(
     # Less is better for errors, and scores that nobody knows are not on offer.
     assert [view.measure.itemData(i) for i in range(view.measure.count())] == ["psnr_db", "held_out"]
     view.measure.setCurrentIndex(1)
-    assert [p["seconds"] for p in view.front] == [0.01, 0.1, 0.4]
+    assert [p.seconds for p in view.front] == [0.01, 0.1, 0.4]
     view.table.selectRow(1)
     assert describe(view.front[1]) == (
         "admm tv, 0.1 s, 10 iterations, PSNR (dB) 20, error on held-out pixels (noise = 1) 10, memory 9 MiB"
@@ -205,17 +205,17 @@ def test_a_chart_of_calibrations_is_drawn_against_photographs_scene_by_scene(
     qtbot.waitUntil(lambda: bool(view.front), timeout=WAIT_MS)
     assert panel.heading.text() == "the simulated microscope (SIMULATED)"
     assert view.cost_key == "images"
-    assert [p["setting"] for p in view.front] == ["one PSF", "3 x 3"]
+    assert [p.setting for p in view.front] == ["one PSF", "3 x 3"]
     assert view.table.rowCount() == 3
     view.group.setCurrentText("beads")
-    assert [p["setting"] for p in view.front] == ["one PSF", "axial"]
+    assert [p.setting for p in view.front] == ["one PSF", "axial"]
     assert view.table.rowCount() == 2
     view.table.selectRow(0)
     assert view.place.text() == (
         "axial, 0.5 s, 40 iterations, 5 photographs, PSNR of the reconstruction (dB) 27"
     )
     view.cost.setCurrentIndex(view.cost.findData("seconds"))
-    assert [p["setting"] for p in view.front] == ["axial"]
+    assert [p.setting for p in view.front] == ["axial"]
 
 
 def test_a_chart_of_another_version_is_refused(qtbot: QtBot, panel: ChartsPanel, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.files.stability_file import CellLog, read_stability
 from recon.evaluation import maps
 from recon.evaluation.maps import run_map
-from recon.verdict.map import Axis, Failure, StressMap, Trial
+from recon.verdict.map import Failure, Stress, StressMap, Trial
 
 CALLS: list[tuple[str, float, float]] = []
 
@@ -28,8 +28,8 @@ def trial(method: str, x: float, y: float, _seed: int, _size: str) -> Trial:
 
 
 AXES = (
-    Axis("x", "light", "electrons", (1, 3, 10, 30), (1, 10), logarithmic=True),
-    Axis("y", "noise", "electrons", (1, 4), (1, 4)),
+    Stress("x", "light", "electrons", (1, 3, 10, 30), (1, 10), logarithmic=True),
+    Stress("y", "noise", "electrons", (1, 4), (1, 4)),
 )
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calibration_routines import Listener, SweepEvent, SweepExposures
+from calibration_routines.procedure import Listener
+from calibration_routines.psf.sweep_plan import SweepExposures
+from calibration_routines.psf.sweep_watch import SweepEvent
 from instrument.runs.run_control import RunControl
 from instrument.runs.runner import Runner, RunStatus
 

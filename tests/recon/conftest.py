@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
-from recon.verdict.map import Axis
+from recon.verdict.map import Stress
 
 DrawnMap = Callable[[str, Sequence[float], str, Mapping[object, Sequence[float]]], str]
 
@@ -94,7 +94,10 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
         from instrument.evaluation.figures import map_figure
         from instrument.files.figures import save_figure
 
-        axes = Axis(x_name, x_name, "", tuple(x), ()), Axis(y_name, y_name, "", tuple(range(len(rows))), ())
+        axes = (
+            Stress(x_name, x_name, "", tuple(x), ()),
+            Stress(y_name, y_name, "", tuple(range(len(rows))), ()),
+        )
         grid = np.array(list(rows.values()), float)
         text = _as_text(*axes, grid)
         shown = {
@@ -111,7 +114,7 @@ def drawn_map(tmp_path: Path) -> DrawnMap:
     return draw
 
 
-def _as_text(x: Axis, y: Axis, severity: np.ndarray) -> str:
+def _as_text(x: Stress, y: Stress, severity: np.ndarray) -> str:
     """Draw a map in text: severities, failing ones marked with ``#``; the largest ``y`` on top."""
     lines = [f"{y.label} up, {x.label} to the right; # fails (severity >= 1)"]
     for value, row in reversed(list(zip(y.values, severity, strict=True))):

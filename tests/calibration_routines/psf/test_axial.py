@@ -13,9 +13,9 @@ from calibration_routines import (
     AxialSweep,
     CalibrationError,
     SweepEvent,
+    axial_planes,
     calibrate_sweep,
     expose_sweep,
-    planes_needed,
     sweep_plan,
 )
 from drivers.simulated.world import SimulatedWorld
@@ -196,6 +196,6 @@ def test_the_plan_counts_its_frames() -> None:
 def test_the_number_of_planes_follows_from_the_optics() -> None:
     pco = Geometry(13.0, 8.9, (5.5, 7.5))
     # the shadow's edge moves by 7.5/2 mm * 8.9 mm * (1/100 - 1/300) / mm = 222 um = 17.1 pixels: 9 steps of 2
-    assert planes_needed(100e3, 300e3, pco) == 10
+    assert axial_planes(100e3, 300e3, pco).value == 10
     with pytest.raises(BenchError, match="aperture_mm"):
-        planes_needed(100e3, 300e3, Geometry(13.0, 8.9))
+        axial_planes(100e3, 300e3, Geometry(13.0, 8.9))

@@ -103,7 +103,7 @@ def test_a_device_that_was_lost_never_counts_as_safe(kind: str, words: str, fail
     device = bench.devices[kind]  # type: ignore[index]
     assert isinstance(device, MockDevice)
     device._open = False
-    for leave in (bench.safe_state, bench.close):
+    for leave in (bench.stop, bench.close):
         with pytest.raises(
             StepsFailedError, match=rf"may not be safe[^$]*{kind} \(mock\).*{words}: look"
         ) as caught:
@@ -132,7 +132,7 @@ def test_a_device_that_was_never_opened_is_safe() -> None:
 
 def test_the_slm_keeps_its_image_when_so_configured() -> None:
     bench = bench_with(kinds=("camera",), extra='[slm]\ndriver = "mock"\nblank_when_safe = false').open()
-    bench.safe_state()
+    bench.stop()
     assert "slm.display" not in calls(bench)
     bench.close()
 

@@ -6,7 +6,8 @@ import pytest
 
 from instrument.files.errors import BenchError
 from instrument.plan import Plan
-from instrument.plan.illumination import group_lights, illumination_plan
+from instrument.plan.model import illumination_plan
+from instrument.plan.patterns import group_lights
 
 
 def test_each_group_is_lit_once_after_the_dark() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+import instrument.cli.plan  # noqa: F401 - its help lists the patterns that there are when it is imported
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.cli import main

@@ -26,6 +26,7 @@ from instrument.plan import (
     check,
     estimate,
 )
+from instrument.plan.abilities import BYTES_A_FRAME_BESIDE_THE_IMAGE as BESIDE
 
 AXES = (
     StageAxis("x_um", -100.0, 100.0, 1000.0, 0.1),
@@ -217,10 +218,10 @@ def test_the_estimate_counts_frames_bytes_moves_and_seconds() -> None:
         ),
     )
     found = estimate(plan, abilities())
-    assert (found.frames, found.moves, found.image_bytes) == (2, 2, 2 * 10 * 20 * 2)
+    assert (found.frames, found.moves, found.total_bytes) == (2, 2, 2 * (10 * 20 * 2 + BESIDE))
     assert found.seconds == pytest.approx(1 + 2 + 0.2)
     averaged = Plan(label="x", parts=(Part(label="a", average=10, repeats=3, interval_s=60),))
     found = estimate(averaged, abilities())
-    assert found.image_bytes == 3 * 10 * 20 * 4
+    assert found.total_bytes == 3 * (10 * 20 * 4 + BESIDE)
     assert found.exposures == 30
     assert found.seconds == pytest.approx(120 + 0.1)

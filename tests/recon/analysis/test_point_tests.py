@@ -42,7 +42,7 @@ def test_the_dip_is_found_where_a_reconstruction_on_the_whole_sensor_finds_it() 
     psf = WORLD.psf((0.0, 0.0, Z_UM), GREEN)
     rng = np.random.default_rng(0)
     data = Noise().expose(point(-1.75, 0.0) + point(1.75, 0.0), rng)
-    window = WindowProblem(psf[None], (4, 12)).solve(data).volume[0].sum(axis=0)
+    window = WindowProblem(psf[None], (4, 12)).solve(data)[0].sum(axis=0)
     whole = reconstruct(data, psf, prior="nonnegative", solver="fista", iterations=200).image
     row, column = (n // 2 for n in whole.shape)
     seen = whole[row - 4 : row + 5, column - 12 : column + 13].sum(axis=0)

@@ -14,14 +14,14 @@ import pytest
 from scipy.interpolate import griddata
 
 from recon.analysis.gram import WindowProblem
-from recon.analysis.points import Noise, PointGrid, try_points
+from recon.analysis.points import DIP, Noise, PointGrid, try_points
 from recon.analysis.resolution import axial_resolution
 from recon.evaluation.lenslets import build_camera
 from recon.evaluation.map_trials import local_condition
 from recon.evaluation.maps import map_named
 from recon.evaluation.scene import SceneSpec
 from recon.evaluation.scene_trial import Options, judge_image, run_scene, scene_of, solve
-from recon.verdict.map import DIP, boundary, worst
+from recon.verdict.map import boundary, worst
 
 if TYPE_CHECKING:
     from tests.recon.conftest import DrawnMap

@@ -11,10 +11,10 @@ from recon.evaluation.map_trials import _OffBalance
 from recon.evaluation.maps import MAPS, map_named, run_map
 from recon.priors import NonNegativity, TotalVariation
 from recon.solvers.sensor_admm import SensorAdmm
-from recon.verdict.map import Axis, Cell, Failure, StressMap, Trial, boundary, severity_grid
+from recon.verdict.map import Cell, Failure, Stress, StressMap, Trial, boundary, severity_grid
 
-X = Axis("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
-Y = Axis("noise", "noise", "electrons", (1, 2, 4), (1, 4))
+X = Stress("light", "light", "electrons", (1, 10, 100, 1000), (1, 100), logarithmic=True)
+Y = Stress("noise", "noise", "electrons", (1, 2, 4), (1, 4))
 
 
 def fake(_method: str, x: float, y: float, _seed: int, _size: str) -> Trial:

@@ -13,16 +13,16 @@ import numpy.typing as npt
 from recon.optics.diffuser import Diffuser
 from recon.optics.grid import PixelGrid, Spectrum
 from recon.optics.jit import compiled
-from recon.optics.wave import Emission, Propagator, Source, check_source
+from recon.optics.wave import Emission, Source, WavePropagator, check_source
 
 
-class RayPropagator(Propagator):
+class RayPropagator(WavePropagator):
     """Caustics of geometrical optics.
 
     Parameters
     ----------
     diffuser, distance_um
-        As for :class:`Propagator`.
+        As for :class:`WavePropagator`.
     rays_per_sample : int
         Rays along each side of a sample of the height map.
     """

@@ -8,8 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -17,12 +15,13 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration_routines import SweepCalibration, SweepExposures
-from calibration_routines.demo.demo import Advance, DemoResult, run_demo
-from calibration_routines.demo.demo_picture import compare, scene_field
-from calibration_routines.demo.demo_settings import DemoSettings, read_picture
+from calibration_routines.demo import DemoResult, DemoSettings, read_picture, run_demo
+from calibration_routines.demo_picture import compare, scene_field
+from calibration_routines.procedure import Listener
+from calibration_routines.psf.sweep_plan import SweepExposures
 from drivers.errors import DeviceError
-from instrument.bench.bench import Bench
+from instrument.bench.bench import Bench, open_bench
+from instrument.bench.config import BenchConfig
 from instrument.cli import main
 from instrument.files.calibration_file import load_calibration
 from instrument.files.errors import FileError
@@ -45,56 +44,48 @@ MOVING = ("dark frames and axial sweep", "response over the field", "photograph 
 SAFE = {"light": "off", "stage_moving": False, "scene_lit": False}
 
 
-class Listener:
-    """Keeps what the demo tells, and can raise when a stage begins or moves on."""
+class Troubling(Listener):
+    """Keeps the demo's stages, and can raise when one begins or moves on."""
 
     def __init__(self, trouble_in: str = "", trouble: BaseException | None = None) -> None:
         self.stages: list[str] = []
         self.trouble_in, self.trouble = trouble_in, trouble
-        self.bench: Bench | None = None
 
     def make_trouble(self) -> None:
         trouble, self.trouble = self.trouble, None
         if trouble is not None:
             raise trouble
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[Advance]:
-        self.stages.append(name)
-
-        def advance(done: float, total: float) -> None:
-            if name == self.trouble_in and (done >= total / 2 or name == "reconstruct"):
-                self.make_trouble()
-
-        if name == self.trouble_in and name not in MOVING:
+    def step(self, words: str) -> None:
+        self.stages.append(words)
+        if words == self.trouble_in and words not in MOVING:
             self.make_trouble()
-        yield advance
 
-    def on_bench(self, bench: Bench, folder: Path) -> None:
-        self.bench = bench
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        name = self.stages[-1]
+        if name == self.trouble_in and (done >= total / 2 or name == "reconstruct"):
+            self.make_trouble()
 
-    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
-        assert not exposures.warnings
-
-    def on_sweep(self, done: SweepCalibration) -> None:
-        assert not done.findings
+    def exposures(self, found: SweepExposures) -> None:
+        assert not found.warnings
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, Listener]:
-    listener = Listener()
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, Troubling]:
+    listener = Troubling()
     return run_demo(tmp_path_factory.mktemp("demo"), listener, SMALL), listener
 
 
-def test_the_small_demo_reconstructs_its_scene(shown: tuple[DemoResult, Listener]) -> None:
+def test_the_small_demo_reconstructs_its_scene(shown: tuple[DemoResult, Troubling]) -> None:
     result, listener = shown
     assert result.comparison.psnr_db > 24
     assert result.comparison.ssim > 0.7
     assert list(result.seconds) == listener.stages
     assert result.measured.photo.saturated_pixels == 0
+    assert result.measured.calibration.findings == ()
 
 
-def test_everything_it_made_is_in_its_folder(shown: tuple[DemoResult, Listener]) -> None:
+def test_everything_it_made_is_in_its_folder(shown: tuple[DemoResult, Troubling]) -> None:
     result, _ = shown
     for path in result.files.values():
         assert path.is_relative_to(result.folder)
@@ -110,7 +101,7 @@ def test_everything_it_made_is_in_its_folder(shown: tuple[DemoResult, Listener])
     assert len(load_calibration(result.files["calibration"]).psfs) == SMALL.planes
 
 
-def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, Listener]) -> None:
+def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, Troubling]) -> None:
     result, _ = shown
     truth = cv2.imread(str(result.files["ground truth, linear float32"]), cv2.IMREAD_UNCHANGED)
     picture = cv2.imread(str(result.files["picture, linear float32"]), cv2.IMREAD_UNCHANGED)
@@ -122,7 +113,7 @@ def test_a_picture_shifted_or_turned_over_scores_worse(shown: tuple[DemoResult, 
     assert compare(np.roll(picture, 2, axis=1), truth, field).psnr_db < right - 2
 
 
-def test_pictures_stand_upright(shown: tuple[DemoResult, Listener]) -> None:
+def test_pictures_stand_upright(shown: tuple[DemoResult, Troubling]) -> None:
     result, _ = shown
     original = read_picture()
     for name in ("picture", "ground truth, linear float32"):
@@ -167,18 +158,23 @@ STOP, FAIL = KeyboardInterrupt(), DeviceError("camera (simulated)", "was unplugg
     ],
 )
 def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
-    tmp_path: Path, stage: str, trouble: BaseException
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str, trouble: BaseException
 ) -> None:
-    listener = Listener(stage, trouble)
+    benches: list[Bench] = []
+
+    def opened(config: BenchConfig) -> Bench:
+        benches.append(open_bench(config))
+        return benches[0]
+
+    monkeypatch.setattr("calibration_routines.demo.open_bench", opened)
     with pytest.raises(type(trouble)):
-        run_demo(tmp_path, listener, SMALL)
+        run_demo(tmp_path, Troubling(stage, trouble), SMALL)
     (folder,) = tmp_path.iterdir()
     record = json.loads((folder / "demo.json").read_text())
     assert record["state"] == ("aborted" if isinstance(trouble, KeyboardInterrupt) else "failed")
     assert record["stage"] == stage
     assert record["left"] == SAFE
-    assert listener.bench is not None
-    assert not any(device.is_open for device in listener.bench.devices.values())
+    assert not any(device.is_open for device in benches[0].devices.values())
     runs = sorted(path for path in folder.iterdir() if (path / "state.json").exists())
     if stage in MOVING and stage != "reconstruct":
         expected = RunCondition.ABORTED if record["state"] == "aborted" else RunCondition.FAILED
@@ -188,14 +184,14 @@ def test_whatever_ends_it_the_bench_is_safe_and_the_record_says_so(
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(FileError, match=r"is no folder|cannot be made"):
-        run_demo(tmp_path / "file", Listener(), SMALL)
+        run_demo(tmp_path / "file", Troubling(), SMALL)
 
 
 PROGRAM = """
 import sys
-from calibration_routines.demo import demo_settings
+from calibration_routines import demo
 from instrument.cli import main
-small = demo_settings.DemoSettings(
+small = demo.DemoSettings(
     preset="tiny", camera_binning=1, binning=1, z_mm=(60.0, 150.0), planes=3, scene_plane=1,
     half_field_deg=5.0, reconstruction_s=5.0, time_scale=1.0,
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibration_routines import CalibrationError
-from calibration_routines.psf.field_response import fit_field_response, measure_field_response
+from calibration_routines.optics.photograph import fit_field_response, measure_field_response
 from instrument.bench.bench import open_bench
 from instrument.bench.config_file import parse_config
 from instrument.plan import PlanError

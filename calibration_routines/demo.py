@@ -7,23 +7,30 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from calibration_routines.demo.demo_picture import Comparison, Viewer, compare, write_pictures
-from calibration_routines.demo.demo_settings import DemoSettings
-from calibration_routines.optics.photograph import Photograph, photograph
+from calibration_routines.demo_picture import Comparison, Viewer, compare, write_pictures
+from calibration_routines.optics.photograph import (
+    FieldResponse,
+    Photograph,
+    measure_field_response,
+    photograph,
+)
 from calibration_routines.procedure import Listener
 from calibration_routines.psf.exposure import expose_scene
-from calibration_routines.psf.field_response import FieldResponse, measure_field_response
 from calibration_routines.psf.sweep import SweepCalibration, calibrate_sweep
-from calibration_routines.psf.sweep_plan import SweepExposures, expose_sweep
+from calibration_routines.psf.sweep_options import AxialSweep
+from calibration_routines.psf.sweep_plan import expose_sweep, plan_lines, sweep_plan
+from calibration_routines.psf.sweep_procedure import quality_lines
 from drivers.simulated.world import SimulatedWorld
 from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
@@ -32,8 +39,120 @@ from instrument.files.errors import FileError
 from instrument.runs.finish import CtrlC
 from instrument.runs.runner import RunStatus
 from recon import Reconstruction, reconstruct
+from recon.base.declare import option
+from recon.optics.scene import Scene, picture
 
 FILE = "demo.json"
+PICTURE = Path(__file__).with_name("demo_picture.jpg")
+"""A cup of coffee; photograph by Rachel Michetti, CC0 (docs/reference/demo-picture.md)."""
+
+
+_HIDDEN: dict[str, Any] = {"flags": ("",)}  # not offered: the demo is the same for everybody
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """The demo's settings; everything that could flatter the result is here, in the open."""
+
+    preset: str = option(
+        "pco",
+        help="The simulated optics; pco: the dissertation's prototype (Kuo 2020, Sec. 4.3).",
+        **_HIDDEN,
+    )
+    camera_binning: int = option(2, least=1, help="In the camera, 2 as in Kuo 2020, Sec. 4.3.", **_HIDDEN)
+    binning: int = option(
+        2, least=1, help="Of PSFs and photograph in software: to the optical resolution.", **_HIDDEN
+    )
+    z_mm: tuple[float, float] = option(
+        (100.0, 500.0), unit="mm", help="Nearest and farthest plane of the sweep.", **_HIDDEN
+    )
+    planes: int = option(7, least=1, help="Planes of the sweep.", **_HIDDEN)
+    scene_plane: int = option(
+        5, least=0, help="The plane, counted from the nearest, in which the scene stands.", **_HIDDEN
+    )
+    half_field_deg: float = option(
+        18.0, unit="deg", help="Half the angle under which the picture's width is seen.", **_HIDDEN
+    )
+    average: int = option(4, least=1, help="Frames averaged, for PSFs and for the photograph.", **_HIDDEN)
+    reconstruction_s: float = option(
+        12.0,
+        unit="s",
+        least=0.1,
+        flags=("--reconstruction-s",),
+        metavar="S",
+        help="Time for the reconstruction.",
+    )
+    time_scale: float = option(
+        1.0, least=0, help="Real seconds per simulated second of motion and exposure.", **_HIDDEN
+    )
+    seed: int = option(0, least=0, help="Of the simulated diffuser, sensor and noise.")
+
+    @property
+    def sweep(self) -> AxialSweep:
+        """The axial sweep."""
+        return AxialSweep(
+            z_min_um=1e3 * self.z_mm[0],
+            z_max_um=1e3 * self.z_mm[1],
+            planes=self.planes,
+            average=self.average,
+            binning=self.binning,
+        )
+
+    @property
+    def scene_z_um(self) -> float:
+        """Depth of the scene."""
+        return self.sweep.z_um[self.scene_plane]
+
+    @property
+    def scene_size_um(self) -> tuple[float, float]:
+        """Height and width of the picture on the screen."""
+        width = 2 * self.scene_z_um * float(np.tan(np.radians(self.half_field_deg)))
+        rows, columns = read_picture().shape
+        return width * rows / columns, width
+
+    def scene(self) -> Scene:
+        """Return the scene: the picture on a screen that glows in the colour of the point source."""
+        radiance = np.zeros((*read_picture().shape, 3), np.float32)
+        radiance[..., 1] = read_picture()
+        return picture(radiance, self.scene_z_um, self.scene_size_um[1], name="a cup of coffee on a screen")
+
+    def bench_toml(self) -> str:
+        """Return the configuration of the demo's bench."""
+        return f"""\
+# The bench of diffuserbench demo: SIMULATED.
+[bench]
+name = "demo bench"
+data_folder = "."
+
+[camera]
+driver = "simulated"
+binning = {self.camera_binning}
+
+[stage]
+driver = "simulated"
+
+[led_array]
+driver = "simulated"
+
+[source]
+rgb = [0, 255, 0]
+
+[scene]
+control = "simulated"
+
+[simulated]
+preset = "{self.preset}"
+seed = {self.seed}
+time_scale = {self.time_scale:g}
+"""
+
+
+def read_picture() -> npt.NDArray[np.float32]:
+    """Return the demo's picture as light from a screen: linear, 0 to 1, grey, (height, width) float32."""
+    levels = cv2.imread(str(PICTURE), cv2.IMREAD_GRAYSCALE)
+    if levels is None:
+        raise FileNotFoundError(f"The demo's picture {PICTURE} is missing: install diffuserbench again.")
+    return (np.asarray(levels, np.float32) / 255.0) ** np.float32(2.2)
 
 
 def new_folder(parent: Path) -> Path:
@@ -92,24 +211,26 @@ class Journal:
         write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
 
 
-Advance = Callable[[float, float], None]
-Stage = Callable[[str], AbstractContextManager[Advance]]
+class _Stages(Listener):
+    """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
+    def __init__(self, journal: Journal, listener: Listener, ctrl_c: CtrlC) -> None:
+        self._journal, self._listener, self._ctrl_c = journal, listener, ctrl_c
 
-class Audience(Protocol):
-    """Whom the demo tells what it does."""
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Enter a stage."""
+        with self._journal.stage(name):
+            self._listener.step(name)
+            yield
+            self._ctrl_c.check()
 
-    def stage(self, name: str) -> AbstractContextManager[Advance]:
-        """Enter a stage; gives what is called with how much of it is done and how much there is."""
+    def share(self, done: float, total: float, *, at_most: bool = False) -> None:
+        self._ctrl_c.check()
+        self._listener.share(done, total, at_most=at_most)
 
-    def on_bench(self, bench: Bench, folder: Path) -> None:
-        """Learn which bench is used, and where everything goes."""
-
-    def on_exposures(self, bench: Bench, settings: DemoSettings, exposures: SweepExposures) -> None:
-        """Learn the exposures, and what the sweep will do and cost, before it starts."""
-
-    def on_sweep(self, done: SweepCalibration) -> None:
-        """Learn how good the sweep is."""
+    def frame(self, status: RunStatus) -> None:
+        self.share(status.done, status.total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +269,9 @@ class DemoResult:
     files: dict[str, Path]
 
 
-def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | None = None) -> DemoResult:
+def run_demo(
+    folder: Path | str, listener: Listener | None = None, settings: DemoSettings | None = None
+) -> DemoResult:
     """Run the main job on the simulated bench, into a new folder inside ``folder``.
 
     Its ``demo.json`` always says how far it came: ``state`` is ``running``, ``completed``, ``failed`` or
@@ -167,7 +290,7 @@ def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | No
     try:
         journal.note(state="running")
         with CtrlC() as ctrl_c:
-            return _run(place, audience, settings, journal, ctrl_c)
+            return _run(place, listener or Listener(), settings, journal, ctrl_c)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -176,40 +299,32 @@ def run_demo(folder: Path | str, audience: Audience, settings: DemoSettings | No
 
 
 def _run(
-    place: Path, audience: Audience, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
+    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
 ) -> DemoResult:
-    @contextmanager
-    def stage(name: str) -> Iterator[Advance]:
-        with journal.stage(name), audience.stage(name) as tell:
-
-            def advance(done: float, total: float) -> None:
-                ctrl_c.check()
-                tell(done, total)
-
-            yield advance
-            ctrl_c.check()
-
+    stages = _Stages(journal, listener, ctrl_c)
+    stage = stages.stage
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):
         bench = open_bench(parse_config(settings.bench_toml(), place / "bench.toml"))
     with bench:
         journal.note(simulated=bool(bench.simulated_kinds), bench=bench.label)
-        audience.on_bench(bench, place)
+        listener.said(f"Bench: {bench.label}")
+        listener.said(f"Everything goes to {place}")
         try:
-            measured = _measure(bench, place, settings, audience, stage)
+            measured = _measure(bench, place, settings, listener, stages)
         finally:
-            bench.safe_state()
+            bench.stop()
             journal.note(left=_state_of(bench))
         viewer = Viewer(_world(bench), settings, measured)
     with stage("compile kernels (kept)"):
         _warm_up()
-    with stage("reconstruct") as advance:
+    with stage("reconstruct"):
         result = reconstruct(
             measured.photo.measurement,
             measured.calibration.calibration,
             z_um=settings.scene_z_um,
             time_s=settings.reconstruction_s,
-            on_progress=viewer.watch(lambda seconds: advance(seconds, settings.reconstruction_s)),
+            on_progress=viewer.watch(lambda seconds: stages.share(seconds, settings.reconstruction_s)),
         )
     comparison = compare(viewer.picture(result.image), viewer.truth, viewer.field)
     with stage("write the pictures"):
@@ -220,8 +335,11 @@ def _run(
     return DemoResult(place, settings, measured, result, comparison, dict(journal.seconds), files)
 
 
-def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audience, stage: Stage) -> Measured:
+def _measure(
+    bench: Bench, place: Path, settings: DemoSettings, listener: Listener, stages: _Stages
+) -> Measured:
     """Do everything that needs the bench."""
+    stage = stages.stage
     if bench.stage is None:
         raise ValueError("The demo's bench has a stage.")
     sweep = settings.sweep.points()
@@ -231,11 +349,13 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
         bench.place_source(*sweep.points_um[0])
     with stage("expose without saturating"):
         exposures = expose_sweep(bench, sweep)
-    audience.on_exposures(bench, settings, exposures)
-    with stage("dark frames and axial sweep") as advance:
-        done = calibrate_sweep(bench, sweep, place, exposures=exposures, listener=_Frames(advance))
-    audience.on_sweep(done)
-    with stage("response over the field") as advance:
+    listener.exposures(exposures)
+    listener.planned(plan_lines(bench, sweep, sweep_plan(sweep, exposures.exposures_ms), None))
+    with stage("dark frames and axial sweep"):
+        done = calibrate_sweep(bench, sweep, place, exposures=exposures, listener=stages)
+    for line in quality_lines(done):
+        listener.said(line)
+    with stage("response over the field"):
         height, width = settings.scene_size_um
         response = measure_field_response(
             bench,
@@ -243,9 +363,9 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             settings.scene_z_um,
             exposures.exposures_ms[settings.scene_plane],
             place,
-            listener=_Frames(advance),
+            listener=stages,
         )
-    with stage("photograph the scene") as advance:
+    with stage("photograph the scene"):
         _world(bench).set_scene(settings.scene())
         exposure = expose_scene(bench)
         photo = photograph(
@@ -255,7 +375,7 @@ def _measure(bench: Bench, place: Path, settings: DemoSettings, audience: Audien
             average=settings.average,
             dark_frames=settings.average,
             binning=settings.binning,
-            listener=_Frames(advance),
+            listener=stages,
         )
     return Measured(done, response, photo, bench.label)
 
@@ -265,14 +385,6 @@ def _warm_up() -> None:
     psf = np.zeros((16, 16), np.float32)
     psf[4:12:3, 5:11:2] = 1.0
     reconstruct(psf + 1.0, psf, iterations=2)
-
-
-class _Frames(Listener):
-    def __init__(self, advance: Advance) -> None:
-        self._advance = advance
-
-    def frame(self, status: RunStatus) -> None:
-        self._advance(status.done, status.total)
 
 
 def _world(bench: Bench) -> SimulatedWorld:

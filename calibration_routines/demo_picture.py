@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from calibration_routines.demo.demo_settings import DemoSettings
 from drivers.simulated.world import SimulatedWorld
 from instrument.files.figures import Convergence, Panel, Summary, save_figure, summary_figure
 from instrument.files.images import write_image
@@ -22,7 +21,7 @@ from recon.base.metrics import psnr, scale_to, ssim
 from recon.solvers.base import IterationRecord
 
 if TYPE_CHECKING:
-    from calibration_routines.demo.demo import Measured
+    from calibration_routines.demo import DemoSettings, Measured
 
 
 Float = npt.NDArray[np.float32]

@@ -1,1 +1,0 @@
-"""The demo: calibrate, photograph, reconstruct on the simulated bench."""

@@ -1,0 +1,147 @@
+"""What a GenICam camera's images are: format, region, binning, trigger."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from drivers.aravis.features import FRAME_TRIGGERS, Features
+from drivers.camera import Roi, TriggerMode
+from drivers.common.pixels import PixelFormat, compile_kernels, genicam_format
+from drivers.errors import DeviceError, LimitError
+
+
+class Images:
+    """Format, region and binning of an open camera's images; at first all of the sensor, unbinned.
+
+    Parameters
+    ----------
+    features : Features
+    camera
+        The library's camera.
+    name : str
+        The camera as error messages name it.
+    sensor : callable
+        Asks for the sensor's ``(height, width)``.
+
+    Attributes
+    ----------
+    formats : dict of str to PixelFormat
+        Those that can be unpacked, the best for measuring first.
+    format_name : str
+    roi : Roi
+    binning : int
+    sensor : (int, int)
+    """
+
+    def __init__(
+        self, features: Features, camera: Any, name: str, sensor: Callable[[], tuple[int, int]]
+    ) -> None:
+        self._features, self._camera, self._name = features, camera, name
+        if features.find("BinningHorizontal"):
+            features.set_number("BinningHorizontal", 1)
+            features.set_number("BinningVertical", 1)
+        self.binning = 1
+        self.sensor = sensor()
+        offered = features.entries("PixelFormat")
+        known = {name: pixels for name in offered if (pixels := genicam_format(name)) is not None}
+        if not known:
+            raise DeviceError(
+                name,
+                f"offers only pixel formats that cannot be read here: {', '.join(offered)}.",
+                "Readable: Mono and Bayer of 8 to 16 bits, RGB8, BGR8.",
+            )
+        # The best for measuring first: one sample a pixel, no mosaic, many bits, unpacked.
+        best = sorted(
+            known.items(), key=lambda item: (item[1].channels, item[1].bayer, -item[1].bits, len(item[0]))
+        )
+        self.formats: dict[str, PixelFormat] = dict(best)
+        self.apply_format(best[0][0])
+        self.apply_roi(Roi(0, 0, *self.sensor))
+
+    @property
+    def format(self) -> PixelFormat:
+        """The present pixel format."""
+        return self.formats[self.format_name]
+
+    def apply_format(self, pixel_format: str) -> None:
+        """Set the pixel format."""
+        self.format_name = self._features.choose("PixelFormat", pixel_format)
+        compile_kernels(self.formats[pixel_format].packing)
+
+    def refused(self) -> str:
+        """Return which regions the camera takes, for the refusal of another."""
+        smallest = [int(self._features.bounds(name)[0]) * self.binning for name in ("Height", "Width")]
+        return (
+            f"The sensor has {self.sensor[0]} x {self.sensor[1]} pixels, "
+            f"the smallest region {smallest[0]} x {smallest[1]}."
+        )
+
+    def apply_roi(self, asked: Roi) -> bool:
+        """Set the largest region on the camera's steps inside one on the sensor; False when there is none."""
+        features, factor = self._features, self.binning
+        mosaic = 2 if self.format.bayer else 1
+        sides = []
+        for start, length, offset, size in (
+            (asked.top, asked.height, "OffsetY", "Height"),
+            (asked.left, asked.width, "OffsetX", "Width"),
+        ):
+            movable = features.find(offset) is not None
+            step = max(features.increment(offset), mosaic) if movable else 1
+            first = -(-start // (factor * step)) * step
+            steps = features.increment(size)
+            count = ((start + length) // factor - first) // steps * steps
+            if count < features.bounds(size)[0] or (first and not movable):
+                return False
+            sides.append((offset, first, size, count, movable))
+        for offset, _, _, _, movable in sides:  # the size's limits shrink by the offset
+            if movable:
+                features.set_number(offset, 0)
+        for offset, first, size, count, movable in sides:
+            features.set_number(size, count)
+            if movable:
+                features.set_number(offset, first)
+        self.roi = self._read_roi()
+        return True
+
+    def _read_roi(self) -> Roi:
+        with self._features.words("say its region"):
+            region = self._camera.get_region()
+        factor = self.binning
+        return Roi(region.y * factor, region.x * factor, region.height * factor, region.width * factor)
+
+    def apply_binning(self, binning: int) -> None:
+        """Set the binning along both axes; the region becomes the whole sensor."""
+        if self._features.find("BinningHorizontal"):
+            made = [
+                self._features.set_number(f"Binning{axis}", binning) for axis in ("Horizontal", "Vertical")
+            ]
+            if made[0] != made[1]:
+                raise LimitError(
+                    self._name, f"bins {made[0]:g} x {made[1]:g} pixels.", f"Asked for {binning}."
+                )
+            self.binning = int(made[0])
+        self.apply_roi(Roi(0, 0, *self.sensor))
+
+
+def set_trigger(features: Features, name: str, mode: TriggerMode, line: str, activation: str) -> None:
+    """Choose what starts an exposure; ``line`` and ``activation`` are of the hardware trigger."""
+    if not features.find("TriggerMode"):
+        if mode != "free_run":
+            raise LimitError(name, f"has no trigger mode {mode!r}.", "It has no triggers.")
+        return
+    selectors = features.entries("TriggerSelector") if features.find("TriggerSelector") else ()
+    for selector in selectors or (None,):
+        if selector is not None:
+            features.choose("TriggerSelector", selector)
+        if features.find("TriggerMode"):  # not every selector has it
+            features.choose("TriggerMode", "Off")
+    if mode != "free_run":
+        frame = next((name for name in FRAME_TRIGGERS if name in selectors), None)
+        if frame is not None:
+            features.choose("TriggerSelector", frame)
+        source = "Software" if mode == "software" else line
+        features.choose("TriggerSource", source)
+        if mode == "hardware" and features.find("TriggerActivation"):
+            features.choose("TriggerActivation", activation)
+        features.choose("TriggerMode", "On")
