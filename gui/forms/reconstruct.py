@@ -307,9 +307,7 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
         now_s = time.monotonic()
         if now_s - shown_s < max(_INTERVAL_S, cost_s / _SHARE):
             return
-        image = present()
-        if isinstance(request, VolumeRequest):
-            image = image.max(axis=0)
+        image = present().max(axis=0)  # of a picture its only plane
         note = f"iteration {record.iteration}, change {record.change:.1e}"
         with contextlib.suppress(JobCancelledError):  # the solver sees it by itself, and keeps what it has
             context.report(
@@ -334,7 +332,7 @@ def lines_of(work: ReconstructionWork) -> str:
     volume = isinstance(work.request, VolumeRequest)
     write = "write_volume" if volume else "write_reconstruction"
     imports = Imports({("instrument.reconstruction.result_file", "Outputs")})
-    imports.names.add((f"instrument.reconstruction.{'volume_file' if volume else 'result_file'}", write))
+    imports.names.add(("instrument.reconstruction.result_file", write))
     lines = [f"request = {expression(work.request, imports)}", "job = request.prepare()"]
     settled: list[str] = []
     if work.kept_in is None:

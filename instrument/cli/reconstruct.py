@@ -130,7 +130,7 @@ def _video(asked: _Asked, run: Path | None) -> None:
 
 
 def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
-    source, options, output = asked.source, asked.options, asked.output
+    source, output = asked.source, asked.output
     asked.given.refuse("--patterned", "patterned picture")
     if run is None or source.calibration is None:
         raise BenchError(
@@ -144,11 +144,8 @@ def _patterned(asked: _Asked, run: Path | None, sheet: Path) -> None:
         run=run,
         sheet=sheet,
         calibration=source.calibration,
-        z_um=options.z_um,
         binning=asked.inputs.binning or 1,
-        prior=None if options.prior is None else str(options.prior),
-        tau=options.tau,
-        iterations=options.iterations,
+        options=asked.options,
     )
     reconstruct_patterns(request, Outputs.named(output.out or _PICTURE), output)
 

@@ -78,7 +78,7 @@ def reconstruct_patterns(request: PatternedRequest, outputs: Outputs, output: Ou
         outputs.check(job.measurement.size, overwrite=output.force)
         _print_job(job, "calibration or frames come from the simulated bench")
         with (
-            one_task("picture", request.iterations or ITERATIONS) as advance,
+            one_task("picture", request.options.iterations or ITERATIONS) as advance,
             first_interrupt_cancels() as cancel,
         ):
 

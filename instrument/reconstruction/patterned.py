@@ -6,7 +6,7 @@ import io
 import threading
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from instrument.reconstruction.preparation import reduce
 from instrument.reconstruction.request import refocused
 from instrument.runs.run import Run
 from recon import Measurement, reconstruct
+from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.result import Reconstruction
 from recon.solvers.base import IterationRecord
 from recon.types import Calibration
@@ -53,22 +54,16 @@ class PatternedRequest:
         A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
         (n_patterns, height, width) on the calibration's pixels.
     calibration : Path
-    z_um : float or None
     binning : int
         Of the calibration's pixels.
-    prior : str or None
-    tau : float or None
-    iterations : int or None
+    options : ReconstructionOptions
     """
 
     run: Path
     sheet: Path
     calibration: Path
-    z_um: float | None = None
     binning: int = 1
-    prior: str | None = None
-    tau: float | None = None
-    iterations: int | None = None
+    options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +86,15 @@ class PreparedPatterned:
 
 
 def prepare_patterned(
-    request: PatternedRequest, told: Callable[[int, int], object] = lambda _done, _total: None
+    request: PatternedRequest, on_progress: Callable[[int, int], object] = lambda _done, _total: None
 ) -> PreparedPatterned:
     """Read both runs, and reconstruct the patterns from the sheet's.
 
     Parameters
     ----------
     request : PatternedRequest
-    told : callable
-        Told after each pattern how many of all are done.
+    on_progress : callable
+        ``on_progress(patterns done, patterns)`` after each.
 
     Raises
     ------
@@ -129,8 +124,8 @@ def prepare_patterned(
         },
         simulated=simulated,
     )
-    if request.z_um is not None:
-        job = refocused(job, request.z_um)
+    if request.options.z_um is not None:
+        job = refocused(job, request.options.z_um)
     if request.sheet.suffix.lower() == ".npy":
         patterns = _patterns_from_file(request.sheet, frames.shape)
     else:
@@ -143,7 +138,7 @@ def prepare_patterned(
             )
         _require_same_plan(run, sheet)
         warnings += _saturation(sheet)
-        patterns = _patterns_of(_frames(sheet, calibration, request.binning), job, request, told)
+        patterns = _patterns_of(_frames(sheet, calibration, request.binning), job, request, on_progress)
     return PreparedPatterned(replace(job, warnings=tuple(warnings)), frames, patterns, request)
 
 
@@ -158,10 +153,7 @@ def solve_patterned(
     return reconstruct(
         Measurement(prepared.frames, patterns=prepared.patterns),
         prepared.job.calibration,
-        z_um=request.z_um,
-        prior=request.prior,
-        tau=request.tau,
-        iterations=request.iterations,
+        request.options,
         on_progress=None if watch is None else lambda record, _: watch(record),
         cancel=cancel,
     )
@@ -243,21 +235,21 @@ def _patterns_from_file(path: Path, shape: tuple[int, ...]) -> Floats:
 
 
 def _patterns_of(
-    sheet: Floats, job: Job, request: PatternedRequest, told: Callable[[int, int], object]
+    sheet: Floats, job: Job, request: PatternedRequest, on_progress: Callable[[int, int], object]
 ) -> Floats:
     """Reconstruct the sheet under each group, smooth, and take the share of each in all of them."""
     from scipy.ndimage import gaussian_filter
 
     sigma = SMOOTHING_SHARE * min(sheet.shape[1:])
     pictures = []
-    told(0, len(sheet))
+    on_progress(0, len(sheet))
     for frame in sheet:
         found = reconstruct(
-            frame, job.calibration, z_um=request.z_um, solver="admm", iterations=SHEET_ITERATIONS,
+            frame, job.calibration, z_um=request.options.z_um, solver="admm", iterations=SHEET_ITERATIONS,
             model="convolution", judged=False,
         )  # fmt: skip
         pictures.append(np.maximum(gaussian_filter(found.image, sigma), 0))
-        told(len(pictures), len(sheet))
+        on_progress(len(pictures), len(sheet))
     return _shares(np.stack(pictures), request.sheet)
 
 

@@ -19,13 +19,12 @@ from instrument.reconstruction.job import (
     job_from_files,
     job_with,
 )
-from instrument.reconstruction.options import InputOptions, NoiseChoice, SourceOptions
+from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run import STATE
-from recon.base.checks import require_options, select_psf
+from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.refocus import at_depth
-from recon.priors import Prior
 from recon.reconstruction.choice import Choice
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
@@ -51,43 +50,72 @@ def _require_choice(asked: str, model: ModelName) -> None:
         )
 
 
-def _require_volume_prior(prior: str | Prior) -> None:
-    if isinstance(prior, str) and prior not in (known := volume_priors()):
-        raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(known)}.")
-
-
-def _require_one_depth(calibration: Calibration, z_um: float | None) -> None:
-    """Refuse a picture of a calibration of several depths without one of them."""
-    if z_um is None and len(members_of_depths(calibration.source_positions_um)) > 1:
-        select_psf(calibration, z_um)  # which says what there is
-
-
-def measured(job: Job, noise: NoiseChoice) -> Measurement:
-    """Return a job's photograph with what is known of it."""
-    erasures = None if job.valid is None else ~job.valid
-    return Measurement(job.measurement, job.binned_noise(noise), erasures=erasures)
-
-
 @dataclass(frozen=True, kw_only=True)
-class PictureRequest:
-    """A picture of one depth, from a photograph and either a PSF file or a calibration.
+class _Request:
+    """What pictures and volumes have in common.
 
     Attributes
     ----------
     image : Path
         The photograph.
-    psf, calibration : Path or None
-        One of the two.
     inputs : InputOptions
-        How they become a measurement and a camera.
+        How it becomes a measurement, and what it is explained with a camera.
     options : ReconstructionOptions
     """
 
     image: Path
-    psf: Path | None = None
-    calibration: Path | None = None
     inputs: InputOptions = field(default_factory=InputOptions)
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
+
+    def solve(
+        self,
+        job: Job,
+        *,
+        watch: Watch | None = None,
+        cancel: threading.Event | None = None,
+        keeper: Keeper | None = None,
+    ) -> Reconstruction:
+        """Reconstruct what ``prepare`` returned.
+
+        Raises
+        ------
+        InputError
+            When the input does not allow it.
+        """
+        measurement = self._measurement(job)
+        return reconstruct(
+            measurement, job.calibration, self.options, on_progress=watch, cancel=cancel, keeper=keeper
+        )
+
+    def explain(self, job: Job) -> Choice:
+        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`.
+
+        Raises
+        ------
+        BenchError
+            Where it would not be asked for all of it.
+        """
+        _require_choice("--explain", self.options.model)
+        return choice_for(Problem.of(self._measurement(job), job.calibration, self.options))
+
+    def _measurement(self, job: Job) -> Measurement:
+        """Return a job's photograph with what is known of it."""
+        erasures = None if job.valid is None else ~job.valid
+        return Measurement(job.measurement, job.binned_noise(self.inputs.noise), erasures=erasures)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureRequest(_Request):
+    """A picture of one depth, from a photograph and either a PSF file or a calibration.
+
+    Attributes
+    ----------
+    psf, calibration : Path or None
+        One of the two.
+    """
+
+    psf: Path | None = None
+    calibration: Path | None = None
 
     def prepare(self) -> Job:
         """Read the files and bring them together; the options are checked first.
@@ -116,93 +144,33 @@ class PictureRequest:
             raise BenchError("Give either --psf FILE or --calibration FOLDER (one of them).")
         return job if options.z_um is None else refocused(job, options.z_um)
 
-    def solve(
-        self,
-        job: Job,
-        *,
-        watch: Watch | None = None,
-        cancel: threading.Event | None = None,
-        keeper: Keeper | None = None,
-    ) -> Reconstruction:
-        """Reconstruct what :meth:`prepare` returned.
-
-        Raises
-        ------
-        InputError
-            When the input does not allow it.
-        """
-        _require_one_depth(job.calibration, self.options.z_um)
-        return reconstruct(
-            measured(job, self.inputs.noise),
-            job.calibration,
-            self.options,
-            on_progress=None if watch is None else lambda record, volume: watch(record, lambda: volume()[0]),
-            cancel=cancel,
-            keeper=keeper,
-        )
-
-    def explain(self, job: Job) -> Choice:
-        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`.
-
-        Raises
-        ------
-        BenchError
-            Where it would not be asked for all of it.
-        """
-        _require_choice("--explain", self.options.model)
-        _require_one_depth(job.calibration, self.options.z_um)
-        return choice_for(Problem.of(measured(job, self.inputs.noise), job.calibration, self.options))
+    def _measurement(self, job: Job) -> Measurement:
+        """Return the photograph; refused for a calibration of several depths without one of them."""
+        positions, z_um = job.calibration.source_positions_um, self.options.z_um
+        if z_um is None and len(members_of_depths(positions)) > 1:
+            select_psf(job.calibration, z_um)  # which says what there is
+        return super()._measurement(job)
 
 
 @dataclass(frozen=True, kw_only=True)
-class VolumeRequest:
+class VolumeRequest(_Request):
     """A volume, from a photograph and PSFs at several depths.
 
     Attributes
     ----------
-    image : Path
-        The photograph.
     psfs : Path
         As :func:`volume_job`.
-    inputs : InputOptions
-    options : ReconstructionOptions
-        Its prior must be one of :func:`recon.reconstruction.solvers.volume_priors`.
     """
 
-    image: Path
     psfs: Path
-    inputs: InputOptions = field(default_factory=InputOptions)
-    options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
 
     def prepare(self) -> Job:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
-        options, inputs = self.options, self.inputs
-        _require_known(inputs, options)
-        _require_volume_prior(options.prior or "tv")
+        _require_known(self.inputs, self.options)
+        prior, known = self.options.prior or "tv", volume_priors()
+        if isinstance(prior, str) and prior not in known:
+            raise BenchError(f"--prior {prior} is not for volumes; choose one of {', '.join(known)}.")
         return volume_job(self.psfs, self.image, self.inputs)
-
-    def solve(
-        self,
-        job: Job,
-        *,
-        watch: Watch | None = None,
-        cancel: threading.Event | None = None,
-        keeper: Keeper | None = None,
-    ) -> Reconstruction:
-        """Reconstruct what :meth:`prepare` returned; errors as :meth:`PictureRequest.solve`."""
-        return reconstruct(
-            measured(job, self.inputs.noise),
-            job.calibration,
-            self.options,
-            on_progress=watch,
-            cancel=cancel,
-            keeper=keeper,
-        )
-
-    def explain(self, job: Job) -> Choice:
-        """Say what the model ``"auto"`` would choose, and why; errors as :meth:`PictureRequest.explain`."""
-        _require_choice("--explain", self.options.model)
-        return choice_for(Problem.of(measured(job, self.inputs.noise), job.calibration, self.options))
 
 
 def request_of(
@@ -243,7 +211,7 @@ def done_share(options: ReconstructionOptions, record: IterationRecord) -> float
 
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:
     """Check what can be checked before any file is read; InputError or BenchError says what is wrong."""
-    require_options(noise=None if isinstance(inputs.noise, str) else inputs.noise)
+    require_noise(None if isinstance(inputs.noise, str) else inputs.noise)
     if options.positive_background and options.estimate_background is False:
         raise BenchError("--positive-background and --no-background exclude each other.")
     if options.choose is not None:

@@ -15,7 +15,7 @@ from instrument.files.errors import BenchError, FileError
 from instrument.plan.model import illumination_plan, load_plan
 from instrument.plan.patterns import group_lights, groups_from_text
 from instrument.reconstruction.patterned import PatternedRequest, prepare_patterned
-from recon import Calibration
+from recon import Calibration, Options
 from recon.base.metrics import psnr
 from tests.mocks.recordings import write_recording
 
@@ -99,7 +99,7 @@ def test_one_picture_of_all_patterns(files: tuple[Path, Path, Path], tmp_path: P
 def test_patterns_are_the_shares_of_the_light(files: tuple[Path, Path, Path]) -> None:
     run, sheet, calibration = files
     told: list[tuple[int, int]] = []
-    request = PatternedRequest(run=run, sheet=sheet, calibration=calibration, z_um=30e3)
+    request = PatternedRequest(run=run, sheet=sheet, calibration=calibration, options=Options(z_um=30e3))
     prepared = prepare_patterned(request, lambda done, total: told.append((done, total)))
     assert told == [(n, 3) for n in range(4)]
     truth = lights() / lights().sum(axis=0)
