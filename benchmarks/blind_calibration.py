@@ -202,7 +202,7 @@ def main() -> None:
         raw,
         (window, window),
         settings,
-        progress=lambda what, share: print(f"{share:4.0%} {what}", flush=True),
+        on_progress=lambda what, share: print(f"{share:4.0%} {what}", flush=True),
     )
     seconds = time.perf_counter() - began
     print(

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.device import Device
+from drivers.device import Device, Setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +107,15 @@ class Stage(Device):
     def limits(self) -> dict[str, tuple[float, float]]:
         """Soft limits by axis name."""
         return {axis.name: (axis.lower_limit, axis.upper_limit) for axis in self.axes}
+
+    def _common_settings(self, position: Mapping[str, float]) -> dict[str, Setting]:
+        """Return what every stage's settings say of its axes, for drivers."""
+        settings: dict[str, Setting] = {}
+        for axis in self.axes:
+            settings[f"position_{axis.name}"] = position[axis.name]
+            settings[f"limits_{axis.name}"] = (axis.lower_limit, axis.upper_limit)
+            settings[f"speed_{axis.name}_per_s"] = axis.speed_per_s
+        return settings
 
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Estimated seconds for a move; axes move together, so the slowest counts."""

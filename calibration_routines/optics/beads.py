@@ -254,7 +254,7 @@ def calibrate_beads(
     """
     pitch_um, distance_mm = needed_geometry(geometry)
     window = window_for(slides, geometry, (images.shape[1], images.shape[2]))
-    result = calibrate_from_beads(images, window, slides.solver, progress=progress)
+    result = calibrate_from_beads(images, window, slides.solver, on_progress=progress)
     object_um = pitch_um * slides.z_um / (1e3 * distance_mm)
     places = [(-column * object_um, -row * object_um, slides.z_um) for row, column in result.points]
     record = {

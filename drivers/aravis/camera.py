@@ -15,15 +15,17 @@ from drivers.aravis.features import (
     AUTOMATICS,
     BLACK_LEVEL,
     EXPOSURE,
-    FIRMWARE,
     FRAME_RATE,
     FRAME_RATE_ENABLE,
     GAIN,
     Features,
+    Underruns,
     find_camera,
     found_cameras,
+    identity_of,
     library_error,
     load,
+    stream_statistics,
 )
 from drivers.aravis.images import Images, set_trigger
 from drivers.camera import Roi, TriggerMode
@@ -31,7 +33,7 @@ from drivers.common.buffered_camera import BufferedCamera, RawFrame
 from drivers.common.camera_settings import GainScale, GainUnit
 from drivers.common.drops import FrameNumberCounter
 from drivers.common.pixels import Bytes, Pixels, unpack
-from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart
+from drivers.device import DriverOptions, FoundDevice, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 from drivers.registry.claim import DeviceBusyError
 
@@ -39,7 +41,6 @@ _SLICE_S = 0.05
 """A wait in the library cannot be ended from outside: it is cut into pieces of this length."""
 _BLOCK_IDS = 1 << 16
 """Frame ids of GigE Vision 1 start again after this many, at 1."""
-_FAKES = {("Aravis", "Fake"), ("vitavision.dev", "VivaCam Fake")}
 
 
 class AravisOptions(DriverOptions):
@@ -150,7 +151,7 @@ class AravisCamera(BufferedCamera):
                 features.choose(automatic, "Off")
         if features.find("AcquisitionMode"):
             features.choose("AcquisitionMode", "Continuous")
-        self._identity = self._identify()
+        self._identity = identity_of(self._camera, features)
         self._pitch_um = self._read_pitch()
         exposure = features.find(*EXPOSURE)
         if exposure is None:
@@ -191,21 +192,6 @@ class AravisCamera(BufferedCamera):
         features.set_number("OffsetX", 0)
         features.set_number("OffsetY", 0)
         return int(features.bounds("Height")[1]), int(features.bounds("Width")[1])
-
-    def _identify(self) -> DeviceIdentity:
-        with self._features.words("say who it is"):
-            vendor, model = self._camera.get_vendor_name(), self._camera.get_model_name()
-            serial = self._camera.get_device_serial_number()
-        firmware = self._features.find(*FIRMWARE)
-        return DeviceIdentity(
-            kind="camera",
-            driver="aravis",
-            vendor=vendor or "unknown",
-            model=model or "unknown",
-            serial_number=serial or "",
-            firmware=self._features.text(firmware) if firmware else "",
-            simulated=(vendor, model) in _FAKES,
-        )
 
     def _read_pitch(self) -> float:
         if self.options.pixel_pitch_um is not None:
@@ -407,7 +393,7 @@ class AravisCamera(BufferedCamera):
     def stream_statistics(self) -> Mapping[str, int]:
         """Aravis' counts of the running or last sequence: ``n_missing_packets``, ``n_resent_packets`` ..."""
         stream = self._stream
-        return dict(self._statistics) if stream is None else _statistics(stream)
+        return dict(self._statistics) if stream is None else stream_statistics(stream)
 
     # Streaming -------------------------------------------------------------------------------------
     def _begin(self, n_buffers: int) -> FrameNumberCounter | None:
@@ -428,7 +414,7 @@ class AravisCamera(BufferedCamera):
             camera.start_acquisition()
         if camera.is_gv_device():
             return FrameNumberCounter(_BLOCK_IDS, 1)
-        return FrameNumberCounter() if camera.is_uv_device() else _Underruns(self._stream)
+        return FrameNumberCounter() if camera.is_uv_device() else Underruns(self._stream, _BLOCK_IDS)
 
     def _take(self, timeout_s: float) -> RawFrame | None:
         deadline_s = time.monotonic() + timeout_s
@@ -470,33 +456,10 @@ class AravisCamera(BufferedCamera):
             return
         with contextlib.suppress(library_error()):  # of a camera that is gone
             self._camera.stop_acquisition()
-        self._statistics = _statistics(stream)
+        self._statistics = stream_statistics(stream)
 
     def _decode(self, data: Bytes, out: Pixels) -> bool:
         return unpack(data, self._images.format.packing, out, self._line_bytes)
 
     def _fire(self) -> None:
         self._features.execute("TriggerSoftware")
-
-
-class _Underruns(FrameNumberCounter):
-    """Counts for Aravis' camera in process, which does not number the frames that found no free buffer."""
-
-    def __init__(self, stream: Any) -> None:
-        super().__init__(_BLOCK_IDS, 1)
-        self._stream = stream
-        self._counted: int | None = None
-
-    def lost(self, number: int) -> int:
-        underruns = int(self._stream.get_info_uint64_by_name("n_underruns"))
-        before, self._counted = self._counted, underruns
-        return super().lost(number) + (0 if before is None else underruns - before)
-
-
-def _statistics(stream: Any) -> dict[str, int]:
-    names = (stream.get_info_name(i) for i in range(stream.get_n_infos()))
-    return {
-        name: stream.get_info_uint64_by_name(name)
-        for name in names
-        if name.startswith("n_") and "ratio" not in name
-    }

@@ -1,4 +1,4 @@
-"""The features of a GenICam camera by their names, with errors in words."""
+"""The Aravis library: loaded when asked for; its cameras and their features by name, errors in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from drivers.device import FoundDevice
+from drivers.common.drops import FrameNumberCounter
+from drivers.device import DeviceIdentity, FoundDevice
 from drivers.errors import DeviceError, DeviceLostError, LimitError
 
 REMEDY = (
@@ -18,6 +19,7 @@ REMEDY = (
 FAKE_PREFIX = "Fake_"
 """Ids of the cameras that Aravis itself makes up, for tests."""
 
+_FAKES = {("Aravis", "Fake"), ("vitavision.dev", "VivaCam Fake")}
 _MISSING = "Is it on, connected, and in this computer's subnet? arv-tool-0.8 lists what Aravis finds."
 
 _lock = threading.Lock()
@@ -299,3 +301,45 @@ class Features:
         """Read a feature of any kind as text."""
         with self.words(f"say its {name}"):
             return str(self._device.get_feature(name).get_value_as_string())
+
+
+def identity_of(camera: Any, features: Features) -> DeviceIdentity:
+    """Return who an open camera says it is."""
+    with features.words("say who it is"):
+        vendor, model = camera.get_vendor_name(), camera.get_model_name()
+        serial = camera.get_device_serial_number()
+    firmware = features.find(*FIRMWARE)
+    return DeviceIdentity(
+        kind="camera",
+        driver="aravis",
+        vendor=vendor or "unknown",
+        model=model or "unknown",
+        serial_number=serial or "",
+        firmware=features.text(firmware) if firmware else "",
+        simulated=(vendor, model) in _FAKES,
+    )
+
+
+class Underruns(FrameNumberCounter):
+    """Counts for Aravis' camera in process, which does not number the frames that found no free buffer."""
+
+    def __init__(self, stream: Any, modulus: int) -> None:
+        super().__init__(modulus, 1)
+        self._stream = stream
+        self._counted: int | None = None
+
+    def lost(self, number: int) -> int:
+        """Return the frames lost before this one."""
+        underruns = int(self._stream.get_info_uint64_by_name("n_underruns"))
+        before, self._counted = self._counted, underruns
+        return super().lost(number) + (0 if before is None else underruns - before)
+
+
+def stream_statistics(stream: Any) -> dict[str, int]:
+    """Return the library's counts of a stream: ``n_missing_packets``, ``n_resent_packets`` ..."""
+    names = (stream.get_info_name(i) for i in range(stream.get_n_infos()))
+    return {
+        name: stream.get_info_uint64_by_name(name)
+        for name in names
+        if name.startswith("n_") and "ratio" not in name
+    }

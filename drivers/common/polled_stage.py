@@ -167,11 +167,7 @@ class PolledStage(Stage):
         """Read position, limits and speeds."""
         state = self._ask()
         settings: dict[str, Setting] = {"homed": state.homed, "faults": state.faults}
-        for axis in self._axes:
-            settings[f"position_{axis.name}"] = state.position[axis.name]
-            settings[f"limits_{axis.name}"] = (axis.lower_limit, axis.upper_limit)
-            settings[f"speed_{axis.name}_per_s"] = axis.speed_per_s
-        return settings
+        return settings | self._common_settings(state.position)
 
     # Stage -----------------------------------------------------------------------------------------
     @property

@@ -48,7 +48,7 @@ class GrblLink:
             device,
             baud_rate=baud_rate,
             probe=(b"$G\n", modes_matcher()),
-            on_message=self._hear,
+            on_message=self._on_message,
             timeout_s=timeout_s,
         )
         self._offset: tuple[float, ...] | None = None
@@ -176,7 +176,7 @@ class GrblLink:
         """Return what an alarm means."""
         return f"{ALARMS.get(alarm, 'see the list of alarm codes')} (alarm {alarm})"
 
-    def _hear(self, line: bytes) -> None:
+    def _on_message(self, line: bytes) -> None:
         alarm = parse_alarm(line)
         with self._heard:
             if alarm is not None:

@@ -110,8 +110,8 @@ class ControllerSettings:
     @property
     def letters(self) -> str:
         """The axes' letters, in the order of reports; those beyond what a report holds mean nothing."""
-        told = self.info.get("AXS", "").partition(":")[2]
-        return told if told.isalpha() else AXIS_LETTERS
+        letters = self.info.get("AXS", "").partition(":")[2]
+        return letters if letters.isalpha() else AXIS_LETTERS
 
     @property
     def reports_inches(self) -> bool:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping
 
 from drivers.common.polled_stage import PolledStage, StageState
+from drivers.common.stage_axes import trapezoid_duration_s
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
@@ -199,18 +200,14 @@ class GrblStage(PolledStage):
 
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Estimated seconds for a move, with acceleration; axes move together, so the slowest counts."""
-        longest_s = 0.0
-        for axis in self._axes:
-            if axis.name in start and axis.name in target:
-                way = abs(target[axis.name] - start[axis.name])
-                acceleration = self._acceleration_per_s2(axis.name)
-                ramp_s = axis.speed_per_s / acceleration
-                reaches_speed = way > axis.speed_per_s * ramp_s
-                took_s = (
-                    way / axis.speed_per_s + ramp_s if reaches_speed else 2 * math.sqrt(way / acceleration)
-                )
-                longest_s = max(longest_s, took_s)
-        return longest_s
+        durations = (
+            trapezoid_duration_s(
+                target[axis.name] - start[axis.name], axis.speed_per_s, self._acceleration_per_s2(axis.name)
+            )
+            for axis in self._axes
+            if axis.name in start and axis.name in target
+        )
+        return max(durations, default=0.0)
 
     def _acceleration_per_s2(self, name: str) -> float:
         return abs(self._maps[name].scale) * self._controller.acceleration_per_s2(self._index(name))

@@ -70,16 +70,16 @@ def read_geometry(link: Link, distance_mm: float | None) -> ArrayGeometry:
             link.device, f"sent no JSON for {link.dialect.properties.decode()!r}.", "Reopen it."
         )
     positions = parse_table(link.command(b"pledpos", _SLOW_S), 3)
-    told_na = parse_table(link.command(b"pledposna", _SLOW_S), 2)
+    reported_na = parse_table(link.command(b"pledposna", _SLOW_S), 2)
     count = _whole(properties, "led_count", None if positions is None else len(positions))
-    for what, table in (("pledpos", positions), ("pledposna", told_na)):
+    for what, table in (("pledpos", positions), ("pledposna", reported_na)):
         if table is None or len(table) != count:
             found = "no complete table" if table is None else f"{len(table)} LEDs"
             raise DeviceError(
                 link.device, f"sent {found} for {what!r}; {count} LEDs were expected.", "Open it again."
             )
     assert positions is not None
-    assert told_na is not None
+    assert reported_na is not None
     names = properties.get("color_channels")
     channels = _whole(properties, "color_channel_count", len(names) if isinstance(names, list) else 3)
     if channels not in (1, 3):
@@ -88,8 +88,10 @@ def read_geometry(link: Link, distance_mm: float | None) -> ArrayGeometry:
         positions[:, 2] += distance_mm - positions[0, 2]
         na = _cosines(positions)
     else:
-        na = _agreed(link.device, _cosines(positions), told_na)
-    na[np.hypot(told_na[:, 0], told_na[:, 1]) >= 1] = np.nan  # how the firmware marks LEDs without angle
+        na = _agreed(link.device, _cosines(positions), reported_na)
+    na[np.hypot(reported_na[:, 0], reported_na[:, 1]) >= 1] = (
+        np.nan
+    )  # how the firmware marks LEDs without angle
     return ArrayGeometry(
         positions,
         na,
@@ -109,11 +111,11 @@ def _cosines(positions_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def _agreed(
-    device: str, computed: npt.NDArray[np.float64], told: npt.NDArray[np.float64]
+    device: str, computed: npt.NDArray[np.float64], reported: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """Return the computed angles, which have more digits, or the array's where the two contradict."""
-    known = np.hypot(told[:, 0], told[:, 1]) < 1
-    worst = float(np.abs(computed - told)[known].max(initial=0.0))
+    known = np.hypot(reported[:, 0], reported[:, 1]) < 1
+    worst = float(np.abs(computed - reported)[known].max(initial=0.0))
     if worst <= _NA_DIGITS:
         return computed
     _log.warning(
@@ -122,7 +124,7 @@ def _agreed(
         device,
         worst,
     )
-    return told.copy()
+    return reported.copy()
 
 
 def _whole(properties: Mapping[str, Any], key: str, otherwise: int | None) -> int:
@@ -132,10 +134,10 @@ def _whole(properties: Mapping[str, Any], key: str, otherwise: int | None) -> in
 
 def _wavelengths(properties: Mapping[str, Any], channels: int) -> tuple[float, float, float] | None:
     """Return the centre wavelengths in nanometres, the longest (red) first."""
-    told = properties.get("color_channel_center_wavelengths")
-    if not isinstance(told, dict) or len(told) != channels:
+    reported = properties.get("color_channel_center_wavelengths")
+    if not isinstance(reported, dict) or len(reported) != channels:
         return None
-    values = [v for v in told.values() if isinstance(v, int | float) and 0 < v < _LONGEST_NM]
+    values = [v for v in reported.values() if isinstance(v, int | float) and 0 < v < _LONGEST_NM]
     nm = sorted((1e3 * v if v < _MICROMETRES_END else float(v) for v in values), reverse=True)
     if len(nm) == 1:
         return nm[0], nm[0], nm[0]

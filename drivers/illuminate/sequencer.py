@@ -183,9 +183,9 @@ class Sequencer:
             return outputs[output]
 
         with array.commanding:
-            told = send()
+            made = send()
             array.remember(f"trigger output {output}", send)
-        return told
+        return made
 
     def _check_run(
         self, interval_ms: int, repeats: int, outputs: Sequence[int], inputs: Sequence[int]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.common.stage_axes import trapezoid_duration_s
 from drivers.simulated.surroundings import Clock
 
 
@@ -46,15 +47,6 @@ class _AxisState:
     slip: float = 0.0
     """True screw position minus the one reported (lost steps)."""
     jammed: bool = False
-
-
-def trapezoid_duration_s(distance: float, speed: float, acceleration: float) -> float:
-    """Seconds that a move takes from rest to rest."""
-    distance = abs(distance)
-    ramp = speed**2 / acceleration
-    if distance < ramp:
-        return 2 * math.sqrt(distance / acceleration)
-    return distance / speed + speed / acceleration
 
 
 def trapezoid_path(elapsed: float, distance: float, speed: float, acceleration: float) -> float:

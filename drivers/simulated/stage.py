@@ -9,10 +9,10 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.common.stage_axes import AXIS_NAMES, check_target
+from drivers.common.stage_axes import AXIS_NAMES, check_target, trapezoid_duration_s
 from drivers.device import DriverOptions, Setting, SharedPart
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
-from drivers.simulated.mechanics import AxisSpec, Carriage, trapezoid_duration_s
+from drivers.simulated.mechanics import AxisSpec, Carriage
 from drivers.simulated.options import NotNegative, Positive
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
@@ -114,12 +114,7 @@ class CarriageStage(SimulatedDevice, Stage):
         """Read position, limits and speeds."""
         self._require()
         settings: dict[str, Setting] = {"homed": self._homed}
-        for name, value in self.position().items():
-            settings[f"position_{name}"] = value
-        for axis in self._axes:
-            settings[f"limits_{axis.name}"] = (axis.lower_limit, axis.upper_limit)
-            settings[f"speed_{axis.name}_per_s"] = axis.speed_per_s
-        return settings
+        return settings | self._common_settings(self.position())
 
     # Stage ---
     @property

@@ -193,7 +193,7 @@ def table(options: TableOptions) -> None:
             bar.update(task, advance=1, note=f"{cell.expansion}x {cell.picture} {cell.method}")
 
         loaders = {name: partial(load_sample, name) for name in names}
-        cells = run_table(loaders, shape, expansions=factors, iterations=options.iterations, progress=show)
+        cells = run_table(loaders, shape, expansions=factors, iterations=options.iterations, on_progress=show)
         note = f"{shape[1]} x {shape[0]} SLM pixels, {options.iterations} iterations, "
         note += f"pictures: {', '.join(names)}"
         write_csv(files[0], cells)

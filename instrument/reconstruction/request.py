@@ -22,7 +22,7 @@ from instrument.reconstruction.job import (
 from instrument.reconstruction.options import InputOptions, SourceOptions
 from instrument.reconstruction.preparation import darkest_block
 from instrument.runs.run import STATE
-from recon.base.checks import require_options, select_psf
+from recon.base.checks import require_noise, select_psf
 from recon.camera.camera_model import ModelName, members_of_depths
 from recon.camera.refocus import at_depth
 from recon.reconstruction.choice import Choice
@@ -211,7 +211,7 @@ def done_share(options: ReconstructionOptions, record: IterationRecord) -> float
 
 def _require_known(inputs: InputOptions, options: ReconstructionOptions) -> None:
     """Check what can be checked before any file is read; InputError or BenchError says what is wrong."""
-    require_options(noise=None if isinstance(inputs.noise, str) else inputs.noise)
+    require_noise(None if isinstance(inputs.noise, str) else inputs.noise)
     if options.positive_background and options.estimate_background is False:
         raise BenchError("--positive-background and --no-background exclude each other.")
     if options.choose is not None:

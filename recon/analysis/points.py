@@ -238,7 +238,7 @@ def point_tests(
     step_per_um: float,
     noise: Noise | None = None,
     image: Callable[[float, float], Array] | None = None,
-    progress: Callable[[float], object] | None = None,
+    on_progress: Callable[[float], object] | None = None,
 ) -> PointTests:
     """Run the point tests about a depth.
 
@@ -254,11 +254,11 @@ def point_tests(
         ``image(columns, z_um)``: one point's image (height, width), ``columns`` pixels off the axis on the
         sensor, measured or from other optics than the calibration's. Default: the calibrated PSFs,
         refocused and shifted between pixels.
-    progress : callable, optional
-        Told the share done.
+    on_progress : callable, optional
+        Called with the share done.
     """
     noise = noise or Noise()
-    tell = progress or (lambda _share: None)
+    on_progress = on_progress or (lambda _share: None)
     inverse = 1 / z_um - step_per_um / 2 * (np.arange(PLANES) - PLANES // 2)
     notes: list[str] = []
     with_depth = bool(np.isfinite(step_per_um) and inverse[-1] > 0)
@@ -276,7 +276,7 @@ def point_tests(
         at = float(np.interp(s, np.arange(len(inverse)), inverse)) if len(inverse) > 1 else inverse[0]
         return make(columns, 1 / at)
 
-    tell(0.1)
+    on_progress(0.1)
     across = WindowProblem(planes[len(planes) // 2][None], HALF_WINDOW)
     middle = len(planes) // 2
 
@@ -289,7 +289,7 @@ def point_tests(
     lateral, found = smallest_resolved(try_lateral, [v for v in LATERAL_PX if v >= 0.7 * lateral_px])
     if found is None:
         notes.append("No two points across the axis were resolved at any separation tried.")
-    tell(0.3)
+    on_progress(0.3)
     resolved_px = None if found is None else found.separation_px
     if not with_depth:
         return PointTests(resolved_px, None, None, tuple(lateral), (), (), tuple(notes))
@@ -300,13 +300,13 @@ def point_tests(
     )
     if found_z is None:
         notes.append("No two points along the axis were resolved at any separation tried.")
-    tell(0.5)
+    on_progress(0.5)
     sixteen: list[PointTrial] = []
     factor = None
     if found is not None and found_z is not None:
         problem = WindowProblem(planes, HALF_WINDOW)
         sixteen, factor = _sixteen(
-            problem, point, found.separation_px, found_z.separation_planes, noise, tell
+            problem, point, found.separation_px, found_z.separation_planes, noise, on_progress
         )
         if factor is None:
             notes.append("16 points were not resolved at any separation that fits the window.")
@@ -327,7 +327,7 @@ def _sixteen(
     px: float,
     planes: float,
     noise: Noise,
-    tell: Callable[[float], object],
+    on_progress: Callable[[float], object],
 ) -> tuple[list[PointTrial], float | None]:
     """Grow both separations of a 4 x 4 grid until it is resolved; returns the trials and the factor."""
     room = min((problem.n_z - 2) / (3 * planes), (2 * problem.half[1] - 3) / (3 * px))
@@ -337,7 +337,7 @@ def _sixteen(
         trials.append(
             try_points(problem, point, PointGrid(4, 4, factor * px, factor * planes), noise, trials=1)
         )
-        tell(0.5 + 0.5 * (number + 1) / len(factors))
+        on_progress(0.5 + 0.5 * (number + 1) / len(factors))
         if trials[-1].resolved:
             return trials, factor
     return trials, None

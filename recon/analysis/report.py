@@ -47,7 +47,7 @@ from recon.types import Calibration
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float64]
 Progress = Callable[[str, float], object]
-"""Told what is being done and the share that is done."""
+"""Called with what is being done and the share that is done."""
 
 CONDITION_COUNTS: Mapping[Direction, tuple[int, ...]] = {"x": (2, 4, 9, 16), "z": (2, 3, 4), "xz": (4, 9, 16)}
 SEPARATIONS = (1, 2, 3, 4, 5, 6, 8)
@@ -202,7 +202,7 @@ def analyse(
     calibration: Calibration,
     settings: AnalysisSettings | None = None,
     *,
-    progress: Progress | None = None,
+    on_progress: Progress | None = None,
 ) -> Analysis:
     """Analyse a calibration.
 
@@ -211,7 +211,7 @@ def analyse(
     calibration : Calibration
         With depths and geometry (``pixel_pitch_um``, ``diffuser_distance_mm``). One PSF is enough for most.
     settings : AnalysisSettings, optional
-    progress : callable, optional
+    on_progress : callable, optional
         Called with what is being done and the share done.
 
     Raises
@@ -220,13 +220,13 @@ def analyse(
         When the geometry or the depths are unknown.
     """
     settings = settings or AnalysisSettings()
-    tell = progress or (lambda _what, _share: None)
+    on_progress = on_progress or (lambda _what, _share: None)
     pitch_um, distance_um = _geometry(calibration)
     notes: list[str] = []
     small, sensor_shape = _cut_to_light(calibration)
     depths, stack = central_psfs(small)
     planes = stack.mean(axis=1)
-    tell("resolution", 0.0)
+    on_progress("resolution", 0.0)
     z_um = settings.z_um or _depth_to_analyse(depths, planes, distance_um, notes)
     # Resolution is a matter of measured pixels: of the calibrated PSF nearest to the depth, not of a blend.
     nearest = int(np.argmin(np.abs(1 / depths - 1 / z_um)))
@@ -249,22 +249,22 @@ def analyse(
         )
         for n, s, angle in zip(sensor_shape, far_support, cutoff, strict=True)
     )
-    tell("field", 0.1)
+    on_progress("field", 0.1)
     field_points = across_field(small)
     if len(field_points) < 2:
         notes.append(
             "One place of the field was calibrated: how PSFs vary across it, and how far the convolution "
             "model holds, is not known."
         )
-    tell("depths", 0.2)
+    on_progress("depths", 0.2)
     similarity = across_depth(depths, planes) if len(depths) > 1 else None
-    tell("condition numbers", 0.3)
+    on_progress("condition numbers", 0.3)
     grid_step = axial_inner.step_per_um / 2
     fine = _fine_planes(small, z_um, grid_step)
     if fine is None:
         notes.append("The pattern does not change enough along the axis for condition numbers in depth.")
     condition = _condition(psf[None] if fine is None else fine, with_depth=fine is not None)
-    tell("point tests", 0.5)
+    on_progress("point tests", 0.5)
     tests = None
     if settings.points:
         tests = point_tests(
@@ -273,7 +273,7 @@ def analyse(
             lateral_px=lateral_inner.mean_px,
             step_per_um=axial_inner.step_per_um,
             noise=settings.noise,
-            progress=lambda share: tell("point tests", 0.5 + 0.5 * share),
+            on_progress=lambda share: on_progress("point tests", 0.5 + 0.5 * share),
         )
         notes.extend(tests.notes)
     resolution_px = lateral.mean_px
@@ -282,7 +282,7 @@ def analyse(
         resolution_px = tests.lateral_px or resolution_px
         step = tests.axial_per_um or step
     model, reason = choose_model(sort_by_depth(small), "auto")
-    tell("done", 1.0)
+    on_progress("done", 1.0)
     return Analysis(
         z_um=z_um,
         pitch_um=pitch_um,
@@ -379,28 +379,23 @@ def _fine_planes(calibration: Calibration, z_um: float, step_per_um: float) -> A
 
 
 def _condition(planes: Array, *, with_depth: bool) -> tuple[ConditionCurve, ...]:
-    curves = []
-    for direction, counts in CONDITION_COUNTS.items():
-        if direction != "x" and not with_depth:
-            continue
-        stack = planes[len(planes) // 2][None] if direction == "x" else planes
-        for count in counts:
-            curve = condition_curve(stack, direction, count, SEPARATIONS)
-            if curve.separations:
-                curves.append(curve)
-    return tuple(curves)
+    middle = planes[len(planes) // 2][None]
+    curves = (
+        condition_curve(middle if direction == "x" else planes, direction, count, SEPARATIONS)
+        for direction, counts in CONDITION_COUNTS.items()
+        if direction == "x" or with_depth
+        for count in counts
+    )
+    return tuple(curve for curve in curves if curve.separations)
 
 
 def _lateral_spacing(settings: AnalysisSettings, nearest_um: float, notes: list[str]) -> float | None:
     if (fall_off := settings.fall_off) is not None:
 
-        def along_y(angles: Floats) -> Floats:
-            return fall_off(np.tan(np.minimum(angles, STEEPEST)), np.zeros_like(angles))
+        def along(y: float, x: float) -> Callable[[Floats], Floats]:
+            return lambda angles: fall_off(*(n * np.tan(np.minimum(angles, STEEPEST)) for n in (y, x)))
 
-        def along_x(angles: Floats) -> Floats:
-            return fall_off(np.zeros_like(angles), np.tan(np.minimum(angles, STEEPEST)))
-
-        return min(lateral_spacing_um(f, nearest_um) for f in (along_y, along_x))
+        return min(lateral_spacing_um(f, nearest_um) for f in (along(1, 0), along(0, 1)))
     sigma = settings.fall_off_deg
     if sigma is None and settings.cutoff_deg is not None:
         known = [angle for angle in settings.cutoff_deg if angle is not None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -141,48 +141,11 @@ def select_psf(calibration: Calibration, z_um: float | None) -> tuple[npt.NDArra
     return calibration.psfs[best], float(z[best])
 
 
-def require_options(
-    *,
-    iterations: int | None = None,
-    time_s: float | None = None,
-    tolerance: float | None = None,
-    tau: float | None = None,
-    z_um: float | None = None,
-    noise: NoiseModel | float | None = None,
-) -> None:
-    """Check what can be checked without a measurement; None is always allowed. As :func:`recon.reconstruct`.
-
-    Raises
-    ------
-    InputError
-        For the first that cannot be, with what is expected.
-    """
-    if iterations is not None and (not _is_whole(iterations) or iterations < 1):
-        raise InputError(f"iterations must be a whole number, 1 or more, not {iterations!r}.")
-    _require(time_s, "time_s", "seconds above 0", above=0)
-    _require(tolerance, "tolerance", "0 or more", least=0)
-    _require(tau, "tau", "0 or more, and finite", least=0, below=math.inf)
-    _require(z_um, "z_um", "above 0", above=0)
-    if not isinstance(noise, NoiseModel):
-        expected = "a NoiseModel, or a standard deviation in counts, 0 or more"
-        _require(noise, "noise", expected, least=0, below=math.inf)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def _require(
-    value: object,
-    name: str,
-    expected: str,
-    *,
-    least: float = -math.inf,
-    above: float = -math.inf,
-    below: float = math.nan,
-) -> None:
-    if value is None:
+def require_noise(noise: object) -> None:
+    """Raise InputError for what is no noise model, and no standard deviation in counts; None is allowed."""
+    number = isinstance(noise, Real) and not isinstance(noise, bool)
+    if noise is None or isinstance(noise, NoiseModel) or (number and 0 <= noise < math.inf):  # type: ignore[operator]
         return
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    if not (number and value >= least and value > above and not value >= below):  # type: ignore[operator]
-        raise InputError(f"{name} must be {expected}, not {value!r}.")
+    raise InputError(
+        f"noise must be a NoiseModel, or a standard deviation in counts, 0 or more, not {noise!r}."
+    )

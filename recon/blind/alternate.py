@@ -121,7 +121,7 @@ def calibrate_from_beads(
     psf_shape: tuple[int, int],
     settings: BlindSettings | None = None,
     *,
-    progress: Progress | None = None,
+    on_progress: Progress | None = None,
 ) -> BlindResult:
     """Recover PSFs over the field and the beads from images of beads at unknown places.
 
@@ -132,7 +132,7 @@ def calibrate_from_beads(
     psf_shape : (int, int)
         Window that holds the whole pattern: the aperture's shadow and what the diffuser bends beyond it.
     settings : BlindSettings, optional
-    progress : callable, optional
+    on_progress : callable, optional
         Called with what is being done and the share done.
 
     Raises
@@ -144,7 +144,7 @@ def calibrate_from_beads(
     # Negative noise is kept: clipped, it would be a haze that PSFs and beads had to explain.
     data = np.asarray(images, np.float32)
     _check(data, psf_shape, settings)
-    tell = progress or (lambda _what, _share: None)
+    report = on_progress or (lambda _what, _share: None)
     scale = np.float32(data.max())
     data = np.asarray(data / scale, np.float32)
     sensor = (data.shape[1], data.shape[2])
@@ -153,7 +153,7 @@ def calibrate_from_beads(
     rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
     weights = interpolation_weights(points, np.eye(len(points)), rows, columns).astype(np.float32)
 
-    tell("first PSF", 0.0)
+    report("first PSF", 0.0)
     psfs: Floats = np.repeat(first_psf(np.maximum(data, 0), psf_shape)[None], len(points), axis=0)
     beads = np.zeros((len(data), *field_shape), np.float32)
     norm = float(np.linalg.norm(data))
@@ -165,7 +165,7 @@ def calibrate_from_beads(
         share, part = _GRID_SHARE * number / len(ranks), _GRID_SHARE / len(ranks)
 
         def finding(done: float, rank: int = rank, share: float = share, part: float = part) -> None:
-            tell(f"rank {rank}: beads", share + 0.8 * part * done)
+            report(f"rank {rank}: beads", share + 0.8 * part * done)
 
         beads = _solve_beads(data, np.maximum(psfs, 0), points, beads, settings, finding)
         if not beads.any():
@@ -173,7 +173,7 @@ def calibrate_from_beads(
                 "No bead was found: the first PSF explains nothing. Are the images of the same optics, with "
                 "several beads each and their background removed?"
             )
-        tell(f"rank {rank}: PSFs", share + 0.8 * part)
+        report(f"rank {rank}: PSFs", share + 0.8 * part)
         mixer = BeadMixer(weights, beads, psf_shape, sensor)
         psfs, half = solve_psfs(mixer, data, psfs, rank, settings.iterations)
         psfs, beads = _by_convention(psfs, beads)
@@ -190,7 +190,7 @@ def calibrate_from_beads(
         psf_shape,
         settings.iterations,
         settings.degree,
-        lambda share: tell("beads between pixels", _GRID_SHARE + (1 - _GRID_SHARE) * share),
+        lambda share: report("beads between pixels", _GRID_SHARE + (1 - _GRID_SHARE) * share),
     )
     refuse_what_is_no_beads(data, polished.images(sensor), polished.beads)
     psfs = polished.at(points)
@@ -249,14 +249,14 @@ def _solve_beads(
     points: Array,
     start: Floats,
     settings: BlindSettings,
-    progress: Callable[[float], None],
+    on_progress: Callable[[float], None],
 ) -> Floats:
     """Find the beads of each image with the PSFs fixed (Eq. 5.12): FISTA with a rigorous step."""
     sensor = (data.shape[1], data.shape[2])
     operator = local_convolution([FieldOfPsfs(psfs[:, None], points)], sensor)
     found = np.empty_like(start)
     for number, (image, beads, out) in enumerate(zip(data, start, found, strict=True)):
-        progress(number / len(data))
+        on_progress(number / len(data))
         target = image[None]
         weight = settings.tau * float(np.abs(operator.adjoint(target)).max())
         solver = Fista(operator, target, L1(weight) + NonNegativity(), initial=beads[None, None])

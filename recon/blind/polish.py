@@ -138,7 +138,7 @@ def polish(
     psf_shape: tuple[int, int],
     iterations: int,
     highest_degree: int,
-    progress: Callable[[float], object],
+    on_progress: Callable[[float], object],
 ) -> Polished:
     """Alternate between PSFs and points, the degree of the field's variation raised step by step.
 
@@ -152,7 +152,7 @@ def polish(
         Of each fit of the PSFs.
     highest_degree : int
         Fewer where there are too few beads.
-    progress : callable
+    on_progress : callable
         Called with the share done.
     """
     sensor = data.shape[1], data.shape[2]
@@ -167,7 +167,7 @@ def polish(
             break
         best = np.inf
         for number in range(_ROUNDS):
-            progress((degree + number / _ROUNDS) / len(degrees))
+            on_progress((degree + number / _ROUNDS) / len(degrees))
             functions = FieldFunctions(degree, np.concatenate([points.places for points in beads]))
             mixer = PointMixer(beads, functions, psf_shape, sensor)
             start = np.zeros((functions.count, *psf_shape), np.float32)

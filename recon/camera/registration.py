@@ -76,7 +76,7 @@ def register(
         Background removed.
     scale : float, optional
         Size of the pattern relative to the reference's where it is known: 1 at equal depths,
-        :func:`depth_scale` at others. None: found between 0.6 and 1.7, by coarse to fine search.
+        ``refocus.paraxial_scale`` at others. None: found between 0.6 and 1.7, by coarse to fine search.
     near : (rows, columns), optional
         Where the displacement is expected, e.g. by :func:`expected_shift`: only ``within_px`` of it is
         searched. Needed where a pattern resembles its own shift (a regular lenslet array). None: everywhere.
@@ -114,14 +114,6 @@ def aligned(psf: Array, registration: Registration) -> Array:
         values = scaled(values, 1 / registration.scale)
     by = -registration.rows / registration.scale, -registration.columns / registration.scale
     return moved(values, *by)
-
-
-def depth_scale(z_um: float, reference_z_um: float, distance_um: float) -> float:
-    """Size of a pattern from depth ``z`` relative to that from ``reference_z``: ``s_i`` of Kuo 2020, Eq. 5.2.
-
-    ``(1 + d / z) / (1 + d / z_ref)``, as rays through the aperture show.
-    """
-    return (1 + distance_um / z_um) / (1 + distance_um / reference_z_um)
 
 
 def expected_shift(

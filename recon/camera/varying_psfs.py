@@ -6,7 +6,7 @@ PSFs with interpolated weights.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,11 +158,31 @@ def local_convolution(
         Domain (n_channels, n_z, field height, field width), field = sensor + PSF - 1, centred as
         :class:`~recon.camera.convolution.Convolution`.
     """
+
+    def strips(z: int, field: FieldOfPsfs, needed: Mask, rows: Array, columns: Array) -> Iterator[Strip]:
+        psfs, corner = cut_to_support(field.psfs)
+        yield from _strips(z, psfs, field.points, rows, columns, needed, _offset(corner, field))
+
+    return _model(fields, sensor_shape, strips, n_channels, support, grid_shape, dtype)
+
+
+Mask = npt.NDArray[np.bool_]
+
+
+def _model(
+    fields: list[FieldOfPsfs],
+    sensor_shape: tuple[int, int],
+    strips_of: Callable[[int, FieldOfPsfs, Mask, Array, Array], Iterator[Strip]],
+    n_channels: int | None,
+    support: Mask | None,
+    grid_shape: tuple[int, int] | None,
+    dtype: npt.DTypeLike,
+) -> SpatiallyVarying:
+    """Put together what each depth is cut into, of those that the support touches."""
     if not fields:
         raise InputError("The list of depths is empty: give the PSFs of at least one.")
     shape = fields[0].psfs.shape[2:]
-    channels = max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels
-    field_shape, centre = field_of(sensor_shape, (shape[0], shape[1]))
+    field_shape, centre = field_of(sensor_shape, shape)
     rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
     strips: list[Strip] = []
     for z, field in enumerate(fields):
@@ -170,17 +190,21 @@ def local_convolution(
             raise InputError(f"Depth {z} has PSFs of {field.psfs.shape[2:]}, depth 0 of {shape}.")
         needed = np.ones(field_shape, bool) if support is None else support[z]
         if needed.any():
-            psfs, corner = cut_to_support(field.psfs)
-            offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
-            strips += _strips(z, psfs, field.points, rows, columns, needed, offset)
+            strips += strips_of(z, field, needed, rows, columns)
     return SpatiallyVarying(
         strips,
         field_shape if grid_shape is None else grid_shape,
         sensor_shape,
         n_z=len(fields),
-        n_channels=channels,
+        n_channels=max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels,
         dtype=dtype,
     )
+
+
+def _offset(corner: tuple[int, int], field: FieldOfPsfs) -> tuple[int, int]:
+    """Return where object pixel (0, 0) casts the first pixel of a PSF that was cut at ``corner``."""
+    height, width = field.psfs.shape[2:]
+    return corner[0] - (height - 1), corner[1] - (width - 1)
 
 
 def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[int, int]]:
@@ -192,9 +216,6 @@ def cut_to_support(psfs: Array, threshold: float = 1e-6) -> tuple[Array, tuple[i
         used = np.flatnonzero(bright.max(axis=axis) > level)
         windows.append(slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 1))
     return psfs[..., windows[0], windows[1]], (windows[0].start, windows[1].start)
-
-
-Mask = npt.NDArray[np.bool_]
 
 
 def bounding_window(mask: Mask) -> Window:
@@ -332,30 +353,14 @@ def low_rank(
     Parameters and result as :func:`~recon.camera.varying_psfs.local_convolution`, with ``rank`` or
     ``error`` as :func:`principal_psfs`. Depths that ``support`` does not touch are left out.
     """
-    if not fields:
-        raise InputError("The list of depths is empty: give the PSFs of at least one.")
-    shape = fields[0].psfs.shape[2:]
-    channels = max(f.psfs.shape[1] for f in fields) if n_channels is None else n_channels
-    field_shape, centre = field_of(sensor_shape, (shape[0], shape[1]))
-    rows, columns = (np.arange(n) - c for n, c in zip(field_shape, centre, strict=True))
-    strips = []
-    for z, field in enumerate(fields):
-        needed = np.ones(field_shape, bool) if support is None else support[z]
-        if not needed.any():
-            continue
+
+    def strips(z: int, field: FieldOfPsfs, needed: Mask, rows: Array, columns: Array) -> Iterator[Strip]:
         window = bounding_window(needed)
         principal = principal_psfs(field, rank=rank, error=error)
         psfs, corner = cut_to_support(principal.components)
         weights = interpolation_weights(field.points, principal.scores, rows[window[0]], columns[window[1]])
         if not needed[window].all():
             weights = weights * needed[window]
-        offset = (corner[0] - (shape[0] - 1), corner[1] - (shape[1] - 1))
-        strips.append(Strip(z, window, weights, (whole(window, psfs),), offset))
-    return SpatiallyVarying(
-        strips,
-        field_shape if grid_shape is None else grid_shape,
-        sensor_shape,
-        n_z=len(fields),
-        n_channels=channels,
-        dtype=dtype,
-    )
+        yield Strip(z, window, weights, (whole(window, psfs),), _offset(corner, field))
+
+    return _model(fields, sensor_shape, strips, n_channels, support, grid_shape, dtype)

@@ -276,7 +276,7 @@ class CalibrationProblem(Subject[CalibrationSetting]):
 
         window = (p.window_px, p.window_px)
         settings = replace(BLIND, reach=p.reach)
-        found = calibrate_from_beads(p.slides[:slides], window, settings, progress=tell)
+        found = calibrate_from_beads(p.slides[:slides], window, settings, on_progress=tell)
         places = np.column_stack([found.points, np.full(len(found.points), p.z_um)])
         return self._calibration(found.on_sensor(), places)
 

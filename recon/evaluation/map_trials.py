@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -26,7 +25,7 @@ from recon.reconstruction.part import Part
 from recon.reconstruction.problem import Problem
 from recon.solvers import StoppingRules
 from recon.solvers.admm import Admm, Penalties
-from recon.solvers.base import Outcome
+from recon.solvers.base import Outcome, Solver
 from recon.solvers.douglas_rachford import DouglasRachford
 from recon.solvers.fista import Fista
 from recon.solvers.sensor_admm import SensorAdmm
@@ -84,32 +83,20 @@ def penalties(base: SceneSpec, method: str, x: float, y: float, seed: int, size:
     """Solve with ``x`` times the penalty or step, and ``y`` times the prior's weight."""
     if method.endswith(OF_VOLUMES):
         return _volume_penalties(method, x, y, seed, size)
-    spec = spec_at(base, size, seed, photons=1000.0)
-    scene = scene_of(spec)
+    scene = scene_of(spec_at(base, size, seed, photons=1000.0))
     part = _part_of(scene)
-    outcome = _PICTURE_SOLVERS[method](part, x, y)
-    found = part.problem.measured(part.lifted(outcome.solution), part.channels)
-    error, severities = judge_image(scene, found, scene.truth[None])
-    settled = convergence_severity(outcome.history, outcome.stop_reason, TOLERANCE)
-    return Trial(error, {**severities, Failure.CONVERGENCE: settled})
-
-
-def _rules() -> StoppingRules:
-    return StoppingRules(iterations=STEPS, tolerance=TOLERANCE)
-
-
-def _admm(part: Part, penalty: float, weight: float) -> Outcome:
-    prior = TotalVariation(weight) + NonNegativity()
-    default = Penalties()
-    penalties = Penalties(data=default.data * penalty, separable=default.separable * penalty)
-    return Admm(part.picture_operator, part.data, prior, penalties=penalties).run(_rules())
-
-
-def _fista(part: Part, step: float, weight: float) -> Outcome:
-    prior = TotalVariation(weight) + NonNegativity()
-    length = step / part.picture_operator.norm_bound**2
     with np.errstate(over="ignore", invalid="ignore"):  # too long a step diverges: that is what is asked
-        return Fista(part.picture_operator, part.data, prior, step=length).run(_rules())
+        solver = _picture_solver(method, part, x, TotalVariation(y) + NonNegativity())
+        outcome = solver.run(StoppingRules(iterations=STEPS, tolerance=TOLERANCE))
+    found = part.problem.measured(part.lifted(outcome.solution), part.channels)
+    return _settled(scene, found, outcome, TOLERANCE)
+
+
+def _settled(scene: TestScene, found: Array, outcome: Outcome, tolerance: float) -> Trial:
+    """Judge a volume (n_z, height, width), and whether its solver had settled."""
+    error, severities = judge_image(scene, found, scene.truth.reshape(found.shape))
+    settled = convergence_severity(outcome.history, outcome.stop_reason, tolerance)
+    return Trial(error, {**severities, Failure.CONVERGENCE: settled})
 
 
 class _OffBalance(SensorAdmm):
@@ -126,16 +113,16 @@ class _OffBalance(SensorAdmm):
         return super()._balanced_penalties() * self._factor
 
 
-def _sensor_admm(part: Part, penalty: float, weight: float) -> Outcome:
-    prior = TotalVariation(weight) + NonNegativity()
-    return _OffBalance(part.picture_operator, part.data, prior, penalty).run(_rules())
-
-
-_PICTURE_SOLVERS: dict[str, Callable[[Part, float, float], Outcome]] = {
-    "admm tv": _admm,
-    "admm-sensor tv": _sensor_admm,
-    "fista tv": _fista,
-}
+def _picture_solver(method: str, part: Part, factor: float, prior: Prior) -> Solver:
+    """Return a solver whose penalty or step is so many times its default."""
+    operator = part.picture_operator
+    if method == "fista tv":
+        return Fista(operator, part.data, prior, step=factor / operator.norm_bound**2)
+    if method == "admm-sensor tv":
+        return _OffBalance(operator, part.data, prior, factor)
+    default = Penalties()
+    penalties = Penalties(data=default.data * factor, separable=default.separable * factor)
+    return Admm(operator, part.data, prior, penalties=penalties)
 
 
 def _volume_penalties(method: str, x: float, y: float, seed: int, size: Size) -> Trial:
@@ -155,9 +142,7 @@ def _volume_penalties(method: str, x: float, y: float, seed: int, size: Size) ->
     height, width = data.shape[1:]
     top, left = camera.centre[0] - height // 2, camera.centre[1] - width // 2
     found = outcome.solution[0][:, top : top + height, left : left + width]
-    error, severities = judge_image(scene, found, scene.truth)
-    settled = convergence_severity(outcome.history, outcome.stop_reason, 1e-3)
-    return Trial(error, {**severities, Failure.CONVERGENCE: settled})
+    return _settled(scene, found, outcome, 1e-3)
 
 
 # Points -----------------------------------------------------------------------------------------------

@@ -168,12 +168,12 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
     parts: dict[tuple[int, ...], str] = {}
     middle = len(depths) // 2
     thinned = [depths, depths[::2], depths[middle : middle + 1]]
-    choosers = (_all, _every_second, _central)
+    choosers = (lambda _positions, group: group, _every_second, _central)
     for chosen in thinned[:1] if own.whole else thinned:
         for chooser in choosers[:1] if own.whole else choosers:
             members = tuple(sorted(int(m) for group in chosen for m in chooser(positions, group)))
-            if members not in parts:
-                parts[members] = _words(len(members), _which(chosen, depths, positions))
+            psfs = f"{len(members)} PSF" + ("s" if len(members) > 1 else "")
+            parts.setdefault(members, psfs + _which(chosen, depths, positions))
     return [
         OwnSetting(
             own.label,
@@ -184,10 +184,6 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
         )
         for members, words in parts.items()
     ]
-
-
-def _words(psfs: int, where: str) -> str:
-    return f"{psfs} PSF" + ("s" if psfs > 1 else "") + where
 
 
 def _which(
@@ -203,10 +199,6 @@ def _which(
     number = next(n for n, group in enumerate(depths, 1) if group is chosen[0])
     z_mm = float(positions[chosen[0], 2].mean()) / 1e3
     return f" at depth {number} of {len(depths)}" + (f" (z {z_mm:.4g} mm)" if np.isfinite(z_mm) else "")
-
-
-def _all(_positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    return group
 
 
 def _central(positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:

@@ -169,7 +169,7 @@ def run_table(
     *,
     expansions: Sequence[int] = (4, 16, 36),
     iterations: int = 100,
-    progress: Callable[[Cell], object] | None = None,
+    on_progress: Callable[[Cell], object] | None = None,
 ) -> list[Cell]:
     """Compute every cell.
 
@@ -182,7 +182,7 @@ def run_table(
         Squares.
     iterations : int
         Of L-BFGS, in every cell but the one-step ones.
-    progress : callable, optional
+    on_progress : callable, optional
         Called with each cell as it is ready.
     """
     cells = []
@@ -196,8 +196,8 @@ def run_table(
                 for method in METHODS:
                     cell = run_cell(display, image, method, grid, picture=name, iterations=iterations)
                     cells.append(cell)
-                    if progress is not None:
-                        progress(cell)
+                    if on_progress is not None:
+                        on_progress(cell)
     return cells
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, require_finite, require_options, saturated_share, select_psf
+from recon.base.checks import as_channels, require_finite, require_noise, saturated_share, select_psf
 from recon.base.noise import NoiseModel, estimate_deviation
 from recon.camera.camera_model import Depths, members_of_depths, one_depth, sort_by_depth
 from recon.camera.field_registration import one_psf
@@ -83,7 +83,7 @@ class Measurement:
         InputError
             When the image or what is known of it is unusable.
         """
-        require_options(noise=self.noise)
+        require_noise(self.noise)
         counts = self.channels()
         background = self.background
         data = counts if background is None else counts - self.like(background, counts, "background")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from recon.base.checks import as_channels, check_psf, require_options
+from recon.base.checks import as_channels, check_psf
 from recon.base.declare import settled
 from recon.camera.camera_model import Depths, Extent, ModelName, choose_model, energies, levelled
 from recon.errors import InputError
@@ -417,13 +417,6 @@ def _require(options: ReconstructionOptions) -> None:
     """Check what can be checked before there is a measurement."""
     if options.prior is not None:
         require_prior(options.prior)
-    require_options(
-        iterations=options.iterations,
-        time_s=options.time_s,
-        tolerance=options.tolerance,
-        tau=options.tau,
-        z_um=options.z_um,
-    )
     if options.tau is not None and isinstance(options.prior, Prior):
         raise InputError(
             "tau weighs a prior by name; a prior given as an object has its own weight: leave tau out."

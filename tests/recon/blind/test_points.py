@@ -123,7 +123,7 @@ def test_the_whole_way_finds_every_bead_between_pixels() -> None:
     slides = [slide(rng, 4) for _ in range(8)]
     told: list[float] = []
     found = calibrate_from_beads(
-        np.stack([image for image, _ in slides]), PSF, QUICK, progress=lambda _, share: told.append(share)
+        np.stack([image for image, _ in slides]), PSF, QUICK, on_progress=lambda _, share: told.append(share)
     )
     assert told == sorted(told)
     assert len(told) > 10

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.camera.registration import aligned, depth_scale, displacement, expected_shift, register, scaled
+from recon.camera.refocus import paraxial_scale
+from recon.camera.registration import aligned, displacement, expected_shift, register, scaled
 from recon.errors import InputError
 from recon.optics.diffuser import microlens_diffuser, smooth_diffuser
 from recon.optics.grid import GREEN, PixelGrid
@@ -100,7 +101,7 @@ def test_scale_follows_the_depth(camera: WavePropagator, z_um: float) -> None:
     reference = photograph(camera, (0.0, 0.0, 100e3), 1)
     source = (1.5e3, -0.8e3, z_um)
     image = photograph(camera, source, 2)
-    expected = depth_scale(z_um, 100e3, D_UM)
+    expected = paraxial_scale(100e3, z_um, D_UM)
     found = register(image, reference, scale=None)
     assert found.scale == pytest.approx(expected, rel=2e-3)
     known = register(image, reference, scale=expected)
@@ -113,7 +114,7 @@ def test_scale_follows_the_depth(camera: WavePropagator, z_um: float) -> None:
 def test_alignment_brings_the_pattern_onto_the_reference(camera: WavePropagator) -> None:
     reference = camera.psf((0.0, 0.0, 100e3), GRID, LIGHT)
     image = camera.psf((2.03e3, -1.07e3, 60e3), GRID, LIGHT)
-    back = aligned(image, register(image, reference, scale=depth_scale(60e3, 100e3, D_UM)))
+    back = aligned(image, register(image, reference, scale=paraxial_scale(100e3, 60e3, D_UM)))
     middle = (slice(60, 180), slice(80, 240))
     unit = [i[middle] / np.linalg.norm(i[middle]) for i in (back, reference)]
     assert float(np.vdot(*unit)) > 0.97
