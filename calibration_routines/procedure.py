@@ -167,34 +167,34 @@ class Outcome:
 
 
 class Listener:
-    """Hears how a procedure goes on, in the thread that carries it out; override what is of interest."""
+    """Follows how a procedure goes on, in the thread that carries it out; override what is of interest."""
 
     def step(self, words: str) -> None:
-        """Hear that another step begins: ``"finding exposures"``."""
+        """Note that another step begins: ``"finding exposures"``."""
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
-        """Hear how much of the step is done, where it does not take the frames of a plan.
+        """Note how much of the step is done, where it does not take the frames of a plan.
 
         ``at_most``: the step ends when it has found what it looks for, usually long before ``total``.
         """
 
     def said(self, words: str) -> None:
-        """Hear what was found on the way, for a log."""
+        """Note what was found on the way, for a log."""
 
     def exposures(self, found: SweepExposures) -> None:
-        """Hear which exposures a sweep will have."""
+        """Note which exposures a sweep will have."""
 
     def planned(self, lines: Sequence[str]) -> None:
-        """Hear in words what will be taken, once the exposures are known."""
+        """Note in words what will be taken, once the exposures are known."""
 
     def frame(self, status: RunStatus) -> None:
-        """Hear that a frame of a run is on the disk, or that the run's state changed."""
+        """Note that a frame of a run is on the disk, or that the run's state changed."""
 
     def event(self, event: SweepEvent) -> None:
-        """Hear how good a PSF, or the source, is as soon as it is known."""
+        """Note how good a PSF, or the source, is as soon as it is known."""
 
     def look(self, look: SpotLook) -> None:
-        """Hear what a picture of spots showed: a frame of a mask alignment."""
+        """Note what a picture of spots showed: a frame of a mask alignment."""
 
 
 class Procedure(ABC):

@@ -265,17 +265,13 @@ def compute_lines(order: HologramOrder, config: BenchConfig, weights: str | None
 
     ``weights`` is the expression that makes the weights; None where there are none.
     """
-    imports = Imports(
-        {
-            ("instrument.bench.config_file", "load_config"),
-            ("instrument.display.hologram", "bench_display"),
-            ("instrument.display.hologram", "slm_size"),
-            ("instrument.display.hologram_files", "HologramFiles"),
-            ("instrument.display.hologram", "compute_and_judge"),
-            ("instrument.display.hologram", "prepare_target"),
-            ("instrument.files.images", "read_image"),
-        }
-    )
+    hologram = ("bench_display", "compute_and_judge", "prepare_target", "slm_size")
+    imports = Imports({("instrument.display.hologram", name) for name in hologram})
+    imports.names |= {
+        ("instrument.bench.config_file", "load_config"),
+        ("instrument.display.hologram_files", "HologramFiles"),
+        ("instrument.files.images", "read_image"),
+    }
     options = expression(replace(order.options, weights=None), imports)
     if weights is not None:
         imports.names |= {("dataclasses", "replace"), ("recon.holography", weights.partition("(")[0])}

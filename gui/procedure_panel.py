@@ -100,7 +100,6 @@ class ProcedurePanel(Panel):
         self.choice.currentIndexChanged.connect(self._chosen)
         self.run_bar.start.connect(self.start)
         self.run.looked.connect(self.looked)
-        self.run.said.connect(lambda line: self.session.log("info", line))
         self.run.succeeded.connect(self._succeeded)
         self.run.ended_early.connect(self._ended_early)
         self.run.failed.connect(self._failed)
@@ -292,8 +291,6 @@ class ProcedurePanel(Panel):
     def _succeeded(self, outcome: Outcome) -> None:
         where = [str(path) for path in (*outcome.runs, outcome.calibration, *outcome.files) if path]
         self._say("\n".join((*outcome.verdict, *where)), wrong=not outcome.good)
-        for line in outcome.verdict:
-            self.session.log("info" if outcome.good else "warning", line)
         pictures = [file for file in outcome.files if file.suffix == ".tif"]
         self._result = outcome.calibration or next(iter(pictures), None)
         self.use_button.setVisible(self._result is not None)
@@ -304,7 +301,6 @@ class ProcedurePanel(Panel):
         self._say(ended.words, wrong=True)
         self._unfinished = ended.run
         self.go_on_button.setVisible(ended.run is not None)
-        self.session.log("warning", ended.words)
         self.run_bar.show_end("Ended early; nothing moves, light off", complete=False)
 
     def _failed(self, why: str) -> None:

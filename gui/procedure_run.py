@@ -147,14 +147,12 @@ class Ended:
 
 
 class ProcedureRun(QObject):
-    """Carries out one procedure after the other on a session's bench; all signals in the window's thread.
+    """Carries out one procedure after the other on a session's bench, and logs what is said of it.
 
     Signals
     -------
     looked : Situation
         Ten times a second while it goes on, and once at its end.
-    said : str
-        A line for people.
     judged : PointTaken or SourceVisit
     look : SpotLook
     succeeded : Outcome
@@ -166,7 +164,6 @@ class ProcedureRun(QObject):
     """
 
     looked = Signal(object)
-    said = Signal(str)
     judged = Signal(object)
     look = Signal(object)
     succeeded = Signal(object)
@@ -236,7 +233,7 @@ class ProcedureRun(QObject):
     def _look(self) -> None:
         lines, events, looks = self._mailbox.fetch()
         for line in lines:
-            self.said.emit(line)
+            self._session.log("info", line)
         for event in events:
             self.judged.emit(event)
         for look in looks:
@@ -252,13 +249,19 @@ class ProcedureRun(QObject):
         if isinstance(result, Ended):
             if self._job is not None:
                 self._job.became = "ended early"
-            self.ended_early.emit(result)
+            self._ended_early(result)
             if result.run is not None:
                 self._session.run_finished.emit(result.run)
             return
         for path in dict.fromkeys((*result.runs, *([result.calibration] if result.calibration else []))):
             self._session.run_finished.emit(path)
+        for line in result.verdict:
+            self._session.log("info" if result.good else "warning", line)
         self.succeeded.emit(result)
+
+    def _ended_early(self, ended: Ended) -> None:
+        self._session.log("warning", ended.words)
+        self.ended_early.emit(ended)
 
     def _failed(self, why: str) -> None:
         self._look()
@@ -266,7 +269,7 @@ class ProcedureRun(QObject):
 
     def _cancelled(self, words: str) -> None:
         self._look()
-        self.ended_early.emit(Ended(words))
+        self._ended_early(Ended(words))
 
     def _over(self) -> None:
         self._timer.stop()

@@ -237,7 +237,7 @@ def _compare(
         return None  # nothing but noise may be left, in which a pattern would be found by chance
     found = register(image, axis_image, near=near, within_px=_NEAR_PX)
     if not found.reliable:  # too little is seen to tell; the stage knows well enough for a sum over pixels
-        found = _by_stage(found, near)
+        found = replace(found, rows=near[0], columns=near[1])
     expected = _displaced(axis_bare, (found.rows, found.columns))
     seen = float(expected.sum(dtype=np.float64) / axis_bare.sum())
     if seen < LEAST_SEEN:
@@ -273,10 +273,6 @@ def _tangents(
     rows, columns = (np.asarray((np.arange(n) - (n - 1) / 2) * pitch_um, np.float64) for n in shape)
     tan_y, tan_x = (rows[:, None] - y) / (z + distance_um), (columns[None, :] - x) / (z + distance_um)
     return np.asarray(tan_y, np.float64), np.asarray(tan_x, np.float64)
-
-
-def _by_stage(found: Registration, shift: tuple[float, float]) -> Registration:
-    return replace(found, rows=shift[0], columns=shift[1])
 
 
 def _displaced(image: Floats, shift: tuple[float, float]) -> npt.NDArray[np.float32]:

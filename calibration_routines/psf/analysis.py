@@ -77,7 +77,6 @@ class DarkModel:
             raise ValueError("Dark frames are needed at one or two exposures.")
         self._exposures_ms = tuple(exposures_ms)
         self._means: list[Float] = [_mean(stack) for stack in frames]
-        self.n_frames = min(len(stack) for stack in frames)
         longest = int(np.argmax(self._exposures_ms))
         self.hot = hot_pixels(np.min(frames[longest], axis=0), full_scale)
         """Pixels that are bright without light at the longer exposure, in every frame."""

@@ -16,12 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from calibration_routines.procedure import CalibrationError
+from drivers.camera import Camera
 from drivers.frame import Frame
 from instrument.bench.bench import Bench
 
@@ -31,24 +31,6 @@ _DIMMEST_USABLE = 0.05  # of full scale: below this a PSF drowns in read noise
 
 class TooDarkError(CalibrationError):
     """Hardly any light reaches the camera, even at its longest exposure."""
-
-
-class ExposingCamera(Protocol):
-    """What auto-exposure needs of a :class:`drivers.camera.Camera`."""
-
-    @property
-    def exposure_ms(self) -> float:
-        """Exposure time, milliseconds."""
-
-    @property
-    def exposure_limits_ms(self) -> tuple[float, float]:
-        """Shortest and longest exposure, milliseconds."""
-
-    def set_exposure_ms(self, exposure_ms: float) -> float:
-        """Set the exposure; returns what the device made of it, milliseconds."""
-
-    def snap(self) -> Frame:
-        """Take one frame whose exposure begins after this call."""
 
 
 class ExposureOutcome(Enum):
@@ -151,7 +133,7 @@ def hot_pixels(dark: Counts, full_scale: int) -> npt.NDArray[np.bool_]:
 
 
 def auto_expose(
-    camera: ExposingCamera,
+    camera: Camera,
     *,
     target: float = 0.7,
     tolerance: float = 0.1,
@@ -169,7 +151,7 @@ def auto_expose(
 
     Parameters
     ----------
-    camera : ExposingCamera
+    camera : Camera
         Open, with the source on.
     target, tolerance : float
         Wanted fraction of full scale above black, and the relative deviation from it that is accepted.

@@ -96,17 +96,18 @@ def judge_drift(
     seconds : sequence of float
         When each visit was, from the first.
     """
-    first = visits[0]
-    brightness, shifts = [1.0], [0.0]
-    for visit in visits[1:]:
-        light, shift_px = compare_visit(visit, first)
-        brightness.append(light)
-        shifts.append(shift_px)
+    compared = [(1.0, 0.0), *(compare_visit(visit, visits[0]) for visit in visits[1:])]
+    brightness, shifts = zip(*compared, strict=True)
     findings: list[str] = []
     for k in range(1, len(visits)):
         points = (before_point[k - 1], min(before_point[k], last_point))
-        findings += judge_visit(tuple(brightness[k - 1 : k + 1]), tuple(shifts[k - 1 : k + 1]), points)
-    return Drift(tuple(before_point), tuple(brightness), tuple(shifts), tuple(findings), tuple(seconds))
+        findings += judge_visit(brightness[k - 1 : k + 1], shifts[k - 1 : k + 1], points)
+    return Drift(tuple(before_point), brightness, shifts, tuple(findings), tuple(seconds))
+
+
+def reduction(image: Float) -> int:
+    """Return by how much an image is binned before it is registered."""
+    return max(1, int(np.ceil(np.sqrt(image.size / LARGEST_PX))))
 
 
 def compare_visit(visit: Float, first: Float) -> tuple[float, float]:
@@ -114,7 +115,7 @@ def compare_visit(visit: Float, first: Float) -> tuple[float, float]:
 
     The shift is infinite where the pattern is not found again; both are nan where there is no light.
     """
-    factor = max(1, int(np.ceil(np.sqrt(first.size / LARGEST_PX))))
+    factor = reduction(first)
     light = float(first.sum(dtype=np.float64))
     brightness = float(visit.sum(dtype=np.float64)) / light if light > 0 else float("nan")
     if not light > 0 or not np.ptp(visit) > 0:
@@ -214,7 +215,10 @@ def judge_points(
     depths: dict[float, list[int]] = {}
     for index, point in enumerate(quality):
         depths.setdefault(point.z_um, []).append(index)
-    central = [min(group, key=lambda i: _off_axis(quality[i])) for group in depths.values()]
+    central = [
+        min(group, key=lambda i: float(np.hypot(quality[i].x_um, quality[i].y_um)))
+        for group in depths.values()
+    ]
     d_mm = geometry.diffuser_distance_mm
     along = judge_sweep([quality[i] for i in central], None if d_mm is None else 1e3 * d_mm)
     for index, plane in zip(central, along, strict=True):
@@ -289,7 +293,7 @@ def _judge_depth(
     """Register a depth's PSFs to the central one; puts steps, similarities and findings into ``judged``."""
     here = judged[centre]
     nominal = nominal_px_per_um(geometry, here.z_um)
-    factor = max(1, int(np.ceil(np.sqrt(psfs[0, 0].size / LARGEST_PX))))
+    factor = reduction(psfs[0, 0])
     reference = block_mean(psfs[centre].mean(axis=0), factor)
     places, shifts, seen = [], [], []
     for index in others:
@@ -399,7 +403,3 @@ def nominal_px_per_um(geometry: Geometry, z_um: float) -> float | None:
     """Return ``d / z / pitch``: the pattern's shift in pixels a micrometre; None where it is not known."""
     d_mm, pitch_um = geometry.diffuser_distance_mm, geometry.pixel_pitch_um
     return None if d_mm is None or pitch_um is None else 1e3 * d_mm / z_um / pitch_um
-
-
-def _off_axis(point: PsfQuality) -> float:
-    return float(np.hypot(point.x_um, point.y_um))

@@ -37,23 +37,20 @@ def check_image_settings(sweep: PointSweep, frame_shape: Sequence[int]) -> None:
     """
     height, width = frame_shape[:2]
     binning = max(sweep.binning, 1)  # automatic: known only once there are frames
-    problems = []
     if min(height, width) // binning < LEAST_SIDE_PX:
         most = max(1, min(height, width) // LEAST_SIDE_PX)
         words = (
             f"binning {binning} leaves {height // binning} x {width // binning} pixels of the camera's "
             f"{height} x {width}, fewer than {LEAST_SIDE_PX} on a side: choose {most} at most"
         )
-        problems.append(("binning", words))
-    elif sweep.dct_order > min(height, width) // binning:
+        raise SettingsError([("binning", words)])
+    if sweep.dct_order > min(height, width) // binning:
         words = (
             f"{sweep.dct_order} DCT coefficients along each axis (dct) are more than the image's "
             f"{height // binning} x {width // binning} pixels have: choose "
             f"{min(height, width) // binning} at most; Kuo 2020, Sec. 6.4 removes 10"
         )
-        problems.append(("dct_order", words))
-    if problems:
-        raise SettingsError(problems)
+        raise SettingsError([("dct_order", words)])
 
 
 def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:

@@ -34,13 +34,13 @@ from calibration_routines.psf.psf_quality import (
 )
 from calibration_routines.psf.sampling import Position
 from calibration_routines.psf.stage_fit import (
-    LARGEST_PX,
     MAX_GAIN_ERROR,
     MAX_ROTATION_MRAD,
     compare_visit,
     find_pattern,
     judge_visit,
     nominal_px_per_um,
+    reduction,
 )
 from calibration_routines.psf.sweep_options import PointSweep
 from calibration_routines.psf.sweep_plan import DARK, REFERENCE
@@ -177,7 +177,7 @@ class SweepWatch:
             quality = self._judged(plane, image)
             again = quality.retake and self.take_again is not None and take <= self._sweep.retakes
             number, total = self._numbers[point], len(self._numbers)
-            self._tell(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
+            self._report(PointTaken(number, total, take, quality, plane.exposure_ms, again, image))
             if not again or self.take_again is None:
                 break
             taken = self.take_again(point, plane.exposure_ms * retake_dimming(quality))
@@ -198,10 +198,10 @@ class SweepWatch:
         )
 
     def _image(self, plane: PlaneFrames) -> Float:
-        """Return a point's light, (height, width), binned to :data:`LARGEST_PX` at most."""
+        """Return a point's light, (height, width), binned as for registration."""
         light = channels_first(plane_light(plane, self._dark_model(plane.full_scale)))
         grey: Float = light.mean(axis=0)
-        return block_mean(grey, _factor(grey))
+        return block_mean(grey, reduction(grey))
 
     def _judged(self, plane: PlaneFrames, image: Float) -> PsfQuality:
         frame_shape = plane.frames.shape[1:3]
@@ -275,9 +275,9 @@ class SweepWatch:
             )
             visit = SourceVisit(before.number + 1, self._points_done, brightness, shift_px, findings)
         self._visits.append(visit)
-        self._tell(visit)
+        self._report(visit)
 
-    def _tell(self, event: SweepEvent) -> None:
+    def _report(self, event: SweepEvent) -> None:
         if self.on_event is not None:
             self.on_event(event)
 
@@ -302,7 +302,3 @@ def _counts(snapshot: Snapshot) -> Counts:
 
 def _stacked(frames: Sequence[Counts]) -> Counts:
     return cast(Counts, np.stack(frames))
-
-
-def _factor(image: Float) -> int:
-    return max(1, int(np.ceil(np.sqrt(image.size / LARGEST_PX))))

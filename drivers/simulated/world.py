@@ -24,7 +24,7 @@ from recon.optics.fall_off import (
     table_fall_off,
 )
 from recon.optics.grid import PixelGrid, mixed_spectrum
-from recon.optics.render import RenderSettings, render
+from recon.optics.render import RenderSettings, product, render
 from recon.optics.scene import Scene, TruthGrid, bar_target, bead_volume, picture, tilted_target, true_scene
 from recon.optics.wave import WavePropagator
 from recon.types import Geometry
@@ -224,7 +224,7 @@ class SimulatedWorld(Surroundings):
     def photons_per_s(self, weights: Rgb, binning: int = 1) -> Image | None:
         """Photons a second on every binned pixel now, or None when all is dark."""
         light = None
-        glow = _product(self.emission, weights)
+        glow = product(self.emission, weights)
         if any(glow):
             # Cached by colour, not by brightness: dimming the light costs nothing.
             total = sum(glow)
@@ -234,14 +234,14 @@ class SimulatedWorld(Surroundings):
         with self._lock:
             scene, number = self._scene, self._scene_number
         if self.scene_lit and scene is not None:
-            seen = _product(self._glow(self.options.scene_rgb), weights)
+            seen = product(self._glow(self.options.scene_rgb), weights)
             picture = self._cached(
                 ("scene", number, seen, binning), lambda: self._render(scene, seen, binning)
             )
             light = picture if light is None else light + picture
         leds = self._scene_light
         if leds is not None and scene is not None:
-            seen = _product(self._glow(self.options.scene_rgb), weights)
+            seen = product(self._glow(self.options.scene_rgb), weights)
             picture = self._cached(
                 ("scene", number, seen, binning, leds), lambda: self._render(leds.on(scene), seen, binning)
             )
@@ -362,10 +362,6 @@ class SimulatedWorld(Surroundings):
             while sum(entry.nbytes for entry in self._cache.values()) > CACHE_BYTES and len(self._cache) > 1:
                 self._cache.popitem(last=False)
             return image
-
-
-def _product(first: Rgb, second: Rgb) -> Rgb:
-    return first[0] * second[0], first[1] * second[1], first[2] * second[2]
 
 
 def _diffuser(options: WorldOptions, preset: Preset, aperture_mm: tuple[float, float]) -> Diffuser:

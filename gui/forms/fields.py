@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QSignalBlocker, Qt
+from PySide6.QtCore import QObject, QSignalBlocker, Qt, Signal
 from PySide6.QtGui import QFontDatabase
 from PySide6.QtWidgets import QCheckBox, QComboBox, QPlainTextEdit, QWidget
 
@@ -65,16 +65,7 @@ class Behaviour:
     enabled_when: Callable[[dict[str, Any]], str] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FieldSignals:
-    """What a field calls when it is edited, refused (with the reason), or its value is taken."""
-
-    edited: Callable[[], object]
-    refused: Callable[[str], object]
-    settled: Callable[[], object]
-
-
-class OptionField:
+class OptionField(QObject):
     """A declared option on the screen; subclasses are for kinds of values.
 
     Attributes
@@ -85,12 +76,24 @@ class OptionField:
         That is edited, marked when its content is refused.
     whole : QWidget
         That goes into the row: ``widget``, or what it is part of.
+
+    Signals
+    -------
+    edited
+    refused : str
+        Why the content cannot be used.
+    settled
+        The value was taken: chosen, or typed and the field left.
     """
 
     widget: QWidget
     whole: QWidget
+    edited = Signal()
+    refused = Signal(str)
+    settled = Signal()
 
     def __init__(self, option: Option, behaviour: Behaviour) -> None:
+        super().__init__()
         self.option = option
         self.behaviour = behaviour
         said = option.declaration
@@ -157,10 +160,6 @@ class OptionField:
         """Return what stands in the widget; equal as long as nothing was changed."""
         return self.read()
 
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        raise NotImplementedError
-
 
 class NumberField(OptionField):
     """A number with its unit."""
@@ -175,6 +174,9 @@ class NumberField(OptionField):
         self.widget: NumberEdit = NumberEdit(self.unit, integer=option.is_whole, tip=self.tip, empty=empty)
         self.widget.check = lambda number: self.problem(self._in_own_unit(number))
         self.whole = self.widget
+        self.widget.textChanged.connect(self.edited)
+        self.widget.refused.connect(self.refused)
+        self.widget.submitted.connect(self.settled)
 
     @property
     def label(self) -> str:
@@ -210,12 +212,6 @@ class NumberField(OptionField):
         scaled = None if value is None else value / self.option.declaration.shown_factor
         self.widget.set_value(scaled, overwrite=True)
 
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        self.widget.textChanged.connect(lambda _: signals.edited())
-        self.widget.refused.connect(signals.refused)
-        self.widget.submitted.connect(lambda _: signals.settled())
-
 
 class SwitchField(OptionField):
     """Yes or no."""
@@ -225,6 +221,8 @@ class SwitchField(OptionField):
         self.widget: QCheckBox = QCheckBox()
         self.whole = self.widget
         self.widget.setToolTip(self.tip)
+        self.widget.toggled.connect(self.edited)
+        self.widget.toggled.connect(self.settled)
 
     def read(self) -> tuple[Any, str]:
         """Return the value, and why it cannot be used."""
@@ -232,11 +230,6 @@ class SwitchField(OptionField):
 
     def _set(self, value: Any) -> None:
         self.widget.setChecked(bool(value))
-
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        self.widget.toggled.connect(lambda _: signals.edited())
-        self.widget.toggled.connect(lambda _: signals.settled())
 
 
 class ChoiceField(OptionField):
@@ -256,6 +249,8 @@ class ChoiceField(OptionField):
             self.widget.addItem("no", False)
         self._words_from = self.widget.count()
         self._add(option.words if behaviour.offers is None else behaviour.offers())
+        self.widget.currentIndexChanged.connect(self.edited)
+        self.widget.currentIndexChanged.connect(self.settled)
 
     @property
     def is_being_edited(self) -> bool:
@@ -289,11 +284,6 @@ class ChoiceField(OptionField):
         at = [self.widget.itemData(i) for i in range(self.widget.count())]
         self.widget.setCurrentIndex(at.index(value) if value in at else 0)
 
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        self.widget.currentIndexChanged.connect(lambda _: signals.edited())
-        self.widget.currentIndexChanged.connect(lambda _: signals.settled())
-
 
 class EntryField(OptionField):
     """A text that stands for something: a path, a place, a name."""
@@ -308,6 +298,9 @@ class EntryField(OptionField):
             browse = "folder" if option.declaration.metavar == "FOLDER" else behaviour.browse
             self.whole = path = PathEntry(self.widget, browse, behaviour.filters)
             path.button.setAccessibleName(f"Choose {self.bare_label}")
+        self.widget.textChanged.connect(self.edited)
+        self.widget.refused.connect(self.refused)
+        self.widget.understood.connect(self.settled)
 
     def _understood(self, text: str) -> Any:
         if not text:
@@ -355,12 +348,6 @@ class EntryField(OptionField):
     def _set(self, value: Any) -> None:
         self.widget.setText("" if value is None else shown(self.option, value))
 
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        self.widget.textChanged.connect(lambda _: signals.edited())
-        self.widget.refused.connect(signals.refused)
-        self.widget.understood.connect(signals.settled)
-
 
 class LinesField(OptionField):
     """A text of several lines, as its default has."""
@@ -374,6 +361,7 @@ class LinesField(OptionField):
         self.widget.setMinimumHeight(_TEXT_HEIGHT_PX)
         self.widget.setToolTip(self.tip)
         self.widget.setTabChangesFocus(True)
+        self.widget.textChanged.connect(self.edited)
 
     def read(self) -> tuple[Any, str]:
         """Return the text."""
@@ -381,10 +369,6 @@ class LinesField(OptionField):
 
     def _set(self, value: Any) -> None:
         self.widget.setPlainText(str(value or ""))
-
-    def listen(self, signals: FieldSignals) -> None:
-        """Connect what is to be called."""
-        self.widget.textChanged.connect(signals.edited)
 
 
 def field_for(option: Option, behaviour: Behaviour) -> OptionField:

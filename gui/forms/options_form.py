@@ -9,15 +9,7 @@ from typing import Any, TypeVar
 from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QWidget
 
-from gui.forms.fields import (
-    Behaviour,
-    ChoiceField,
-    FieldSignals,
-    LinesField,
-    OptionField,
-    SwitchField,
-    field_for,
-)
+from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, field_for
 from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
 from recon.base.declare import Option, options_of
@@ -99,10 +91,9 @@ class OptionsForm(QWidget):
         self.more.setVisible(any(map(self._is_folded, self.fields.values())))  # once it has its place
         for name, field in self.fields.items():
             field.show(field.default)
-            signals = FieldSignals(
-                self._edited, partial(self._refused_itself, name), partial(self.settled.emit, name)
-            )
-            field.listen(signals)
+            field.edited.connect(self._edited)
+            field.refused.connect(partial(self._refused_itself, name))
+            field.settled.connect(partial(self.settled.emit, name))
         self._state = self._raw()
         self._update_enabled()
 

@@ -14,12 +14,11 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
-from calibration_routines.procedure import Outcome
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
 from gui.jobs import BusyError, Job, JobContext
 from gui.panel import Panel
-from gui.procedure_run import Ended, ProcedureRun, RunBar, script
+from gui.procedure_run import ProcedureRun, RunBar, script
 from gui.session import BenchSession
 from gui.widgets.building import (
     after_rest,
@@ -94,9 +93,9 @@ class RunsPanel(Panel):
         self._watcher = QFileSystemWatcher(self)
         self._watcher.directoryChanged.connect(lambda _: self._rest.start())
         session.run_finished.connect(lambda _: self._rest.start())
-        self.run.said.connect(lambda line: self.session.log("info", line))
-        self.run.succeeded.connect(self._succeeded)
-        self.run.ended_early.connect(self._ended_early)
+        self.run.succeeded.connect(
+            lambda outcome: self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
+        )
         self.run.failed.connect(lambda why: self.refused(None, why))
         self.run.over.connect(self._over)
         self.read_folder()
@@ -290,14 +289,6 @@ class RunsPanel(Panel):
     def _open_folder(self) -> None:
         if self.opened is not None:
             QDesktopServices.openUrl(QUrl.fromLocalFile(str(self.opened.path)))
-
-    def _succeeded(self, outcome: Outcome) -> None:
-        self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
-        for line in outcome.verdict:
-            self.session.log("info" if outcome.good else "warning", line)
-
-    def _ended_early(self, ended: Ended) -> None:
-        self.session.log("warning", ended.words)
 
     def _over(self) -> None:
         self.bar.set_running(False)

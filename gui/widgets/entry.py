@@ -101,10 +101,8 @@ class Entry(_Refusing):
 class PathEntry(QWidget):
     """An :class:`Entry` for a path, with a button that opens a dialogue to choose it."""
 
-    def __init__(
-        self, entry: Entry, browse: Browse, filters: str = "", parent: QWidget | None = None
-    ) -> None:
-        super().__init__(parent)
+    def __init__(self, entry: Entry, browse: Browse, filters: str = "") -> None:
+        super().__init__()
         self.entry = entry
         self._browse: Browse = browse
         self._filters = filters
@@ -187,9 +185,8 @@ class NumberEdit(_Refusing):
         integer: bool = False,
         tip: str = "",
         empty: str = "",
-        parent: QWidget | None = None,
     ) -> None:
-        super().__init__(parent)
+        super().__init__()
         self.unit = unit
         self.minimum, self.maximum = minimum, maximum
         self.check: Callable[[float], str] | None = None

@@ -254,15 +254,6 @@ class PsfPictures:
         self._in_full: dict[int, Image] = {}
         self._small: dict[int, PsfPicture] = {}
 
-    def __len__(self) -> int:
-        return len(self._in_full) + len(self._small)
-
-    @property
-    def nbytes(self) -> int:
-        """What they hold in memory."""
-        images = [*self._in_full.values(), *(picture.image for picture in self._small.values())]
-        return sum(image.nbytes for image in images)
-
     def keep(self, number: int, image: Image) -> None:
         """Keep a picture, in place of an earlier one of the same number."""
         self._in_full.pop(number, None)

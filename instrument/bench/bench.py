@@ -83,10 +83,8 @@ class Bench:
     def open(self) -> Self:
         """Open every device and apply the configured settings; on failure close again what was opened.
 
-        Raises
-        ------
-        DeviceError
-            Naming the device that is missing, refuses, or is in use by another program, and what to check.
+        Raises DeviceError naming the device that is missing, refuses, or is in use by another program, and
+        what to check.
         """
         try:
             for kind in self.devices:
@@ -165,10 +163,7 @@ class Bench:
 
         ``on_progress`` is called after each frame.
 
-        Raises
-        ------
-        DeviceError
-            When the camera fails, or the LED array was lost meanwhile.
+        Raises DeviceError when the camera fails, or the LED array was lost meanwhile.
         """
 
         def take_note(frame: Frame) -> None:
@@ -181,10 +176,7 @@ class Bench:
     def require_light(self) -> None:
         """Refuse frames taken since the LED array was lost: nobody knows what lit them.
 
-        Raises
-        ------
-        DeviceLostError
-            When it was opened and is not open any more.
+        Raises DeviceLostError when it was opened and is not open any more.
         """
         leds = self.led_array
         if leds is not None and leds in self._opened and not leds.is_open:
@@ -212,10 +204,7 @@ class Bench:
     def source_mount(self) -> SourceMount:
         """The point source on its stage.
 
-        Raises
-        ------
-        BenchError
-            When the bench has no stage.
+        Raises BenchError when the bench has no stage.
         """
         if self.stage is None:
             raise BenchError(f"{self.config.label} has no [stage], so the source cannot be placed.")
@@ -246,12 +235,6 @@ class Bench:
         mount = self.source_mount
         mount.stage.move_to(mount.target(x_um, y_um, z_um))
         return mount.position_um
-
-    def stage_target(
-        self, x_um: float | None = None, y_um: float | None = None, z_um: float | None = None
-    ) -> dict[str, float]:
-        """Return the stage position that brings the point source to a place; errors as ``place_source``."""
-        return self.source_mount.target(x_um, y_um, z_um)
 
     def source_on(self) -> None:
         """Light the point source; confirmed when this returns."""
@@ -302,20 +285,14 @@ class Bench:
 
         Light off, motion stopped, exposure ended, SLM blank if so configured: all tried, in this order.
 
-        Raises
-        ------
-        StepsFailedError
-            After every step was tried, naming those that failed.
+        Raises StepsFailedError after every step was tried, naming those that failed.
         """
         try_all(self._safe_steps())
 
     def close(self) -> None:
         """Make the bench safe and close every device in reverse order, each even if another fails.
 
-        Raises
-        ------
-        StepsFailedError
-            After everything was tried, naming what failed.
+        Raises StepsFailedError after everything was tried, naming what failed.
         """
         steps = self._safe_steps()
         steps += [
@@ -369,12 +346,8 @@ def open_bench(config: BenchConfig | Path | str | None = None, *, ask: Ask | Non
     simulated bench, which says SIMULATED wherever it is named. ``ask`` is as in :class:`Bench`. Use the bench
     as a context manager, or call ``close``.
 
-    Raises
-    ------
-    ConfigError, FileError
-        When the configuration is wrong; no device was touched.
-    DeviceError
-        When a device is missing or refuses; the others were closed again.
+    Raises ConfigError or FileError when the configuration is wrong (no device was touched); DeviceError when
+    a device is missing or refuses (the others were closed again).
     """
     if not isinstance(config, BenchConfig):
         config = load_config(config)

@@ -92,10 +92,7 @@ def camera_settings(camera: Camera) -> dict[str, Any]:
 def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
     """Bring a camera back to what :func:`camera_settings` returned.
 
-    Raises
-    ------
-    DeviceError
-        Naming the settings that the camera did not take.
+    Raises DeviceError naming the settings that the camera did not take.
     """
     for name, set_to in _setters(camera).items():
         if not _same(camera_settings(camera)[name], wanted[name]):
@@ -115,10 +112,7 @@ def restore_camera(camera: Camera, wanted: Mapping[str, Any]) -> None:
 def apply_table(wanted: CameraTable, camera: Camera) -> None:
     """Bring a camera to its configured settings, in the order in which they depend on each other.
 
-    Raises
-    ------
-    LimitError
-        Naming every setting that the camera refuses; the others are set.
+    Raises LimitError naming every setting that the camera refuses; the others are set.
     """
     refused = []
     for name, set_to in _setters(camera).items():

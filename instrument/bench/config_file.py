@@ -44,12 +44,7 @@ def load_config(path: Path | str | None = None) -> BenchConfig:
     Without a path it is ``bench.toml`` in the working folder if there is one, otherwise the embedded default,
     which is the simulated bench (:attr:`BenchConfig.path` is then None).
 
-    Raises
-    ------
-    FileError
-        When the file cannot be read.
-    ConfigError
-        With every mistake that the file contains.
+    Raises FileError when the file cannot be read; ConfigError with every mistake that the file contains.
     """
     if path is None:
         if not Path(DEFAULT_NAME).exists():

@@ -57,12 +57,7 @@ def photograph(
 
     ``on_progress`` is called after each frame, ``on_frame`` with the frame itself.
 
-    Raises
-    ------
-    DeviceError
-        When the camera fails.
-    BenchError
-        When ``average`` is below 1.
+    Raises DeviceError when the camera fails; BenchError when ``average`` is below 1.
     """
     if average < 1:
         raise BenchError(f"A photograph is the mean of 1 or more frames, not {average}.")
@@ -96,10 +91,7 @@ class LightState(enum.StrEnum):
 def switch_light(bench: Bench, light: LightState) -> None:
     """Light the scene, the point source, or nothing; ``AS_IS`` changes nothing.
 
-    Raises
-    ------
-    DeviceError, BenchError
-        When a light cannot be switched.
+    Raises DeviceError or BenchError when a light cannot be switched.
     """
     if light is LightState.AS_IS:
         return
@@ -139,10 +131,7 @@ class Lit:
     def put_back(self, bench: Bench) -> None:
         """Light it again.
 
-        Raises
-        ------
-        DeviceError, BenchError
-            When a light cannot be switched.
+        Raises DeviceError or BenchError when a light cannot be switched.
         """
         if bench.led_array is not None and self.pattern is not None:
             bench.led_array.set_pattern(self.pattern)
@@ -159,9 +148,7 @@ def photograph_name() -> str:
 def check_photograph_file(target: Path, average: int, *, force: bool = False) -> None:
     """Refuse a file that cannot hold the photograph, cannot be written, or is there already.
 
-    Raises
-    ------
-    FileError
+    Raises FileError.
     """
     check_suffix(target)
     if average > 1 and target.suffix.lower() == ".png":
@@ -200,10 +187,7 @@ def snapshot_facts(bench: Bench, taken: Snapshot, light: LightState) -> dict[str
 def read_snapshot(path: Path | str) -> Snapshot:
     """Read a photograph that :func:`write_snapshot` wrote, with its metadata.
 
-    Raises
-    ------
-    FileError
-        When it cannot be read, or is no photograph of this program's: nothing is known about it.
+    Raises FileError when it cannot be read, or is no photograph of this program's: nothing is known about it.
     """
     image = read_image(path)
     try:

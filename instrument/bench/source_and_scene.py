@@ -79,12 +79,8 @@ class Lights:
     def switch_scene(self, *, lit: bool) -> None:
         """Light or darken the scene.
 
-        Raises
-        ------
-        BenchError
-            When the configuration leaves it to a simulated world that is not there.
-        OperatorNeededError
-            When nobody can be asked.
+        Raises BenchError when the configuration leaves it to a simulated world that is not there;
+        OperatorNeededError when nobody can be asked.
         """
         if self._by_operator:
             self._ask_once("the scene", lit=lit)
@@ -152,10 +148,7 @@ class SourceMount:
     def target(self, x_um: float | None, y_um: float | None, z_um: float | None) -> dict[str, float]:
         """Return the stage position that brings the source to a place; None leaves a coordinate as it is.
 
-        Raises
-        ------
-        BenchError
-            When the stage lacks the axis that would have to move.
+        Raises BenchError when the stage lacks the axis that would have to move.
         """
         axes = {axis.name for axis in self.stage.axes}
         target = {}

@@ -76,11 +76,9 @@ def analyze(
     Everything follows from the calibration's PSFs and its geometry; what they cannot tell (the sensor's
     angular cut-off, the diffuser's deflection) is given as options or named on the page as not known.
     """
-    import json
-
     from calibration_routines.optics.angular_response import load_response
     from instrument.evaluation.analysis_figure import draw_analysis, facts
-    from instrument.files.atomic import write_text
+    from instrument.files.atomic import write_json
     from instrument.files.calibration_file import load_calibration
     from instrument.files.figures import save_figure
     from instrument.files.record import plain
@@ -116,7 +114,7 @@ def analyze(
             "provenance": measured.provenance,
             "analysis": plain(analysis.figures()),
         }
-        write_text(record, json.dumps(described, indent=2, allow_nan=False) + "\n")
+        write_json(record, described)
     if simulated:
         typer.echo("SIMULATED: the calibration comes from the simulated bench")
     for name, value in facts(analysis):
@@ -163,13 +161,12 @@ def compare(
 
     Ends with status 1 when a recalibration is due (the new calibration should replace the old one), else 0.
     """
-    import json
     from dataclasses import asdict
 
     from rich.console import Console
     from rich.table import Table
 
-    from instrument.files.atomic import write_text
+    from instrument.files.atomic import write_json
     from instrument.files.calibration_file import load_calibration
     from instrument.files.record import plain
     from instrument.reconstruction.job import find_calibration
@@ -211,7 +208,7 @@ def compare(
         typer.echo("SIMULATED: a calibration comes from the simulated bench")
     if out is not None:
         record = {"old": str(folders[0].resolve()), "new": str(folders[1].resolve()), **asdict(found)}
-        write_text(out, json.dumps(plain(record), indent=2, allow_nan=False) + "\n")
+        write_json(out, plain(record))
         typer.echo(f"Wrote {out}")
     if found.due:
         raise typer.Exit(1)

@@ -66,10 +66,7 @@ class CaptureOptions:
     def light(self) -> LightState:
         """Return the light asked for.
 
-        Raises
-        ------
-        typer.BadParameter
-            When more than one is.
+        Raises typer.BadParameter when more than one is.
         """
         flags = {LightState.SCENE: self.scene, LightState.SOURCE: self.source, LightState.DARK: self.dark}
         chosen = [name for name, is_set in flags.items() if is_set]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -96,11 +97,11 @@ def verify(
 
 
 def _slice(text: str) -> slice:
+    if not re.fullmatch(r"-?\d+|-?\d*:-?\d*(:-?[1-9]\d*)?", text):
+        raise ValueError("give A:B, e.g. 0:100, or one number.")
     numbers = [int(part) if part else None for part in text.split(":")]
     if len(numbers) == 1 and numbers[0] is not None:
         return slice(numbers[0], numbers[0] + 1)
-    if len(numbers) > 3 or numbers[2:] == [0]:
-        raise ValueError("give A:B, e.g. 0:100, or one number.")
     return slice(*numbers)
 
 

@@ -77,9 +77,7 @@ class ShowOptions(CaptureOptions, _Shown):
     def check(self, n_patterns: int) -> None:
         """Refuse what does not go together, or a file that exists.
 
-        Raises
-        ------
-        BenchError, FileError
+        Raises BenchError or FileError.
         """
         capture = self.capture
         if (capture is None) != (self.target is None):

@@ -120,7 +120,7 @@ def _print_job(job: Job, simulated: str) -> None:
 def _print(result: Reconstruction) -> None:
     weight = "" if result.tau is None else f", tau {result.tau:.3g}"
     if result.choice is not None:
-        for line in result.choice.brief():
+        for line in result.choice.lines(steps=False):
             typer.echo(line)
     else:
         typer.echo(f"{'Model':<12}{result.model}: {result.reason}")

@@ -184,12 +184,7 @@ def read_weights(path: Path) -> npt.NDArray[np.float64]:
 def slm_size(config: BenchConfig) -> tuple[tuple[int, int], float]:
     """Ask the bench's SLM for its shape and pixel pitch in micrometres; opens and closes it.
 
-    Raises
-    ------
-    BenchError
-        When the bench has no SLM.
-    DeviceError
-        When it does not answer.
+    Raises BenchError when the bench has no SLM; DeviceError when it does not answer.
     """
     from instrument.bench.bench import Bench
 
@@ -215,10 +210,7 @@ def bench_display(
     ``size`` is the SLM's shape and pitch, of :func:`slm_size`. Another ``expansion`` than the bench's has a
     random mask of its own; with another wavelength the mask keeps its height.
 
-    Raises
-    ------
-    BenchError, FileError
-        When SLM, binning, expansion and mask do not fit together.
+    Raises BenchError or FileError when SLM, binning, expansion and mask do not fit together.
     """
     table = config.display
     q = expansion or table.expansion
@@ -261,10 +253,7 @@ def depth_limit_mm(
 def expansion_side(expansion: int) -> int:
     """Return how many mask pixels an étendue expansion puts along each side of an SLM pixel.
 
-    Raises
-    ------
-    BenchError
-        When the expansion is no square.
+    Raises BenchError when the expansion is no square.
     """
     side = isqrt(expansion)
     if side * side != expansion:
@@ -312,10 +301,7 @@ class Alignment:
     def of(self, display: Display) -> Display:
         """Return the display with this mask's displacement.
 
-        Raises
-        ------
-        FileError
-            When the alignment is another mask's.
+        Raises FileError when the alignment is another mask's.
         """
         if display.mask.shape != self.mask_shape:
             raise FileError(
@@ -333,10 +319,7 @@ def save_alignment(path: Path, alignment: Alignment, facts: Mapping[str, Any]) -
 def load_alignment(path: Path) -> Alignment:
     """Read an alignment.
 
-    Raises
-    ------
-    FileError
-        When it is missing, no alignment, or damaged.
+    Raises FileError when it is missing, no alignment, or damaged.
     """
     record = ALIGNMENT.read(path)
     with ALIGNMENT.damaged(path):

@@ -24,12 +24,8 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     When the block raises, the temporary file is removed and ``path`` stays as it was. The temporary name
     keeps the suffix, so that writers which choose the format by it do the same.
 
-    Raises
-    ------
-    FileError
-        When the folder is missing or cannot be written to.
-    OSError
-        When writing fails (a full disk), naming ``path``.
+    Raises FileError when the folder is missing or cannot be written to; OSError when writing fails (a full
+    disk), naming ``path``.
     """
     path = Path(path)
     check_writable(path)
@@ -58,10 +54,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     A folder that was there is removed once the new one stands. When the block raises, the new one is removed
     and ``path`` stays as it was.
 
-    Raises
-    ------
-    OSError
-        When writing fails.
+    Raises OSError when writing fails.
     """
     mark = secrets.token_hex(4)
     draft, old = path.with_name(f".{path.name}.{mark}.partial"), path.with_name(f".{path.name}.{mark}.old")
@@ -90,9 +83,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
 def require_new(path: Path, *, overwrite: bool | None = None) -> None:
     """Refuse to write over what exists, unless it may be overwritten; None: no option would allow it.
 
-    Raises
-    ------
-    FileError
+    Raises FileError.
     """
     if path.exists() and not overwrite:
         remedy = "" if overwrite is None else "Choose another name, or overwrite with --force."
@@ -126,9 +117,7 @@ def check_writable(path: Path | str, n_bytes: int = 0) -> None:
 
     The disk must have room for ``n_bytes``.
 
-    Raises
-    ------
-    FileError
+    Raises FileError.
     """
     path = Path(path)
     folder = path.parent

@@ -54,11 +54,8 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
     The folder, and its parent where missing, is made by this call, and returned. ``overwrite`` replaces a
     calibration already there, never anything else.
 
-    Raises
-    ------
-    CalibrationFileError
-        When something is there already, the place cannot be written, or the disk is full. What was there
-        before is still there then.
+    Raises CalibrationFileError when something is there already, the place cannot be written, or the disk is
+    full. What was there before is still there then.
     """
     target = Path(folder)
     if target.exists() and not overwrite:
@@ -82,10 +79,8 @@ def save_calibration(calibration: Calibration, folder: Path | str, *, overwrite:
 def load_calibration(folder: Path | str) -> Calibration:
     """Read a calibration that :func:`save_calibration` wrote, checked against its checksums.
 
-    Raises
-    ------
-    CalibrationFileError
-        When the folder is missing, is no calibration, comes from a newer version, or is damaged.
+    Raises CalibrationFileError when the folder is missing, is no calibration, comes from a newer version, or
+    is damaged.
     """
     path = Path(folder)
     if not path.exists():
@@ -117,9 +112,7 @@ def calibrated_depths_um(folder: Path | str) -> tuple[float, ...]:
 
     Empty where depths are not known.
 
-    Raises
-    ------
-    CalibrationFileError
+    Raises CalibrationFileError.
     """
     path = Path(folder) / _JSON
     record = CALIBRATION.read(path)

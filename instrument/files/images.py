@@ -60,11 +60,8 @@ class ImageFile:
 def read_image(path: Path | str) -> ImageFile:
     """Read one image.
 
-    Raises
-    ------
-    FileError
-        When the file is missing, a folder, empty, unreadable, no image, several images, or holds values
-        that are no finite numbers.
+    Raises FileError when the file is missing, a folder, empty, unreadable, no image, several images, or holds
+    values that are no finite numbers.
     """
     path = Path(path)
     array, notes = _decode(path)
@@ -102,12 +99,8 @@ def write_image(path: Path | str, image: npt.NDArray[Any], metadata: Mapping[str
     The suffix chooses the format: ``.tif`` and ``.npy`` keep any dtype, ``.png`` takes uint8 and uint16.
     ``metadata`` goes into a TIFF's description, otherwise into a JSON file beside the image.
 
-    Raises
-    ------
-    FileError
-        When the suffix or the dtype does not fit, or the folder cannot be written to.
-    OSError
-        When the disk is full.
+    Raises FileError when the suffix or the dtype does not fit, or the folder cannot be written to; OSError
+    when the disk is full.
     """
     path = Path(path)
     check_suffix(path)
@@ -141,9 +134,7 @@ def side_car(path: Path | str) -> Path:
 def check_suffix(path: Path | str) -> None:
     """Refuse a file name whose suffix is no format that can be written.
 
-    Raises
-    ------
-    FileError
+    Raises FileError.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITABLE:

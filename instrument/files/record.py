@@ -87,10 +87,8 @@ class RecordFormat:
 
         Fields that this program does not know are among them, and told of once.
 
-        Raises
-        ------
-        FileError
-            When there is no such file, it is something else, damaged, or of a version that is not known.
+        Raises FileError when there is no such file, it is something else, damaged, or of a version that is
+        not known.
         """
         try:
             found = json.loads(path.read_text("utf-8"))
@@ -137,10 +135,7 @@ class RecordFormat:
     def value(self, kind: type[T], fields: Any, path: Path) -> T:
         """Return the value of a type that part of a record describes, telling of fields that are not known.
 
-        Raises
-        ------
-        FileError
-            When it does not describe one.
+        Raises FileError when it does not describe one.
         """
         unknown: Unknown = {}
         with self.damaged(path):

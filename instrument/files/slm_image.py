@@ -78,10 +78,7 @@ class SlmCorrection:
 def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrection | None = None) -> None:
     """Show ideal levels (256 a turn) on an SLM, through its calibration where there is one.
 
-    Raises
-    ------
-    LimitError
-        When the levels are not of the SLM's shape.
+    Raises LimitError when the levels are not of the SLM's shape.
     """
     fits = levels.shape == slm.shape
     slm.display(correction.apply(levels) if correction is not None and fits else levels)
@@ -90,10 +87,7 @@ def show_levels(slm: Slm, levels: npt.NDArray[np.uint8], correction: SlmCorrecti
 def load_slm_correction(path: Path) -> SlmCorrection:
     """Read what :meth:`SlmCorrection.save` wrote.
 
-    Raises
-    ------
-    FileError
-        When it is missing, no SLM calibration, or damaged.
+    Raises FileError when it is missing, no SLM calibration, or damaged.
     """
     record = SLM_CALIBRATION.read(path)
     with SLM_CALIBRATION.damaged(path):
@@ -127,10 +121,7 @@ def write_slm_image(path: Path, levels: npt.NDArray[np.uint8], facts: Mapping[st
 def read_slm_levels(path: Path | str) -> npt.NDArray[np.uint8]:
     """Return the grey levels of an SLM image, ``(height, width)`` uint8, whatever stands beside it.
 
-    Raises
-    ------
-    FileError
-        When it is missing, no image, or not 8-bit grey.
+    Raises FileError when it is missing, no image, or not 8-bit grey.
     """
     pixels = read_image(path).pixels
     if pixels.ndim != 2 or pixels.dtype != np.uint8:

@@ -265,10 +265,7 @@ class VolumeSource:
 def open_volume(path: Path | str) -> VolumeSource:
     """Open a volume: OME-Zarr (``z, y, x`` or ``c, z, y, x``), TIFF (``ZYX``, ``ZCYX``, or pages), .npy.
 
-    Raises
-    ------
-    FileError
-        When it is no volume, or the file is damaged; it names the shape that was found.
+    Raises FileError when it is no volume, or the file is damaged; it names the shape that was found.
     """
     path = Path(path)
     if not path.exists():
@@ -287,10 +284,7 @@ def volume_in_memory(voxels: npt.NDArray[Any], path: Path) -> VolumeSource:
 
     ``path`` is what messages call it. The array may be a memory map.
 
-    Raises
-    ------
-    FileError
-        When it has another number of axes, or no voxel.
+    Raises FileError when it has another number of axes, or no voxel.
     """
     if voxels.ndim not in (3, 4) or 0 in voxels.shape or voxels.dtype.kind not in "uif":
         raise FileError(

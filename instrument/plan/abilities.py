@@ -134,10 +134,7 @@ def check(
     Only the steps that are ``todo`` (None: all) are looked at; ``start`` is the bench's state before the
     first, for what the plan leaves as it is.
 
-    Raises
-    ------
-    PlanError
-        Naming every reason with the steps it concerns.
+    Raises PlanError naming every reason with the steps it concerns.
     """
     found: dict[str, list[int]] = {}
     steps = _steps(plan, todo, start)

@@ -255,10 +255,7 @@ class Plan(PlanData):
     def with_unknown(cls, data: Any, name: Path | str = "plan") -> tuple[Plan, tuple[str, ...]]:
         """Return the plan that plain data describe, and the keys that a newer program may have added.
 
-        Raises
-        ------
-        PlanError
-            Naming every mistake but unknown keys.
+        Raises PlanError naming every mistake but unknown keys.
         """
         try:
             return cls.model_validate(data), ()
@@ -278,10 +275,7 @@ class Plan(PlanData):
     def checked(cls, data: Any, name: Path | str = "plan") -> Plan:
         """Return the plan that plain data describe.
 
-        Raises
-        ------
-        PlanError
-            Naming every mistake, when the data describe none.
+        Raises PlanError naming every mistake, when the data describe none.
         """
         try:
             return cls.model_validate(data)
@@ -333,12 +327,8 @@ def _place(location: tuple[int | str, ...]) -> str:
 def load_plan(path: Path | str) -> Plan:
     """Read a plan from a TOML or JSON file. Relative paths of SLM images are seen from the file's folder.
 
-    Raises
-    ------
-    FileError
-        When there is no such file, or its name ends neither in .toml nor in .json.
-    PlanError
-        Naming every mistake in it.
+    Raises FileError when there is no such file, or its name ends neither in .toml nor in .json; PlanError
+    naming every mistake in it.
     """
     path = Path(path)
     reader = _reader(path)
@@ -401,10 +391,7 @@ def illumination_plan(lights: Sequence[Light], *, exposure_ms: float, average: i
     :func:`recon.reconstruction.patterned.reconstruct_patterned` takes;
     :mod:`instrument.reconstruction.patterned` reads them from runs.
 
-    Raises
-    ------
-    BenchError
-        When there is no light.
+    Raises BenchError when there is no light.
     """
     if not lights:
         raise BenchError("Active illumination needs patterns, each with one LED at least.")

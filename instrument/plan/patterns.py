@@ -43,10 +43,7 @@ LED_PATTERNS: Registry[type[LedShape]] = Registry("LED pattern", "diffuserbench.
 def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
     """Return a named pattern with options.
 
-    Raises
-    ------
-    InputError
-        When nothing has the name, or an option is not known or out of its limits.
+    Raises InputError when nothing has the name, or an option is not known or out of its limits.
     """
     shape = with_overrides(LED_PATTERNS.named(name)(), options or {})
     require(shape)
@@ -56,10 +53,7 @@ def led_shape(name: str, options: Mapping[str, Any] | None = None) -> LedShape:
 def shape_from_text(text: str) -> tuple[str, dict[str, Any]]:
     """Return name and options of a pattern written ``"half side=left na=0.3"``; not looked up yet.
 
-    Raises
-    ------
-    InputError
-        When it is written otherwise.
+    Raises InputError when it is written otherwise.
     """
     name, *words = text.split()
     options: dict[str, Any] = {}
@@ -213,10 +207,7 @@ MOST_NAMED = 8
 def group_lights(groups: Sequence[Sequence[int]], level: int = 255) -> list[Light]:
     """Return the lights of groups of LEDs by number, every LED at one level.
 
-    Raises
-    ------
-    BenchError
-        When a group is empty, or the level out of range.
+    Raises BenchError when a group is empty, or the level out of range.
     """
     if not all(len(group) for group in groups):
         raise BenchError("Active illumination needs groups of LEDs, each with one at least.")
@@ -241,10 +232,7 @@ def _in_words(group: Sequence[int]) -> str:
 def groups_from_text(text: str) -> list[list[int]]:
     """Return groups of LEDs written as ``"0-3,8;4;5,6"``: semicolons between groups, commas in them.
 
-    Raises
-    ------
-    BenchError
-        When it is something else.
+    Raises BenchError when it is something else.
     """
     groups = []
     for group in text.split(";"):

@@ -220,7 +220,7 @@ def _write_tiff(path: Path, result: Reconstruction) -> None:
     import tifffile
 
     volume = result.volume if result.volume.ndim == 3 else np.moveaxis(result.volume, -1, 1)
-    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **_voxel_size(result.grid)}
+    metadata = {"axes": "ZYX" if result.volume.ndim == 3 else "ZCYX", **voxel_size(result.grid)}
     with whole_file(path) as temporary:
         tifffile.imwrite(temporary, volume, ome=True, metadata=metadata, photometric="minisblack")
 
@@ -229,7 +229,8 @@ def _known(values: np.ndarray[Any, Any]) -> list[float] | None:
     return [float(v) for v in values] if np.isfinite(values).all() else None
 
 
-def _voxel_size(grid: Grid) -> dict[str, Any]:
+def voxel_size(grid: Grid) -> dict[str, Any]:
+    """Return OME's one voxel size, the middle plane's; nothing where it is not known."""
     if not (np.isfinite(grid.pitch_um).all() and np.isfinite(grid.spacing_um).all()):
         return {}
     middle = len(grid.z_um) // 2

@@ -18,11 +18,10 @@ from instrument.files.images import read_image, write_image
 from instrument.files.volumes import (
     VolumeSource,
     is_zarr_name,
-    middle_step_um,
     open_volume,
     write_volume_zarr,
 )
-from instrument.reconstruction.result_file import preview
+from instrument.reconstruction.result_file import preview, voxel_size
 from recon.reconstruction.result import Grid
 from recon.solvers.base import IterationRecord
 from recon.verdict.judge import Region
@@ -391,11 +390,13 @@ def _to_zarr(result: StoredResult, source: VolumeSource, target: Path, advance: 
     voxels = np.empty(_full_shape(source), np.float32)
     for z, plane in enumerate(_planes(source, advance)):
         voxels[z] = plane
+    write_volume_zarr(target, voxels, _grid_of(result, source), {"simulated": result.simulated})
+
+
+def _grid_of(result: StoredResult, source: VolumeSource) -> Grid:
     unknown = np.full(source.shape[0], np.nan)
     z_um, pitch_um = result.planes_um or (unknown, unknown)
-    centre = (source.shape[1] // 2, source.shape[2] // 2)
-    grid = Grid(source.shape, centre, z_um, pitch_um)
-    write_volume_zarr(target, voxels, grid, {"simulated": result.simulated})
+    return Grid(source.shape, (source.shape[1] // 2, source.shape[2] // 2), z_um, pitch_um)
 
 
 def _to_tiff(result: StoredResult, source: VolumeSource, target: Path, advance: Advance | None) -> None:
@@ -404,12 +405,7 @@ def _to_tiff(result: StoredResult, source: VolumeSource, target: Path, advance: 
     n_z, height, width = source.shape
     colour = source.n_channels > 1
     shape = (n_z, source.n_channels, height, width) if colour else source.shape
-    metadata: dict[str, Any] = {"axes": "ZCYX" if colour else "ZYX"}
-    if (planes := result.planes_um) is not None and n_z > 1:
-        z_um, pitch_um = planes
-        spacing, pitch = middle_step_um(z_um), float(pitch_um[n_z // 2])
-        metadata |= {"PhysicalSizeX": pitch, "PhysicalSizeY": pitch, "PhysicalSizeZ": spacing}
-        metadata |= {f"PhysicalSize{axis}Unit": "µm" for axis in "XYZ"}
+    metadata = {"axes": "ZCYX" if colour else "ZYX", **voxel_size(_grid_of(result, source))}
 
     def pages() -> Iterator[npt.NDArray[np.float32]]:
         for plane in _planes(source, advance):

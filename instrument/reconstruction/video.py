@@ -41,7 +41,7 @@ from recon.base.declare import inapplicable
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.options import ReconstructionOptions
 from recon.reconstruction.problem import Problem
-from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName
+from recon.streams.joint import JOINT_BLOCK, JOINT_ITERATIONS, OverTimeName, require_joint
 from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, VideoSolver, stream_problem
 
 
@@ -162,11 +162,8 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         picture.calibration,
         replace(options, iterations=None),
     )
-    if request.over_time is not None and not problem.together:
-        raise BenchError(
-            "--over-time takes one PSF, one depth, no background and the cpu: frames are solved together as "
-            "the channels of one picture. Leave --over-time or the others out."
-        )
+    if request.over_time is not None:
+        require_joint(problem)
     if problem.n_planes > 1:
         raise BenchError("A video's file holds pictures: say which depth with --z-mm.")
     reduction = picture.reduction
@@ -174,8 +171,6 @@ def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVide
         rows, columns = reduction.crop.slices(_binned_shape(run, frames[0], reduction.first_binning))
         crop = Crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
         reduction = replace(reduction, crop=crop)
-    if request.over_time is not None and not problem.flat:
-        raise BenchError("--over-time takes grey recordings.")
     usual = COLD_ITERATIONS if request.over_time is None else JOINT_ITERATIONS
     plan = VideoPlan(
         run=str(run.path.resolve()),

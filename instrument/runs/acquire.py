@@ -34,12 +34,8 @@ def acquire(
     after every step; the identifiers of ``calibrations`` in use are kept with the run; ``control`` pauses,
     aborts or stops it from another thread.
 
-    Raises
-    ------
-    PlanError
-        When the plan cannot be carried out; nothing moved and nothing was written.
-    DeviceError, RunError
-        When a device or the disk fails; the bench is safe and the run is marked as failed.
+    Raises PlanError when the plan cannot be carried out (nothing moved, nothing was written); DeviceError or
+    RunError when a device or the disk fails (the bench is safe, the run is marked as failed).
     """
     return prepare(
         bench, plan, folder, on_progress=on_progress, calibrations=calibrations, control=control
@@ -82,7 +78,7 @@ def abilities_of(bench: Bench, folder: Path | None = None) -> BenchAbilities:
         stage_axes=stage.axes if stage is not None else (),
         stage_position=stage.position() if stage is not None else {},
         stage_homed=stage is None or stage.is_homed,
-        stage_target=(lambda source: bench.stage_target(*source)) if stage is not None else None,
+        stage_target=(lambda source: bench.source_mount.target(*source)) if stage is not None else None,
         can_switch_source=bench.can_switch_source,
         can_switch_scene=bench.can_switch_scene,
         n_leds=len(bench.led_array.led_positions_mm) if bench.led_array is not None else 0,
@@ -109,10 +105,8 @@ def record_of(bench: Bench) -> BenchRecord:
 def free_bytes(folder: Path) -> int:
     """Return the free space of the disk that ``folder`` is or will be on.
 
-    Raises
-    ------
-    FileError
-        When nothing can be kept there: its path leads to no disk or through a file, or may not be written to.
+    Raises FileError when nothing can be kept there: its path leads to no disk or through a file, or may not
+    be written to.
     """
     there = there_now(folder)
     if not there.is_dir():
@@ -125,10 +119,7 @@ def free_bytes(folder: Path) -> int:
 def there_now(folder: Path) -> Path:
     """Return what there is of a path already: itself, or the nearest folder above it.
 
-    Raises
-    ------
-    FileError
-        When there is nothing of it, not even its disk.
+    Raises FileError when there is nothing of it, not even its disk.
     """
     path = folder.absolute()
     for there in (path, *path.parents):
@@ -171,10 +162,7 @@ def inspect(run: Run, on_progress: Progress | None = None) -> RunFindings:
 
     ``on_progress`` is called with frames read and frames to read.
 
-    Raises
-    ------
-    RunError
-        When the run is a recording.
+    Raises RunError when the run is a recording.
     """
     if run.plan is None:
         raise RunError(run.path, "is a recording; only runs of a plan can be continued.")

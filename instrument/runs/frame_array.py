@@ -189,12 +189,7 @@ class FrameArray:
     def read(self, index: int) -> Image:
         """Return one frame as it was written.
 
-        Raises
-        ------
-        FileNotFoundError
-            When the frame is not there.
-        FileError
-            When its file has the wrong size.
+        Raises FileNotFoundError when the frame is not there; FileError when its file has the wrong size.
         """
         path = self.chunk_path(index)
         flat = np.fromfile(path, dtype=self.dtype.newbyteorder("<"))

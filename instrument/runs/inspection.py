@@ -88,12 +88,7 @@ def contact_sheet(run: Run, path: Path) -> list[int]:
 
     Each frame is stretched from its 0.1th to its 99.9th percentile; pixels at full scale are red.
 
-    Raises
-    ------
-    RunError
-        When the run has no frames.
-    FileError
-        When ``path`` cannot be written.
+    Raises RunError when the run has no frames; FileError when ``path`` cannot be written.
     """
     from matplotlib.figure import Figure
 

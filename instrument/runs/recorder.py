@@ -60,12 +60,8 @@ def record(
     Light, stage and SLM of the open bench stay as they are until the end, when the bench is made safe. The
     run's folder is made in ``folder`` (None: the bench's own data folder); ``overrides`` are single options.
 
-    Raises
-    ------
-    BenchError
-        When neither ``n_frames`` nor ``seconds`` is given, or the disk has no room for ``n_frames``.
-    DeviceError, RunError
-        When the camera or the disk fails; what was recorded is kept.
+    Raises BenchError when neither ``n_frames`` nor ``seconds`` is given, or the disk has no room for
+    ``n_frames``; DeviceError or RunError when the camera or the disk fails (what was recorded is kept).
     """
     options = with_overrides(options or RecordingOptions(), overrides)
     if options.n_frames is None and options.seconds is None:
@@ -178,13 +174,9 @@ class Recorder:
     def execute(self) -> Run:
         """Record; returns the finished run, whose ``reason`` says how it ended.
 
-        Raises
-        ------
-        DeviceError, RunError
-            When the camera or the disk fails; what was recorded is kept, the run marked as failed, the bench
-            made safe.
-        KeyboardInterrupt, SystemExit
-            After the run was marked as aborted and the bench made safe.
+        Raises DeviceError or RunError when the camera or the disk fails (what was recorded is kept, the run
+        marked as failed, the bench made safe); KeyboardInterrupt or SystemExit after the run was marked as
+        aborted and the bench made safe.
         """
         try:
             return self._execute()

@@ -127,10 +127,7 @@ class Run:
     def open(cls, path: Path | str) -> Run:
         """Open a run folder.
 
-        Raises
-        ------
-        RunError
-            When there is none, or it is not one of this program's.
+        Raises RunError when there is none, or it is not one of this program's.
         """
         path = Path(path)
         if not path.is_dir():
@@ -248,10 +245,7 @@ class Run:
     def frame(self, index: int | Step) -> npt.NDArray[Any]:
         """Return one stored frame, ``(height, width)`` or ``(height, width, 3)``.
 
-        Raises
-        ------
-        RunError
-            When it was not stored.
+        Raises RunError when it was not stored.
         """
         index = index.index if isinstance(index, Step) else index
         if index not in self.records:
@@ -271,10 +265,7 @@ class Run:
     def images(self, label: str) -> npt.NDArray[Any]:
         """Return the frames of all steps of one label, stacked along the first axis.
 
-        Raises
-        ------
-        RunError
-            When there are none, or one was not stored.
+        Raises RunError when there are none, or one was not stored.
         """
         steps = self.steps(label)
         if not steps:

@@ -71,10 +71,7 @@ class RunControl:
     def stop(self) -> None:
         """End at once: light off and motion stopped when this returns, whatever was going on.
 
-        Raises
-        ------
-        StepsFailedError
-            When a device could not be made safe; all were tried.
+        Raises StepsFailedError when a device could not be made safe; all were tried.
         """
         with self._condition:
             self._ending = FinishReason.STOPPED
@@ -122,10 +119,7 @@ class RunControl:
     def check(self) -> None:
         """Wait, everything dark, while the procedure is paused.
 
-        Raises
-        ------
-        EndedEarlyError
-            When it was aborted or stopped.
+        Raises EndedEarlyError when it was aborted or stopped.
         """
         if self.is_pausing and self.ending is None and (bench := self._bench) is not None:
             if bench.can_switch_source:

@@ -236,10 +236,7 @@ class Runner:
     def stop(self) -> None:
         """End at once: light off and motion stopped when this returns, whatever was going on.
 
-        Raises
-        ------
-        StepsFailedError
-            When a device could not be made safe; all were tried.
+        Raises StepsFailedError when a device could not be made safe; all were tried.
         """
         self._stopping.set()
         with self._condition:

@@ -169,10 +169,7 @@ class RunWriter:
 
         The folder appears under its name only when it is whole.
 
-        Raises
-        ------
-        RunError
-            When the folder cannot be written to.
+        Raises RunError when the folder cannot be written to.
         """
         parent = Path(parent)
         with _disk(parent, "no run can be kept there"):
@@ -209,10 +206,7 @@ class RunWriter:
     def reopen(cls, path: Path | str) -> RunWriter:
         """Open a run folder to continue it.
 
-        Raises
-        ------
-        RunError
-            When it is no run, or some program writes to it now.
+        Raises RunError when it is no run, or some program writes to it now.
         """
         path = Run.open(path).path
         with _disk(path, "cannot be continued"):
@@ -231,11 +225,8 @@ class RunWriter:
     def write(self, frames: Sequence[FrameToStore]) -> None:
         """Store frames with their metadata, and return once all of it is on the disk.
 
-        Raises
-        ------
-        RunError
-            When the disk is full or not writable, or a frame does not fit the run. What was on the disk
-            before stays.
+        Raises RunError when the disk is full or not writable, or a frame does not fit the run. What was on
+        the disk before stays.
         """
         if not frames:
             return

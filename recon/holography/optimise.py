@@ -9,7 +9,6 @@ from __future__ import annotations
 import enum
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -122,7 +121,7 @@ def compute_hologram(
     if options.phase_levels is not None:
         phase = _Phase(model)
         return _on_levels(phase, phase.pack(_start(initial, model, options)), options.phase_levels, watch)
-    search: _Search
+    search: _Lbfgs | _Nesterov
     if method == "lbfgs":
         variable = _Complex(model) if complex_slm else _Phase(model)
         search = _Lbfgs(variable, variable.pack(_start(initial, model, options)))
@@ -230,20 +229,8 @@ class _Complex:
 
 
 # Searches -----------------------------------------------------------------------------------------
-class _Search(ABC):
-    """A descent method: :meth:`step` moves on and returns what is there, or None when it is stuck."""
-
-    point: _Point
-
-    @abstractmethod
-    def step(self) -> _Point | None: ...
-
-    @property
-    @abstractmethod
-    def slm(self) -> Array: ...
-
-
-class _Lbfgs(_Search):
+# Each moves on by a step, and returns what is there, or None when it is stuck.
+class _Lbfgs:
     """L-BFGS with a back-tracking line search (Nocedal and Wright, Alg. 7.4).
 
     The first step turns the phases by a typical 0.5 rad; from then on the step 1 is nearly always taken, so
@@ -316,7 +303,7 @@ class _Lbfgs(_Search):
         return None
 
 
-class _Nesterov(_Search):
+class _Nesterov:
     """Projected gradient with Nesterov acceleration (Kuo 2020, Alg. 1, A.6), finding its own step.
 
     The step starts large and is halved, and the momentum dropped, whenever the loss rises. The extrapolated
@@ -399,7 +386,7 @@ class _Watch:
 
     def run(
         self,
-        search: _Search,
+        search: _Lbfgs | _Nesterov,
         iterations: int,
         psnr_db: float | None,
         before: tuple[HologramRecord, ...] = (),

@@ -33,7 +33,6 @@ class Glass:
 AIR = Glass(1.0)
 POLYCARBONATE = Glass(1.58, 30.0)
 OPTICAL_EPOXY = Glass(1.56, 40.0)
-PDMS = Glass(1.41, 50.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ place. The sums run as one linear convolution per node over the cells in its nei
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,14 +84,15 @@ def render(
     np.maximum(image, 0, out=image)
     for place, power, diameter in scene.points():
         source = (float(place[0]), float(place[1]), float(place[2]))
-        spectrum = mixed_spectrum(_product(weights, power), settings.spectral_samples)
+        spectrum = mixed_spectrum(product(weights, power), settings.spectral_samples)
         light = propagator.psf(source, grid, spectrum, diameter_um=diameter, emission="isotropic")
         light *= response_on(grid, source, propagator.distance_um, fall_off)
         image += np.float32(bead_photons) * light
     return image
 
 
-def _product(weights: Weights, power: npt.NDArray[np.float64]) -> Weights:
+def product(weights: Weights, power: Sequence[float] | npt.NDArray[np.float64]) -> Weights:
+    """Return sensitivities to red, green and blue times the power in each."""
     red, green, blue = (w * float(p) for w, p in zip(weights, power, strict=True))
     return red, green, blue
 
@@ -111,7 +113,7 @@ def _render_layer(
         passes = []
         for band in range(3):
             pick = (float(band == 0), float(band == 1), float(band == 2))
-            passes.append((pick, _product(weights, np.asarray(pick))))
+            passes.append((pick, product(weights, pick)))
     total = np.zeros(grid.shape, np.float32)
     for pick, spectral_weights in passes:
         if any(spectral_weights):

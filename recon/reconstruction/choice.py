@@ -35,6 +35,10 @@ class Option:
     time: float
     error_db: float
 
+    def to_json(self) -> dict[str, Any]:
+        """Return it, JSON-compatible."""
+        return {"value": self.value, "time": _known(self.time), "error_db": _known(self.error_db)}
+
     def __str__(self) -> str:
         """Say it in words."""
         change = "error not known" if self.error_db != self.error_db else f"{self.error_db:+.1f} dB"
@@ -126,33 +130,18 @@ class Choice:
         )  # fmt: skip
         return hashlib.sha256(repr(chosen).encode()).hexdigest()[:8]
 
-    def lines(self) -> list[str]:
-        """Return what was chosen and why, one or more lines a choice."""
+    def lines(self, *, steps: bool = True) -> list[str]:
+        """Return what was chosen and why, a line a choice, and what one step up and down would be."""
         text = []
         for d in self.decisions:
             text.append(f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}")
-            text += [
-                f"{'':<12}  one step {way}: {option}"
-                for way, option in (("up", d.up), ("down", d.down))
-                if option is not None
-            ]
+            if steps:
+                ways = (("up", d.up), ("down", d.down))
+                text += [f"{'':<12}  one step {way}: {o}" for way, o in ways if o is not None]
         return text
-
-    def brief(self) -> list[str]:
-        """Return what was chosen, one line a choice, without the steps up and down."""
-        return [
-            f"{d.name.capitalize():<12}{d.value}: {d.why}{' (as asked)' if d.overruled else ''}"
-            for d in self.decisions
-        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it, JSON-compatible (numbers that are not known are None)."""
-
-        def option(o: Option | None) -> dict[str, Any] | None:
-            if o is None:
-                return None
-            return {"value": o.value, "time": _known(o.time), "error_db": _known(o.error_db)}
-
         return {
             "model": self.model,
             "planes": list(self.planes),
@@ -172,8 +161,8 @@ class Choice:
                     "value": d.value,
                     "why": d.why,
                     "error_db": _known(d.error_db),
-                    "one_step_up": option(d.up),
-                    "one_step_down": option(d.down),
+                    "one_step_up": d.up and d.up.to_json(),
+                    "one_step_down": d.down and d.down.to_json(),
                     "overruled": d.overruled,
                     "numbers": {k: _known(v) for k, v in d.numbers.items()},
                 }

@@ -174,6 +174,29 @@ class JointAdmm(SensorAdmm):
         return misfit
 
 
+def require_joint(problem: Problem) -> None:
+    """Refuse what a prior over time has no way for: frames are the channels of one problem.
+
+    Raises
+    ------
+    InputError
+        When frames are colour, or their camera has more than one PSF, one depth, or a background, which a
+        solver of one channel at a time cannot join; or another solver was asked for.
+    """
+    if not problem.flat:
+        raise InputError("Priors over time take grey frames; reconstruct each channel on its own.")
+    if not problem.together:
+        raise InputError(
+            "A prior over time joins frames as the channels of one problem: it takes one PSF, one depth, no "
+            "background and the cpu. Leave the prior over time out."
+        )
+    if problem.patterned or problem.options.solver not in ("auto", "admm-sensor"):
+        raise InputError(
+            "A prior over time has a solver of its own, for frames in one light: leave the solver or the "
+            "prior over time out."
+        )
+
+
 def solve_together(
     problem: Problem,
     frames: Floats,
@@ -207,23 +230,11 @@ def solve_together(
     Raises
     ------
     InputError
-        When the frames are colour, or fewer than two; or their camera has more than one PSF or a background:
-        frames are the channels of one problem, which a solver of one channel at a time cannot join.
+        When there are fewer than two frames, or as of :func:`require_joint`.
     """
-    if not problem.flat or frames.ndim != 3:
-        raise InputError("Priors over time take grey frames; reconstruct each channel on its own.")
-    if len(frames) < 2:
-        raise InputError("A prior over time needs two frames at least.")
-    if not problem.together:
-        raise InputError(
-            "A prior over time joins frames as the channels of one problem: it takes one PSF, one depth, no "
-            "background and the cpu. Leave the prior over time out."
-        )
-    if problem.patterned or problem.options.solver not in ("auto", "admm-sensor"):
-        raise InputError(
-            "A prior over time has a solver of its own, for frames in one light: leave the solver or the "
-            "prior over time out."
-        )
+    require_joint(problem)
+    if frames.ndim != 3 or len(frames) < 2:
+        raise InputError(f"A prior over time needs two frames at least, grey; got {frames.shape}.")
     shape = problem.sensor_shape
     part = Part(problem, slice(0, 1))
     part.weigh(problem.options.tau)

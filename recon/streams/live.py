@@ -33,10 +33,6 @@ Array = npt.NDArray[Any]
 LEAST_SIDE = 16
 """Pixels of a picture's short side below which no binning goes."""
 
-SETTLED = 1e-3
-"""Change an iteration below which a frame's picture is done, or the solver's own where that is smaller: 55 dB
-from where the exact-data ADMM would end."""
-
 AT_ONCE = 150_000
 """Pixels of the first picture, at most: its filter is made and applied in about a tenth of a second."""
 
@@ -271,7 +267,7 @@ class LiveReconstructor:
         first = _now()
         done = 0
         while True:
-            self._settled = level.solver.advance(min(SETTLED, level.problem.stop_tolerance))
+            self._settled = level.solver.advance(level.tolerance)
             done += 1
             spent_ms = _since(began).wall_ms
             if self._settled or done == at_most or spent_ms + ahead_ms > self.budget_ms or newer():
@@ -405,7 +401,7 @@ class LiveReconstructor:
         return LivePicture(
             image=self.shown(volume),
             binning=level.binning,
-            method="wiener" if filtered else level.problem.solver.name,
+            method="wiener" if filtered else level.method,
             iterations=done,
             total_iterations=0 if filtered or level.solver is None else level.solver.iterations,
             scene=self._scene,

@@ -62,10 +62,10 @@ def test_an_outlook_moves_nothing_and_counts_what_the_run_then_takes(bench: Benc
     assert list(tmp_path.iterdir()) == []
     assert sorted({round(place["z_um"]) for place in outlook.path}) == [60000, 75000, 100000, 150000]
     assert outlook.path[0] == outlook.path[-1]  # the reference
-    heard = Following()
-    done = AXIAL.carry_out(bench, tmp_path, listener=heard)
-    assert heard.steps == ["homing the stage", "finding exposures", "sweeping", "analysing"]
-    assert heard.found is not None
+    following = Following()
+    done = AXIAL.carry_out(bench, tmp_path, listener=following)
+    assert following.steps == ["homing the stage", "finding exposures", "sweeping", "analysing"]
+    assert following.found is not None
     assert outlook.cost is not None
     assert Run.open(done.runs[0]).n_frames == outlook.cost.frames
     assert done.good, done.verdict
