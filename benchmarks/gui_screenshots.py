@@ -302,6 +302,7 @@ def _reconstructions(window: MainWindow, out: Path) -> None:
             }
         )
         panel._suggest_out()
+        _wait(lambda: not panel.jobs.jobs, "a free name")
         job = panel.reconstruct()
         if job is None:
             raise SystemExit(panel._note.toolTip())

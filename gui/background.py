@@ -60,8 +60,8 @@ class NewestOnly:
         (read, done), epoch = self._wanted.pop(next(iter(self._wanted))), self._epoch
         self._job = job = self._jobs.watch(self._title, lambda _: read())
         job.succeeded.connect(lambda value: done(value) if epoch == self._epoch else None)
-        if self._failed is not None:
-            job.failed.connect(self._failed)
+        if (failed := self._failed) is not None:
+            job.failed.connect(lambda why: failed(why) if epoch == self._epoch else None)
         job.ended.connect(self._ended)
 
     def _ended(self) -> None:

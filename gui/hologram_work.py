@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,7 +40,6 @@ from instrument.runs.run_control import EndedEarlyError, RunControl
 from recon.base.declare import Imports, expression, option
 from recon.holography import Display, HologramOptions, HologramRecord, Target
 
-_INTERVAL_S = 0.25
 _FRAME_S = 0.02
 """How long each of several frames is shown before the next is sent; the SLM's settling comes on top."""
 
@@ -161,20 +159,17 @@ def compute(
     targets = order.targets(display)
     options = order.options
     history: list[HologramRecord] = []
-    reported_s = 0.0
 
     def watch(record: HologramRecord, slm: Any) -> None:
-        nonlocal reported_s
         history.append(record)
-        if time.monotonic() - reported_s < _INTERVAL_S:
-            return
+        context.offer(lambda: so_far(record, slm))
+
+    def so_far(record: HologramRecord, slm: Any) -> Progress:
         share = record.iteration / max(options.iterations, 1)
         if options.time_s is not None:
             share = max(share, record.seconds / options.time_s)
         phase = np.mod(np.angle(np.asarray(slm).reshape(-1, *display.slm_shape)[0]), 2 * np.pi)
-        with contextlib.suppress(JobCancelledError):  # the optimiser sees it by itself
-            context.report(Progress(min(share, 1.0), tuple(history), phase.astype(np.float32)))
-        reported_s = time.monotonic()
+        return Progress(min(share, 1.0), tuple(history), phase.astype(np.float32))
 
     result = compute_and_judge(display, targets, options, callback=watch, cancel=context.cancel)
     if write:
@@ -199,8 +194,6 @@ def photograph(
     correction: Path | None,
     average: int,
     context: JobContext,
-    *,
-    make_folder: bool = False,
 ) -> tuple[Photographed, Path]:
     """Show a hologram, photograph it, compare it with its target, and write what was seen.
 
@@ -208,8 +201,6 @@ def photograph(
     camera's exposure as it was.
     """
     pattern = computed.order.out
-    if make_folder:
-        pattern.parent.mkdir(parents=True, exist_ok=True)
     out = free_result(pattern.parent, f"{pattern.stem}-seen", ".png")
     check_writable(out)  # before the bench is touched
     control = RunControl()

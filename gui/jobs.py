@@ -30,6 +30,12 @@ _MOST_WAITING = 16
 """Device jobs that may wait for their turn; more are refused: a held key must not fill a queue."""
 
 
+_SHOWN_S = 0.5
+"""What there is so far is shown this often, at most."""
+_SHARE = 0.1
+"""At most this part of the time goes into making pictures on the way."""
+
+
 class JobCancelledError(KeyboardInterrupt):
     """A job was cancelled; raised by :meth:`JobContext.check` in the job's thread."""
 
@@ -71,6 +77,8 @@ class JobContext:
         self._lock = threading.Lock()
         self._newest: list[Any] = []
         self._on_cancel: list[Callable[[], object]] = []
+        self._next_s = 0.0
+        """From then on there may be another picture of what there is so far, seconds."""
         self.cancel = threading.Event()
         """Set when the job is cancelled; solvers take it as their ``cancel``."""
 
@@ -84,9 +92,23 @@ class JobContext:
         """
         with self._lock:
             first, self._newest = not self._newest, [value]
+        self._next_s = time.monotonic() + _SHOWN_S
         if first:
             self._send("progress", None)
         self.check()
+
+    def offer(self, make: Callable[[], object]) -> None:
+        """Report what ``make`` returns, now and then; for solvers, which see the end by themselves.
+
+        Nothing is made a moment after the last report, nor so often that it takes much of the time.
+        """
+        began_s = time.monotonic()
+        if began_s < self._next_s or self.cancel.is_set():
+            return
+        with contextlib.suppress(JobCancelledError):
+            self.report(make())
+            now_s = time.monotonic()
+            self._next_s = now_s + max(_SHOWN_S, (now_s - began_s) / _SHARE)
 
     def check(self) -> None:
         """Raise JobCancelledError when the job was cancelled."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from pyqtgraph import PlotWidget
 from PySide6.QtCore import QEvent, QObject, QSettings, QSize, Qt
 from PySide6.QtGui import QAction, QCloseEvent, QGuiApplication, QKeyEvent, QKeySequence, QShortcut, QWindow
 from PySide6.QtWidgets import (
@@ -31,8 +30,7 @@ from gui.theme import THEMES, apply_theme, colours
 from gui.widgets.building import PanelPlace, button, fill, label, tabs, text_view
 from gui.widgets.dialogues import Question, TextWindow
 from gui.widgets.entry import NumberEdit
-from gui.widgets.image_view import ImageView
-from gui.widgets.plots import restyle
+from gui.widgets.plots import restyle_all
 
 _AREAS = {
     "top right": Qt.DockWidgetArea.RightDockWidgetArea,
@@ -81,6 +79,11 @@ class DeviceChips(QWidget):
         chip.setStyleSheet(f"color: {colour}; border: none; padding: 2px 4px;")
         chip.setToolTip(state.text or state.condition)
         self.reconnect_buttons[kind].setVisible(state.condition == "failed")
+
+    def restyle(self) -> None:
+        """Take over the colours of the theme in use."""
+        for kind in self.chips:
+            self.show_state(kind)
 
     def _show_all(self, kind: str) -> None:
         state = self._session.state(kind)
@@ -143,8 +146,7 @@ class MainWindow(QMainWindow):
     def panel(self, name: str) -> Panel:
         """Return a panel of the table, made now if it was not yet."""
         if name not in self._panels:
-            panel = PANELS[name].load()(self.session)
-            self._panels[name] = panel
+            self._panels[name] = panel = PANELS[name].made(self.session)
             self._places[name].hold(panel)
         return self._panels[name]
 
@@ -290,14 +292,7 @@ class MainWindow(QMainWindow):
         assert isinstance(app, QApplication)
         apply_theme(app, name)
         self._settings.setValue("theme", name)
-        for kind in self.session.kinds:
-            self.chips.show_state(kind)
-        for view in self.findChildren(ImageView):  # of every panel: one white picture spoils a dark room
-            view.restyle()
-        for plot in self.findChildren(PlotWidget):
-            restyle(plot)
-        for panel in self._panels.values():
-            panel.theme_changed()
+        restyle_all(self)  # every panel: one white picture spoils a dark room
 
     # STOP ----------------------------------------------------------------------------------------
     def _make_stop_keys(self) -> None:
@@ -357,10 +352,8 @@ class MainWindow(QMainWindow):
             self.job_label.setText(text.splitlines()[0][:200])
 
     def _ask_operator(self, request: OperatorRequest) -> None:
-        def answered(done: bool) -> None:
-            (request.confirm if done else request.refuse)()
-
-        box = self._ask(_BY_HAND, "To be done by hand", request.text, ("Done", "Stop"), answered)
+        answers = ("Done", "Stop")
+        box = self._ask(_BY_HAND, "To be done by hand", request.text, answers, request.answer)
         request.withdrawn = box.reject
 
     def _ask(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
 from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
@@ -20,14 +21,15 @@ _REFUSAL_MS = 12_000
 
 
 class Panel(QWidget):
-    """A part of the window. Subclasses set ``title``, fill ``body`` and say ``as_python``.
+    """A part of the window. Subclasses fill ``body`` and say ``as_python``.
 
     Parameters
     ----------
     session : BenchSession
     """
 
-    title: ClassVar[str] = ""
+    title = ""
+    """On its tab; the table of panels has it."""
 
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -63,10 +65,9 @@ class Panel(QWidget):
         raise NotImplementedError
 
     def shutdown(self) -> None:
-        """End what the panel runs of its own (timers, workers); called before the window closes."""
-
-    def theme_changed(self) -> None:
-        """Take over another theme where the style sheet does not reach: plots, images."""
+        """End the timers in the panel, and in subclasses its work; called before the window closes."""
+        for timer in self.findChildren(QTimer):
+            timer.stop()
 
     # Telling the user ----------------------------------------------------------------------------
     def refused(self, field: QWidget | None, why: str) -> None:
@@ -112,7 +113,7 @@ class DevicePanel(Panel):
         """Begin to look at the device; while it is not open, ``state`` has why."""
         self._state_label = state
         self.session.device_changed.connect(self._device_changed)
-        self._timer = every(self, self.look_ms, self.look)
+        every(self, self.look_ms, self.look)
         self._device_changed(self.kind)
 
     @property
@@ -127,10 +128,6 @@ class DevicePanel(Panel):
     def show_device(self, is_open: bool) -> None:
         """Let it be used, or not."""
         raise NotImplementedError
-
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
 
     def _device_changed(self, kind: str) -> None:
         if kind != self.kind:

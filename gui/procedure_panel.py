@@ -235,12 +235,6 @@ class ProcedurePanel(Panel):
     def finished(self, outcome: Outcome) -> None:
         """Show a result on the right; for subclasses."""
 
-    def shutdown(self) -> None:
-        """End the timers."""
-        self._rest.stop()
-        self._slow.stop()
-        self.run.shutdown()
-
     # Inside --------------------------------------------------------------------------------------
     def _chosen(self) -> None:
         self.stack.setCurrentIndex(self.choice.currentIndex())

@@ -226,10 +226,6 @@ class ProcedureRun(QObject):
         if self._job is not None:
             self._session.jobs.withdraw(self._job)
 
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
-
     def _look(self) -> None:
         lines, events, looks = self._mailbox.fetch()
         for line in lines:

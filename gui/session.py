@@ -80,10 +80,12 @@ class BenchSession(QObject):
         self._states: dict[str, DeviceState] = {kind: DeviceState("closed") for kind in self.bench.devices}
         self._threads: list[threading.Thread] = []
         self._stopping = self._stop_again = False
-        self._closing = False
+        self.is_closing = False
+        """Whether the end has begun."""
         self._all_closed = threading.Event()
         self.is_closed = False
-        self._live_wanted = True
+        self.live_wanted = True
+        """Whether the live view is to run whenever nothing else needs the camera."""
         self._live_job: Job | None = None
         self._requests: list[OperatorRequest] = []
         self._from_thread.connect(self._do, Qt.ConnectionType.QueuedConnection)
@@ -167,26 +169,21 @@ class BenchSession(QObject):
     def _all_tried(self) -> None:
         for kind in self.kinds:
             self._tried(kind)
-        if not self._closing:
+        if not self.is_closing:
             self._watch.start()
             self.opened.emit()
 
     def _tried(self, kind: str) -> None:
         if self.state(kind).condition == "opening":
             self._set_state(kind, DeviceState("failed", "It was not opened."))
-        if kind == "camera" and self.is_open("camera") and self._live_wanted:
+        if kind == "camera" and self.is_open("camera") and self.live_wanted:
             self.start_live()
 
     # The live view -------------------------------------------------------------------------------
-    @property
-    def live_wanted(self) -> bool:
-        """Whether the live view is to run whenever nothing else needs the camera."""
-        return self._live_wanted
-
     def start_live(self) -> None:
         """Start the live view; it also goes on by itself after a run."""
-        self._live_wanted = True
-        if self.is_open("camera") and not self.jobs.is_busy("camera") and not self._closing:
+        self.live_wanted = True
+        if self.is_open("camera") and not self.jobs.is_busy("camera") and not self.is_closing:
             with contextlib.suppress(BusyError):  # a run goes on: the live view does after it
                 self._live_job = self.jobs.device(
                     "Starting the live view", lambda _: self.live.start(), {"camera"}, quiet=True
@@ -194,7 +191,7 @@ class BenchSession(QObject):
 
     def stop_live(self) -> None:
         """End the live view until it is started again."""
-        self._live_wanted = False
+        self.live_wanted = False
         if self.live.is_running:
             with contextlib.suppress(BusyError):  # a run has ended it already
                 self.jobs.device("Ending the live view", lambda _: self.live.stop(), {"camera"}, quiet=True)
@@ -244,7 +241,7 @@ class BenchSession(QObject):
             self.log("debug", f"{job.title}: done.")
         if job is self._live_job:
             self._live_job = None
-        elif job.lanes and self._live_wanted and not self.live.is_running and not self._stopping:
+        elif job.lanes and self.live_wanted and not self.live.is_running and not self._stopping:
             self.start_live()
 
     def _note_error(self, job: Job) -> None:
@@ -291,7 +288,7 @@ class BenchSession(QObject):
         self._whatever_happens(self.jobs.cancel_device_jobs)
         self._whatever_happens(self.stop_pressed.emit)
         for request in list(self._requests):
-            self._whatever_happens(request.refuse)
+            self._whatever_happens(partial(request.answer, False))
             if request.withdrawn is not None:
                 self._whatever_happens(request.withdrawn)
         if self._stopping:
@@ -331,7 +328,7 @@ class BenchSession(QObject):
         self.log("error", f"{safe} {', '.join(late)} has not ended yet. STOP is repeated until it has.")
 
     def _stop_ended(self, failure: Exception | None, late: tuple[str, ...]) -> None:
-        if self._stop_again and not self._closing:  # pressed once more: something may have begun meanwhile
+        if self._stop_again and not self.is_closing:  # pressed once more: something may have begun meanwhile
             self._stop_again = False
             self._in_thread("STOP", self._stop_all, self.jobs.device_jobs)
             return
@@ -343,22 +340,17 @@ class BenchSession(QObject):
         else:
             self.log("info", "Stopped: light off, nothing moving.")
         self.stopped.emit()
-        if self._live_wanted and not self._closing:
+        if self.live_wanted and not self.is_closing:
             self.start_live()
-
-    @property
-    def is_closing(self) -> bool:
-        """Whether the end has begun."""
-        return self._closing
 
     # The end -------------------------------------------------------------------------------------
     def close(self) -> None:
         """End safely: jobs cancelled, light off, motion stopped, devices closed; ``closed`` follows."""
-        if self._closing:
+        if self.is_closing:
             return
-        self._closing = True
+        self.is_closing = True
         self._watch.stop()
-        self._live_wanted = False
+        self.live_wanted = False
         for job in self.jobs.jobs:
             job.cancel()
         self.stop()
@@ -413,8 +405,8 @@ class BenchSession(QObject):
         asked.wait()
 
     def _show_request(self, request: OperatorRequest) -> None:
-        if self._stopping or self._closing:
-            request.refuse()  # sent before STOP: nobody may wait for its answer
+        if self._stopping or self.is_closing:
+            request.answer(False)  # sent before STOP: nobody may wait for its answer
             return
         self._requests.append(request)
         request.answered = lambda: self._requests.remove(request)

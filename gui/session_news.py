@@ -24,16 +24,9 @@ class OperatorRequest:
         self._done = threading.Event()
         self._refused = False
 
-    def confirm(self) -> None:
-        """Say that it is done."""
-        self._answer()
-
-    def refuse(self) -> None:
-        """Say that it will not be done: the job ends."""
-        self._refused = True
-        self._answer()
-
-    def _answer(self) -> None:
+    def answer(self, done: bool) -> None:
+        """Say that it is done, or will not be: the job ends then."""
+        self._refused = self._refused or not done
         if not self._done.is_set():
             self._done.set()
             if self.answered is not None:

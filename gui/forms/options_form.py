@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtWidgets import QFormLayout, QLabel, QLineEdit, QScrollArea, QToolButton, QWidget
 
+from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField, LinesField, OptionField, SwitchField, field_for
+from gui.jobs import JobRunner
 from gui.widgets.building import fill, in_row, label, mark
 from instrument.files.errors import BenchError
+from instrument.reconstruction.stored_result import free_result
 from recon.base.declare import Option, options_of
 from recon.errors import InputError
 
@@ -344,3 +348,38 @@ class OptionsForm(QWidget):
             reason.hide()
             self.widgets[name].setToolTip(self.fields[name].tip)
             mark(self.widgets[name], "refused", False)
+
+
+class SuggestedName:
+    """Suggests where a form's result goes, in its option ``out``, under a name that no file has.
+
+    A name that was chosen stays. Which names are taken is looked up in a job.
+
+    Parameters
+    ----------
+    jobs : JobRunner
+    form : OptionsForm
+    folder : Path
+        Made when something is written there.
+    suffix : str
+    """
+
+    def __init__(self, jobs: JobRunner, form: OptionsForm, folder: Path, suffix: str) -> None:
+        self._form, self._folder, self._suffix = form, folder, suffix
+        self._reader = NewestOnly(jobs, "Looking for a free name")
+        self._suggested: Path | None = None
+
+    def suggest(self, stem: str) -> None:
+        """Name the result after what it is made of."""
+        self._take(self._folder / f"{stem}{self._suffix}")
+        self._reader.ask(lambda: free_result(self._folder, stem, self._suffix), self._take)
+
+    def make_room(self, out: Path) -> None:
+        """Make the folder of suggested names where a result goes there; for a job's thread."""
+        if out.parent == self._folder:
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+    def _take(self, path: Path) -> None:
+        if str(self._form.fields["out"].raw()).strip() in ("", str(self._suggested)):
+            self._suggested = path
+            self._form.set_values({"out": path})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,7 @@ from PySide6.QtWidgets import QCompleter, QWidget
 
 from gui.forms.fields import Behaviour
 from gui.forms.options_form import FOLDED, OptionsForm
-from gui.jobs import JobCancelledError, JobContext
+from gui.jobs import JobContext
 from gui.widgets.building import button, fill, in_row, label, scrolled, share_bar
 from instrument.files.errors import BenchError
 from instrument.reconstruction.checkpointing import checkpoint_for, require_kept, settle_checkpoint
@@ -232,12 +230,6 @@ def _one_shot(present: dict[str, Any]) -> str:
     return f"{solver} is one shot: it has no iterations." if one_step else ""
 
 
-_INTERVAL_S = 0.5
-"""What there is so far is shown this often, at most."""
-_SHARE = 0.1
-"""At most this part of the time goes into making pictures on the way."""
-
-
 @dataclass(frozen=True, slots=True)
 class SoFar:
     """How far a reconstruction is.
@@ -299,22 +291,13 @@ def reconstruct_job(work: ReconstructionWork, context: JobContext) -> Written:
     keeper = checkpoint_for(work.kept_in, prepared, request)
     context.report(SoFar(0.0, "Solving …", prepared))
     history: list[IterationRecord] = []
-    shown_s, cost_s = time.monotonic(), 0.0
 
     def watch(record: IterationRecord, present: Callable[[], npt.NDArray[np.float32]]) -> None:
-        nonlocal shown_s, cost_s
         history.append(record)
-        now_s = time.monotonic()
-        if now_s - shown_s < max(_INTERVAL_S, cost_s / _SHARE):
-            return
-        image = present().max(axis=0)  # of a picture its only plane
+        share = done_share(request.options, record)
         note = f"iteration {record.iteration}, change {record.change:.1e}"
-        with contextlib.suppress(JobCancelledError):  # the solver sees it by itself, and keeps what it has
-            context.report(
-                SoFar(done_share(request.options, record), note, prepared, np.array(image), tuple(history))
-            )
-        shown_s = time.monotonic()
-        cost_s = shown_s - now_s
+        # Of a picture its only plane.
+        context.offer(lambda: SoFar(share, note, prepared, np.array(present().max(axis=0)), tuple(history)))
 
     if isinstance(request, VolumeRequest):
         volume = request.solve(prepared, watch=watch, cancel=context.cancel, keeper=keeper)

@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Literal, NamedTuple
 
 from gui.panel import Panel
+from gui.session import BenchSession
 
 Area = Literal["centre", "top right", "right", "bottom"]
 
@@ -24,10 +25,11 @@ class PanelEntry(NamedTuple):
     """Keys that bring it to the front."""
     tip: str
 
-    def load(self) -> type[Panel]:
-        """Import the panel's class."""
+    def made(self, session: BenchSession) -> Panel:
+        """Import the panel's class and return one of it."""
         module, _, name = self.place.partition(":")
-        panel: type[Panel] = getattr(import_module(module), name)
+        panel: Panel = getattr(import_module(module), name)(session)
+        panel.title = self.title
         return panel
 
 

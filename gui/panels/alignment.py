@@ -33,7 +33,6 @@ _BRIGHTEST = 99.95  # percentile: spots are few
 class AlignmentPanel(ProcedurePanel):
     """Alignment of the scattering mask."""
 
-    title = "Alignment"
     handed_to = "holograms"
     use_words = "Compute holograms with it…"
 
@@ -72,7 +71,7 @@ class AlignmentPanel(ProcedurePanel):
         self._scores: list[list[tuple[float, float]]] = []
         self._brightest: list[float] = []
         self.run.look.connect(self._looked_at)
-        self.theme_changed()
+        self._draw_plots()
 
     def began(self) -> None:
         """Clear the last alignment."""
@@ -93,11 +92,10 @@ class AlignmentPanel(ProcedurePanel):
             self.pose.show_report(report)
             self.tabs.setCurrentIndex(1)
 
-    def theme_changed(self) -> None:
-        """Restyle the plots."""
+    def restyle(self) -> None:
+        """Take over another theme."""
         for field in (self.before, self.after):
             field.restyle()
-        self.pose.restyle()
         self._draw_plots()
 
     # Inside --------------------------------------------------------------------------------------

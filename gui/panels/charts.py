@@ -34,8 +34,6 @@ _NO_CHART = "No chart yet. Make one with diffuserbench chart, then open its char
 class ChartsPanel(Panel):
     """Stability maps of a ``stability.json``, and the points of a ``chart.json``."""
 
-    title = "Charts"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.maps_path = SHIPPED
@@ -91,11 +89,6 @@ class ChartsPanel(Panel):
     def _choose(self) -> None:
         start = str(self.session.runs_folder)
         choose_path(self, "open", "Open maps or a chart", start, self.open, "Maps and charts (*.json)")
-
-    def theme_changed(self) -> None:
-        """Take over the theme's colours."""
-        self.stability.restyle()
-        self.chart.restyle()
 
     def as_python(self) -> str:
         """Return lines that draw the map that is shown, or read the chart."""

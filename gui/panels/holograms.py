@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
 from PySide6.QtWidgets import QWidget
 
+from calibration_routines.display.hologram_photograph import Photographed
 from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField
-from gui.forms.options_form import OptionsForm
+from gui.forms.options_form import OptionsForm, SuggestedName
 from gui.hologram_work import (
     Computed,
     HologramOrder,
@@ -23,7 +23,7 @@ from gui.hologram_work import (
     photograph,
     show_on_slm,
 )
-from gui.jobs import Job
+from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_row, scrolled, share_bar, split
@@ -31,7 +31,6 @@ from gui.widgets.hologram_views import WEIGHTS_SHAPE, HologramViews, WeightsMode
 from instrument.display.hologram import depth_limit_mm, expansion_side, field_picture
 from instrument.files.errors import BenchError
 from instrument.files.images import read_image
-from instrument.reconstruction.stored_result import free_result
 from recon.base.declare import expression, option, options_of
 from recon.errors import InputError
 from recon.holography import LOSSES, HologramOptions
@@ -67,16 +66,15 @@ class _PanelOptions:
 class HologramsPanel(Panel):
     """A hologram of one picture, from the target to its photograph."""
 
-    title = "Holograms"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.computed: Computed | None = None
         self.job: Job | None = None
-        self._suggested: Path | None = None
         self._reader = NewestOnly(session.jobs, "Reading the picture")
-        self._target_asked: tuple[Any, ...] | None = None
+        self._target_shown: object = None
+        """Which picture is shown, when it was changed last, and how it fills the field."""
         self.form = self._make_form()
+        self._names = SuggestedName(self.jobs, self.form, session.runs_folder / "holograms", ".png")
         self.views = HologramViews()
         self.target = self.views.target
         tip = "Take off all that was painted (left button paints, right button rubs out)"
@@ -217,11 +215,14 @@ class HologramsPanel(Panel):
             self.refused(None, str(error))
             return None
         self.accepted()
-        if order.out == self._suggested and not preview:
-            order.out.parent.mkdir(parents=True, exist_ok=True)
         config, size = self.session.config, (slm.shape, slm.pixel_pitch_um)
         title = "Previewing a hologram" if preview else f"Computing {order.out.name}"
-        work = partial(compute, order, config, size, write=not preview)
+
+        def work(context: JobContext) -> Computed:
+            if not preview:
+                self._names.make_room(order.out)
+            return compute(order, config, size, context, write=not preview)
+
         job = self._started(self.follow(self.jobs.compute(title, work)))
         job.progressed.connect(self._progressed)
         job.succeeded.connect(self._computed)
@@ -253,15 +254,13 @@ class HologramsPanel(Panel):
         if computed is None or not self.form.recheck("correction"):
             return None
         correction, bench = self.form.value("correction"), self.session.bench
-        suggested = computed.order.out.parent == self._suggestions
-        job = self._device_job(
-            lambda: self.session.exclusive_job(
-                f"Photographing {computed.order.out.stem}",
-                lambda context: photograph(
-                    bench, computed, correction, _AVERAGE, context, make_folder=suggested
-                ),
-            )
-        )
+
+        def work(context: JobContext) -> tuple[Photographed, Path]:
+            self._names.make_room(computed.order.out)
+            return photograph(bench, computed, correction, _AVERAGE, context)
+
+        title = f"Photographing {computed.order.out.stem}"
+        job = self._device_job(lambda: self.session.exclusive_job(title, work))
         if job is not None:
             job.succeeded.connect(self._photographed)
         return job
@@ -300,44 +299,34 @@ class HologramsPanel(Panel):
         """Show the target as it fills the field."""
         try:
             path, fit, srgb = (self.form.value(name) for name in ("picture", "fit", "srgb"))
-            wanted = (path, path.stat().st_mtime_ns, fit, srgb)
-        except (BenchError, OSError):
+        except BenchError:
             return  # refused at its field
         self._suggest_out()
-        if wanted == self._target_asked:
-            return
-        self._target_asked = wanted
+        shown = self._target_shown
 
-        def read() -> npt.NDArray[Any] | str:
+        def read() -> tuple[object, npt.NDArray[Any]] | str | None:
             try:
-                return field_picture(read_image(path).pixels, fit=fit, srgb=srgb)
-            except (BenchError, InputError) as error:
+                wanted = (path, path.stat().st_mtime_ns, fit, srgb)
+                if wanted == shown:
+                    return None
+                return wanted, field_picture(read_image(path).pixels, fit=fit, srgb=srgb)
+            except (BenchError, InputError, OSError) as error:
                 return str(error)
 
-        self._reader.ask(read, lambda target: self._target_read(wanted, target))
+        self._reader.forget()  # another picture is on its way
+        self._reader.ask(read, self._target_read)
 
-    def _target_read(self, wanted: object, target: npt.NDArray[Any] | str) -> None:
-        if wanted != self._target_asked:
-            return  # another picture is on its way
-        if isinstance(target, str):
-            self._target_asked = None
-            self.form.refuse("picture", target)
-            self.refused(None, target)
-        else:
+    def _target_read(self, read: tuple[object, npt.NDArray[Any]] | str | None) -> None:
+        if isinstance(read, str):
+            self._target_shown = None
+            self.form.refuse("picture", read)
+            self.refused(None, read)
+        elif read is not None:
+            self._target_shown, target = read
             self.target.show_target(target)
 
-    @property
-    def _suggestions(self) -> Path:
-        """The folder of the names that are suggested: made when it is needed."""
-        return self.session.runs_folder / "holograms"
-
     def _suggest_out(self) -> None:
-        present = str(self.form.fields["out"].raw())
-        if present not in ("", str(self._suggested)):
-            return  # a name that was chosen stays
-        picture = Path(str(self.form.fields["picture"].raw()))
-        self._suggested = free_result(self._suggestions, picture.stem or "slm", ".png")
-        self.form.set_values({"out": self._suggested})
+        self._names.suggest(Path(str(self.form.fields["picture"].raw())).stem or "slm")
 
     def _show_mode(self) -> None:
         """Show what goes with which part of the picture counts: losses, brush, weight elsewhere."""
@@ -363,12 +352,9 @@ class HologramsPanel(Panel):
         """Put an alignment of the mask into the form."""
         self.form.set_values({"alignment": path})
 
-    def theme_changed(self) -> None:
-        """Take over the theme's colours."""
-        self.views.restyle()
-
     def shutdown(self) -> None:
         """End the computation."""
+        super().shutdown()
         self.stop()
 
 

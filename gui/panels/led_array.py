@@ -31,7 +31,6 @@ _DIMMEST = 70
 class LedPanel(DevicePanel):
     """Draws the array with its LEDs as they are lit, and lights them."""
 
-    title = "LED array"
     kind = "led_array"
     look_ms = 300
 
@@ -104,12 +103,7 @@ class LedPanel(DevicePanel):
         lines = [f"bench.led_array.set_pattern({lit})", 'input("Enter ends, and turns the light off. ")']
         return on_bench(self.session.config.path, lines, imports)
 
-    def shutdown(self) -> None:
-        """End the timers."""
-        super().shutdown()
-        self._rest.stop()
-
-    def theme_changed(self) -> None:
+    def restyle(self) -> None:
         """Take over the theme's colours."""
         self._drawn = None
 

@@ -48,8 +48,6 @@ _LIGHTS = {
 class LivePanel(Panel):
     """Shows the newest frame of the live view, or of the run that goes on; owns nothing of it."""
 
-    title = "Live view"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.picture = LivePicture()
@@ -66,9 +64,8 @@ class LivePanel(Panel):
         self._shown_at: deque[float] = deque(maxlen=400)
         self._lay_out()
         session.device_changed.connect(self._device_changed)
-        self._frame_timer = every(self, _LOOK_MS, self.look)
-        self._frame_timer.setTimerType(Qt.TimerType.PreciseTimer)
-        self._statistics_timer = every(self, _STATISTICS_MS, self.count)
+        every(self, _LOOK_MS, self.look).setTimerType(Qt.TimerType.PreciseTimer)
+        every(self, _STATISTICS_MS, self.count)
 
     # Layout --------------------------------------------------------------------------------------
     def _lay_out(self) -> None:
@@ -138,17 +135,6 @@ class LivePanel(Panel):
         ]
         imports.names.add(("pathlib", "Path"))
         return on_bench(self.session.config.path, lines, imports)
-
-    def shutdown(self) -> None:
-        """End the timers."""
-        self._frame_timer.stop()
-        self._statistics_timer.stop()
-        self.form.shutdown()
-        self.record_bar.shutdown()
-
-    def theme_changed(self) -> None:
-        """Take over the theme's colour map and plot colours."""
-        self.picture.restyle()
 
     # Frames --------------------------------------------------------------------------------------
     def look(self) -> None:

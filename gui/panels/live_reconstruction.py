@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QTimer
 from PySide6.QtGui import QHideEvent
-from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QLineEdit, QPushButton, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QComboBox, QWidget
 
-from gui.background import LiveFollower
+from gui.background import LiveFollower, NewestOnly
 from gui.forms.options_form import FOLDED, OptionsForm
 from gui.jobs import Job, JobContext
-from gui.panel import Panel
+from gui.panel import Panel, on_bench
 from gui.session import BenchSession
-from gui.widgets.building import scrolled
-from gui.widgets.dialogues import choose_path, elided
+from gui.widgets.building import button, choice, every, fill, in_row, label, offer, scrolled
+from gui.widgets.dialogues import elided, path_field
 from gui.widgets.entry import NumberEdit
 from gui.widgets.image_view import ImageView
 from instrument.bench.photograph import LightState, light_of
@@ -38,7 +37,6 @@ from recon.types import Calibration
 _LOOK_MS = 50
 _BUDGET_MS = 80.0
 """A picture's time: twelve a second leave half of a two-core machine to the camera and the window."""
-_PROGRESS_S = 0.5
 _NO_CALIBRATION = "Choose a calibration; the Sweeps panel makes one."
 _ALL_DEPTHS = "all depths"
 _WHITE = 99.8
@@ -70,14 +68,11 @@ class LiveReconstructionPanel(Panel):
     The options are those of every reconstruction that apply to live pictures, folded away behind a button.
     """
 
-    title = "Live reconstruction"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.follower = LiveFollower(session.live)
         self.loaded: _Loaded | None = None
-        self._reading: Job | None = None
-        """The newest job that loads a calibration; what older ones bring is dropped."""
+        self._reader = NewestOnly(session.jobs, "Loading the calibration", self._refuse)
         self._loading: Job | None = None
         """The newest job that prepares a preview; what older ones bring is dropped."""
         self._refining: Job | None = None
@@ -86,28 +81,24 @@ class LiveReconstructionPanel(Panel):
         self._logged: tuple[str, ...] = ()
         """Warnings of the reconstructor in use that are in the log already."""
         self.view = ImageView()
-        self.file = QLineEdit()
-        self.file.setPlaceholderText("calibration folder")
-        self.file.setToolTip("A calibration, or a run that holds one; Enter loads it")
-        self.file.returnPressed.connect(self.load)
-        self.browse_button = QPushButton("…")
-        self.browse_button.setToolTip("Choose a calibration folder")
-        self.browse_button.clicked.connect(self._browse)
-        self.plane = QComboBox()
-        self.plane.setToolTip("Depth of the scene: which PSFs of the calibration are used")
+        self.file, self.browse_button = path_field(
+            "calibration folder",
+            "A calibration, or a run that holds one",
+            self.load,
+            browse="folder",
+            start=session.runs_folder,
+        )
+        self.plane = choice((), "Depth of the scene: which PSFs of the calibration are used")
         self.plane.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.plane.activated.connect(self._rebuild)
-        self.run_button = QPushButton("▶ Preview")
-        self.run_button.setCheckable(True)
+        tip = "Reconstruct the newest frame again and again"
+        self.run_button = button("▶ Preview", tip, checkable=True)
         self.run_button.setChecked(True)
-        self.run_button.setToolTip("Reconstruct the newest frame again and again")
         self.run_button.toggled.connect(self._toggle)
-        self.refine_button = QPushButton("Refine")
-        self.refine_button.setToolTip("Reconstruct the newest frame with the full solver; again ends it")
-        self.refine_button.clicked.connect(self.refine)
-        self.budget = NumberEdit(
-            "ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip="Time for one picture: quality gives way"
-        )
+        tip = "Reconstruct the newest frame with the full solver; again ends it"
+        self.refine_button = button("Refine", tip, self.refine)
+        tip = "Time for one picture: quality gives way"
+        self.budget = NumberEdit("ms", _BUDGET_MS, minimum=5.0, maximum=5000.0, tip=tip)
         self.budget.setFixedWidth(80)
         self.budget.submitted.connect(self._set_budget)
         self.budget.refused.connect(lambda why: self.refused(None, why))
@@ -119,58 +110,37 @@ class LiveReconstructionPanel(Panel):
         self.options.refused.connect(self.refused)
         folded = scrolled(self.options)
         folded.hide()
-        self.options_button = QPushButton("Options")
-        self.options_button.setCheckable(True)
-        self.options_button.setToolTip("Prior, solver, camera model, background; how frames are binned")
+        tip = "Prior, solver, camera model, background; how frames are binned"
+        self.options_button = button("Options", tip, checkable=True)
         self.options_button.toggled.connect(folded.setVisible)
-        self.status = QLabel(_NO_CALIBRATION)
-        self.status.setWordWrap(True)
-        self.status.setObjectName("dim")
-        first = QHBoxLayout()
-        first.addWidget(self.file, 1)
-        first.addWidget(self.browse_button)
-        first.addWidget(self.plane)
-        second = QHBoxLayout()
-        second.addWidget(self.run_button)
-        second.addWidget(self.refine_button)
-        second.addWidget(self.options_button)
-        second.addStretch(1)
-        second.addWidget(QLabel("within"))
-        second.addWidget(self.budget)
-        layout = QVBoxLayout(self.body)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(first)
-        layout.addWidget(self.view, 1)
-        layout.addWidget(self.status)
-        layout.addLayout(second)
-        layout.addWidget(folded, 1)
+        self.status = label(_NO_CALIBRATION, "dim", wraps=True)
+        first = in_row((self.file, 1), self.browse_button, self.plane)
+        switches = (self.run_button, self.refine_button, self.options_button)
+        second = in_row(*switches, None, label("within"), self.budget)
+        fill(self.body, first, (self.view, 1), self.status, second, (folded, 1))
         session.run_finished.connect(self._run_finished)
-        self._timer = QTimer(self)
-        self._timer.timeout.connect(self.look)
-        self._timer.start(_LOOK_MS)
-        self._find_newest()
+        self._timer = every(self, _LOOK_MS, self.look)
+        folder = session.runs_folder
+        self._load(_NO_CALIBRATION, lambda: newest_calibration(folder))
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:
         """Return lines that reconstruct live with the same calibration."""
-        path = self.session.config.path
         calibration = "calibration" if self.loaded is None else str(self.loaded.path)
-        imports = Imports({("instrument.bench.bench", "open_bench"), ("instrument.live.live", "live_view")})
+        imports = Imports({("instrument.live.live", "live_view")})
         options, live = (expression(asked, imports, indent="    ") for asked in self._asked(self.z_um))
         lines = (
-            "",
-            f"with open_bench({str(path) if path else None!r}) as bench:",
-            f"    options = {options}",
-            f"    settings = {live}",
-            f"    with live_view(bench, {calibration!r}, options, settings) as live:",
-            "        for result in live:",
-            "            print(result.picture.quality, result.latency_ms)",
+            f"options = {options}",
+            f"settings = {live}",
+            f"with live_view(bench, {calibration!r}, options, settings) as live:",
+            "    for result in live:",
+            "        print(result.picture.quality, result.latency_ms)",
         )
-        return "\n".join((*imports.lines(), *lines, ""))
+        return on_bench(self.session.config.path, lines, imports)
 
     def shutdown(self) -> None:
         """End the timer, the preview and a refinement."""
-        self._timer.stop()
+        super().shutdown()
         if self._refining is not None:
             self._refining.cancel()
         self._end_preview()
@@ -185,30 +155,31 @@ class LiveReconstructionPanel(Panel):
     def load(self) -> None:
         """Load the calibration in the field."""
         folder = Path(self.file.text().strip()).expanduser()
-        self.status.setText(f"Loading {folder} …")
+        self._reader.forget()
+        # Another reader: none waits for an older calibration.
+        self._reader = NewestOnly(self.jobs, "Loading the calibration", self._refuse)
+        self._load(f"Loading {folder} …", lambda: find_calibration(folder))
 
-        def work(_: JobContext) -> tuple[Path, Calibration]:
-            found = find_calibration(folder)
-            return found, load_calibration(found)
+    def _load(self, words: str, find: Callable[[], Path | None]) -> None:
+        """Load the calibration that is found in a job's thread, if one is."""
+        self.status.setText(words)
 
-        job = self.session.jobs.compute("Loading the calibration", work)
-        job.quiet = True
-        self._reading = job
-        job.succeeded.connect(lambda value: self._got_calibration(job, value))
-        job.failed.connect(lambda why: self._refuse(job, why))
+        def read() -> tuple[Path, Calibration] | None:
+            found = find()
+            return None if found is None else (found, load_calibration(found))
 
-    def _refuse(self, job: Job, why: str) -> None:
-        if job in (self._reading, self._loading):
-            self.refused(self.file, why)
-            if self.loaded is None:
-                self.status.setText(_NO_CALIBRATION)
+        self._reader.ask(read, self._got_calibration)
 
-    def _got_calibration(self, job: Job, value: object) -> None:
-        if job is not self._reading:
-            return
-        path, calibration = cast(tuple[Path, Calibration], value)
-        depths = _depths_um(calibration)
-        self._build(path, calibration, depths[len(depths) // 2] if depths else None)
+    def _refuse(self, why: str) -> None:
+        self.refused(self.file, why)
+        if self.loaded is None:
+            self.status.setText(_NO_CALIBRATION)
+
+    def _got_calibration(self, read: tuple[Path, Calibration] | None) -> None:
+        if read is not None:
+            path, calibration = read
+            depths = _depths_um(calibration)
+            self._build(path, calibration, depths[len(depths) // 2] if depths else None)
 
     def _rebuild(self) -> None:
         if self.loaded is not None:
@@ -246,9 +217,7 @@ class LiveReconstructionPanel(Panel):
             self._show_depths(loaded)
             depth = f", {self.plane.currentText()}" if self.plane.count() else ""
             why = f"{why} The preview goes on as before: {loaded.path}{depth}."
-        else:
-            self.status.setText(_NO_CALIBRATION)
-        self.refused(self.file, why)
+        self._refuse(why)
 
     def _not_loading(self, job: Job) -> None:
         if job is self._loading:
@@ -269,33 +238,14 @@ class LiveReconstructionPanel(Panel):
         depths: list[float | None] = list(_depths_um(loaded.calibration))
         depths += [None] if depths else []
         if [self.plane.itemData(i) for i in range(self.plane.count())] != depths:
-            self.plane.clear()
-            for z_um in depths:
-                self.plane.addItem(_ALL_DEPTHS if z_um is None else f"z {z_um / 1e3:.4g} mm", z_um)
+            offer(self.plane, [(_ALL_DEPTHS if z is None else f"z {z / 1e3:.4g} mm", z) for z in depths])
         if depths:
             self.plane.setCurrentIndex(depths.index(loaded.z_um))
         self.plane.setVisible(bool(depths))
 
-    def _browse(self) -> None:
-        start = self.file.text() or str(self.session.runs_folder)
-
-        def chosen(path: Path) -> None:
-            self.file.setText(str(path))
-            self.load()
-
-        choose_path(self, "folder", "Calibration", start, chosen)
-
-    def _find_newest(self) -> None:
-        """Begin with the newest calibration among the runs, if there is one."""
-        newest = newest_calibration(self.session.runs_folder)
-        if newest is not None:
-            self.file.setText(str(newest))
-            self.load()
-
     def _run_finished(self, path: Path) -> None:
-        if self.loaded is None and (is_calibration(path) or any(path.glob("*/calibration.json"))):
-            self.file.setText(str(path))
-            self.load()
+        if self.loaded is None:
+            self._load(_NO_CALIBRATION, lambda: _calibration_of(path))
 
     def _set_budget(self, value: float) -> None:
         if self.loaded is not None:
@@ -371,20 +321,14 @@ class LiveReconstructionPanel(Panel):
             self.refused(None, "There is no frame yet: start the live view.")
             return
         image = np.array(frame.image)  # a copy: the ring's buffer is wanted back
-
         reconstructor = loaded.reconstructor
 
         def work(context: JobContext) -> tuple[Reconstruction, npt.NDArray[np.float32]]:
             self.follower.stop()
-            shown_s = time.monotonic()
 
             def watch(record: Any, present: Any) -> None:
-                nonlocal shown_s
-                if not context.cancel.is_set() and time.monotonic() - shown_s > _PROGRESS_S:
-                    shown_s = time.monotonic()
-                    left = max(ITERATIONS - record.iteration, 0)
-                    left_s = left * record.seconds / record.iteration
-                    context.report(_SoFar(record.iteration, left_s, reconstructor.shown(present()).copy()))
+                left_s = max(ITERATIONS - record.iteration, 0) * record.seconds / record.iteration
+                context.offer(lambda: _SoFar(record.iteration, left_s, reconstructor.shown(present()).copy()))
 
             result = reconstructor.full(image, on_progress=watch, cancel=context.cancel)
             return result, reconstructor.shown(result.volume)
@@ -408,16 +352,20 @@ class LiveReconstructionPanel(Panel):
         result, shown = cast(tuple[Reconstruction, npt.NDArray[np.float32]], value)
         self._holds = True
         self._show_picture(shown)
-        reason = f", {result.stop_reason}"
         elided(
             self.status,
             f"Refined: {result.solver} with {result.prior}, {len(result.history)} iterations, "
-            f"{result.seconds:.1f} s{reason}. {' '.join(result.warnings)}",
+            f"{result.seconds:.1f} s, {result.stop_reason}. {' '.join(result.warnings)}",
         )
 
     def _refining_ended(self) -> None:
         self._refining = None
         self.refine_button.setText("Back to the preview" if self._holds else "Refine")
+
+
+def _calibration_of(run: Path) -> Path | None:
+    """Return the calibration that a run is or holds, if there is one."""
+    return find_calibration(run) if is_calibration(run) or any(run.glob("*/calibration.json")) else None
 
 
 def _depths_um(calibration: Calibration) -> list[float]:

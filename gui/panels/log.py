@@ -28,8 +28,6 @@ class _Line(NamedTuple):
 class LogPanel(Panel):
     """Lines of the session's log, newest last."""
 
-    title = "Log"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self._lines: deque[_Line] = deque(maxlen=MOST_LINES)
@@ -63,7 +61,7 @@ class LogPanel(Panel):
             "logging.basicConfig(level=logging.INFO, format=line)\n"
         )
 
-    def theme_changed(self) -> None:
+    def restyle(self) -> None:
         """Write the lines anew: their colours say what they are."""
         self._show_all()
 

@@ -12,6 +12,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QListWidget, QListWidgetItem, QStackedWidget, QWidget
 
 from gui.background import NewestOnly
+from gui.forms.options_form import SuggestedName
 from gui.forms.reconstruct import CALIBRATION, PSF, ReconstructForm, SoFar, Written, reconstruct_job
 from gui.jobs import Job, JobContext
 from gui.panel import Panel
@@ -31,7 +32,6 @@ from instrument.reconstruction.stored_result import (
     StoredResult,
     export_result,
     find_results,
-    free_result,
     open_result,
 )
 from recon.base.declare import Imports, expression
@@ -44,8 +44,6 @@ Views = dict[Path, npt.NDArray[np.uint8]]
 class ReconstructionsPanel(Panel):
     """Results in the data folder, a viewer for pictures and volumes, and the form."""
 
-    title = "Reconstructions"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.result: StoredResult | None = None
@@ -53,7 +51,6 @@ class ReconstructionsPanel(Panel):
         self._explaining: Job | None = None
         self._opening: Job | None = None
         self._first_picture = True
-        self._suggested: Path | None = None
         self.list = QListWidget()
         self.list.setToolTip("Reconstructions in the data folder, the newest first (Enter opens)")
         self.list.setAlternatingRowColors(True)
@@ -87,6 +84,8 @@ class ReconstructionsPanel(Panel):
             self.viewers.addWidget(widget)
         self._arrange()
         session.run_finished.connect(lambda _: self.refresh())
+        folder = self.session.runs_folder / "reconstructions"
+        self._names = SuggestedName(self.jobs, self.form.options, folder, ".tif")
         self._suggest_out()
         self._depths = NewestOnly(self.jobs, "Reading a calibration's depths")
         self.form.options.settled.connect(self._settled)
@@ -174,18 +173,21 @@ class ReconstructionsPanel(Panel):
         if not self._still_shown(result):
             return
         views = self._views_for(target)  # what is asked about now is what is written after the answer
-        present = [path for path in views or (target,) if path.exists()]
-        if not present:
-            self.export_to(target, views=views)
-            return
-        names = ", ".join(path.name for path in present)
 
         def answered(agreed: bool) -> None:
             if agreed and self._still_shown(result):
                 self.export_to(target, overwrite=True, views=views)
 
-        text = f"{names}: exists already. Replace it?"
-        Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
+        def looked(present: list[str]) -> None:
+            if not present:
+                self.export_to(target, views=views)
+                return
+            text = f"{', '.join(present)}: exists already. Replace it?"
+            Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
+
+        files = list(views or (target,))
+        look = self.jobs.watch("Looking for files", lambda _: [file.name for file in files if file.exists()])
+        self.follow(look).succeeded.connect(looked)
 
     def _still_shown(self, result: StoredResult) -> bool:
         """Whether a result is still open; says so where another was opened while the operator was asked."""
@@ -254,13 +256,7 @@ class ReconstructionsPanel(Panel):
 
     # Reconstructing ------------------------------------------------------------------------------
     def _suggest_out(self) -> None:
-        """Name the result after the photograph, where nothing is written yet; a name that was typed stays."""
-        if self.form.text("out") not in ("", str(self._suggested)):
-            return
-        folder = self.session.runs_folder / "reconstructions"
-        stem = Path(self.form.text("image")).stem or "reconstruction"
-        self._suggested = free_result(folder, stem, ".tif")
-        self.form.options.set_values({"out": self._suggested})
+        self._names.suggest(Path(self.form.text("image")).stem or "reconstruction")
 
     def _settled(self, name: str) -> None:
         """Follow what was named in the form: the result's name, the depths to choose from."""
@@ -277,12 +273,14 @@ class ReconstructionsPanel(Panel):
             self.refused(None, str(error))
             return None
         self.accepted()
-        request, outputs = work.request, work.outputs
-        if outputs.image == self._suggested:
-            outputs.image.parent.mkdir(parents=True, exist_ok=True)
+        request = work.request
         volume = isinstance(request, VolumeRequest)
-        title = f"Reconstructing {request.image.name}"
-        self.job = job = self.jobs.compute(title, lambda context: reconstruct_job(work, context))
+
+        def do(context: JobContext) -> Written:
+            self._names.make_room(work.outputs.image)
+            return reconstruct_job(work, context)
+
+        self.job = job = self.jobs.compute(f"Reconstructing {request.image.name}", do)
         self._begun(job, "Reading …")
         self._close_result()
         self._opening, self._first_picture = None, True
@@ -406,13 +404,9 @@ class ReconstructionsPanel(Panel):
         opened = f"result = open_result({expression(path, imports)})"
         return "\n".join([*imports.lines(), "", opened, "print(result.facts(), result.warnings)", ""])
 
-    def theme_changed(self) -> None:
-        """Take over the theme's colours."""
-        for view in (self.picture, self.volume, self.convergence, self.facts):
-            view.restyle()
-
     def shutdown(self) -> None:
         """Close the volume that is shown and end the work."""
+        super().shutdown()
         if self.job is not None:
             self.job.cancel()
         self._depths.forget()

@@ -67,8 +67,6 @@ class _Picture:
 class RunsPanel(Panel):
     """A list of runs, the newest first; a click opens one."""
 
-    title = "Runs"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.run = ProcedureRun(session, self)
@@ -182,11 +180,6 @@ class RunsPanel(Panel):
         """Show a run that another panel hands on, and mark it in the list as soon as that is read."""
         self._wanted = path
         self.read_folder()
-
-    def shutdown(self) -> None:
-        """End the timers."""
-        self._rest.stop()
-        self.run.shutdown()
 
     # Making --------------------------------------------------------------------------------------
     def _make_list(self) -> None:

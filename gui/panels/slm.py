@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtWidgets import QCheckBox, QLineEdit, QPushButton, QWidget
+from PySide6.QtWidgets import QCheckBox, QWidget
 
 from gui.jobs import Job
 from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_row, label
-from gui.widgets.dialogues import choose_path, elided
+from gui.widgets.dialogues import elided, path_field
 from gui.widgets.image_view import ImageView
 from gui.widgets.plots import curve_pen, plot_widget
 from instrument.files.slm_image import SlmCorrection, load_slm_correction, read_slm_image, show_levels
@@ -26,7 +26,6 @@ _IMAGES = "Phase pictures (*.png *.tif *.tiff *.bmp *.npy)"
 class SlmPanel(DevicePanel):
     """Shows what the SLM shows; loads 8-bit phase pictures through the look-up table."""
 
-    title = "SLM"
     kind = "slm"
     look_ms = 500
 
@@ -35,17 +34,20 @@ class SlmPanel(DevicePanel):
         self.view = ImageView("grey")
         self.view.setToolTip("Grey levels on the SLM now, 0 to 255")
         self.now = label("–")
-        self.file, self.browse_button = self._path_field(
-            "phase picture, 8 bit, 256 levels a turn", "A picture of the SLM's own size", self.load, _IMAGES
+        self.file, self.browse_button = path_field(
+            "phase picture, 8 bit, 256 levels a turn",
+            "A picture of the SLM's own size",
+            self.load,
+            filters=_IMAGES,
         )
         tip = "Put the picture on the SLM, through the look-up table"
         self.load_button = button("Show", tip, self.load)
         self.blank_button = button("Blank", "All pixels to grey level 0", self.blank)
-        self.table_file, self.table_button = self._path_field(
+        self.table_file, self.table_button = path_field(
             "look-up table: calibration.json from calibrate slm",
             "What calibrate slm wrote",
             self.load_table,
-            "Calibration (*.json)",
+            filters="Calibration (*.json)",
         )
         self.use_table = QCheckBox("apply look-up table and flatness")
         self.use_table.setToolTip("What is shown next goes through the SLM's calibration")
@@ -68,23 +70,6 @@ class SlmPanel(DevicePanel):
             self.table_plot,
         )
         self.watch_device(self.now)
-
-    def _path_field(
-        self, empty: str, tip: str, load: Callable[[], object], filters: str
-    ) -> tuple[QLineEdit, QPushButton]:
-        """Return a field for a path, and the button that lets one be chosen; both load it."""
-        field = QLineEdit()
-        field.setPlaceholderText(empty)
-        field.setToolTip(f"{tip}; Enter loads it")
-        field.returnPressed.connect(load)
-
-        def chosen(path: Path) -> None:
-            field.setText(str(path))
-            load()
-
-        return field, button(
-            "…", "Choose a file", lambda: choose_path(field, "open", tip, field.text(), chosen, filters)
-        )
 
     # Panel ---------------------------------------------------------------------------------------
     def as_python(self) -> str:

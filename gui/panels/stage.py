@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QFocusEvent, QKeyEvent
@@ -17,10 +16,9 @@ from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_column, in_row, label, mark, share_bar
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
+from gui.widgets.image_view import step_factor
 from recon.base.declare import Imports
 
-_FINE, _COARSE = 0.1, 10.0
-"""Factors of the step with Ctrl and with Shift."""
 _STEPS = {"um": 100.0, "mrad": 1.0}
 """Steps to begin with, by unit: a tenth of a millimetre, a milliradian."""
 _KEYS: dict[Qt.Key, tuple[str, int]] = {
@@ -32,13 +30,6 @@ _KEYS: dict[Qt.Key, tuple[str, int]] = {
     Qt.Key.Key_PageUp: ("z", 1),
 }
 _GAUGE = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class _Reading:
-    position: dict[str, float]
-    is_homed: bool
-    is_moving: bool
 
 
 @dataclass(slots=True)
@@ -72,13 +63,8 @@ class JogPad(QFrame):
         if direction is None:
             super().keyPressEvent(event)
             return
-        modifiers = event.modifiers()
-        factor = 1.0
-        if modifiers & Qt.KeyboardModifier.ShiftModifier:
-            factor = _COARSE
-        elif modifiers & Qt.KeyboardModifier.ControlModifier:
-            factor = _FINE
-        self._panel.jog(direction[0], direction[1] * factor, repeated=event.isAutoRepeat())
+        letter, sign = direction
+        self._panel.jog(letter, sign * step_factor(event), repeated=event.isAutoRepeat())
 
     def focusInEvent(self, event: QFocusEvent) -> None:  # noqa: N802 - Qt's name
         """Show that keys go here."""
@@ -94,7 +80,6 @@ class JogPad(QFrame):
 class StagePanel(DevicePanel):
     """Position, targets and limits of every axis; jogging; home, which asks first."""
 
-    title = "Stage"
     kind = "stage"
     look_ms = 200
 
@@ -183,7 +168,7 @@ class StagePanel(DevicePanel):
         if stage is None or not self.is_ready or self._reading is not None:
             return
         self._reading = self.jobs.watch(
-            "Reading the stage", lambda _: _Reading(stage.position(), stage.is_homed, stage.is_moving)
+            "Reading the stage", lambda _: (stage.position(), stage.is_homed, stage.is_moving)
         )
         self._reading.succeeded.connect(self._show)
         self._reading.ended.connect(self._looked)
@@ -191,18 +176,18 @@ class StagePanel(DevicePanel):
     def _looked(self) -> None:
         self._reading = None
 
-    def _show(self, value: object) -> None:
-        reading = cast(_Reading, value)
+    def _show(self, reading: tuple[dict[str, float], bool, bool]) -> None:
+        position, is_homed, is_moving = reading
         for name, row in self.rows.items():
-            here = reading.position[name]
+            here = position[name]
             row.position.setText(f"{here:,.1f} {_words(row.axis.unit)}".replace(",", "\u2009"))
             travel = row.axis.upper_limit - row.axis.lower_limit
             row.gauge.setValue(round(_GAUGE * (here - row.axis.lower_limit) / travel) if travel else 0)
             if row.target.value is None or not row.target.hasFocus():
                 row.target.set_value(round(here, 3))
-        if reading.is_moving:
+        if is_moving:
             self.state.setText("Moving …  Esc stops")
-        elif not reading.is_homed:
+        elif not is_homed:
             self.state.setText("Not homed: positions have no reference. Home it first.")
         else:
             self.state.setText("At rest, homed")
@@ -221,9 +206,9 @@ class StagePanel(DevicePanel):
         if not field.submit():  # not by the step of before
             field.setFocus()
             return
-        step = field.value or 0.0
-        name, delta = row.axis.name, steps * step
-        self._start(f"Jog {letter} by {delta:g} {_words(row.axis.unit)}", {name: delta}, relative=True)
+        delta = steps * (field.value or 0.0)
+        words = f"Jog {letter} by {delta:g} {_words(row.axis.unit)}"
+        self._start(words, {row.axis.name: delta}, relative=True)
 
     def _jog_clicked(self, letter: str, sign: int, _checked: bool = False) -> None:
         self.jog(letter, sign)

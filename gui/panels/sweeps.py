@@ -70,8 +70,6 @@ PLAN = Routine(
 class SweepsPanel(ProcedurePanel):
     """Sweeps and plans."""
 
-    title = "Sweeps"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         self.path = PathPlot()
         self.frame = ImageView()
@@ -130,11 +128,6 @@ class SweepsPanel(ProcedurePanel):
     def _show_result(self, picture: QImage) -> None:
         self.picture.show_pixmap(QPixmap.fromImage(picture))
         self.tabs.setCurrentWidget(self.picture)
-
-    def theme_changed(self) -> None:
-        """Restyle the plots."""
-        self.path.restyle()
-        self.psfs.restyle()
 
     def _judged(self, event: object) -> None:
         if isinstance(event, PointTaken):

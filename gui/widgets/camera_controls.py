@@ -64,12 +64,8 @@ class CameraForm(QWidget):
         self.all_button = button("All settings …", tip, self._show_all)
         fill(self, self.form, in_row(self._temperature_name, (self.temperature, 1), self.all_button))
         self._session.device_changed.connect(self._device_changed)
-        self._timer = every(self, _READ_BACK_MS, self.read_back)
+        every(self, _READ_BACK_MS, self.read_back)
         self._device_changed("camera")
-
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
 
     def read_back(self) -> None:
         """Ask the camera for all settings, unless something else uses it."""
@@ -197,12 +193,8 @@ class RecordBar(QWidget):
         self.gauge.setFormat("…")
         self.note = label()
         fill(self, self.button, self.seconds, self.label, self.gauge, (self.note, 1), across=True)
-        self._timer = every(self, _DISK_MS, self._look_at_disk)
+        every(self, _DISK_MS, self._look_at_disk)
         self._look_at_disk()
-
-    def shutdown(self) -> None:
-        """End the timer."""
-        self._timer.stop()
 
     def toggle(self) -> None:
         """Start a recording, or end the one that runs."""

@@ -13,12 +13,13 @@ from PySide6.QtWidgets import (
     QDialogButtonBox,
     QFileDialog,
     QLabel,
+    QLineEdit,
     QMessageBox,
-    QVBoxLayout,
+    QPushButton,
     QWidget,
 )
 
-from gui.widgets.building import text_view
+from gui.widgets.building import button, fill, text_view
 
 Browse = Literal["open", "folder", "save"]
 
@@ -114,6 +115,31 @@ def choose_path(
     return dialogue
 
 
+def path_field(
+    words: str,
+    tip: str,
+    load: Callable[[], object],
+    *,
+    browse: Browse = "open",
+    filters: str = "",
+    start: Path | None = None,
+) -> tuple[QLineEdit, QPushButton]:
+    """Return a field for a path, and the button to choose one, first from ``start``; both load it."""
+    field = QLineEdit()
+    field.setPlaceholderText(words)
+    field.setToolTip(f"{tip}; Enter loads it")
+    field.returnPressed.connect(load)
+
+    def chosen(path: Path) -> None:
+        field.setText(str(path))
+        load()
+
+    def choose() -> None:
+        choose_path(field, browse, tip, field.text() or str(start or ""), chosen, filters)
+
+    return field, button("…", f"Choose a {'folder' if browse == 'folder' else 'file'}", choose)
+
+
 _MOST_CHARACTERS = 220
 
 
@@ -146,6 +172,4 @@ class TextWindow(QDialog):
         copy = buttons.addButton("Copy all", QDialogButtonBox.ButtonRole.ActionRole)
         copy.clicked.connect(lambda: QGuiApplication.clipboard().setText(self.view.toPlainText()))
         buttons.rejected.connect(self.reject)
-        layout = QVBoxLayout(self)
-        layout.addWidget(self.view)
-        layout.addWidget(buttons)
+        fill(self, self.view, buttons)

@@ -146,7 +146,7 @@ class WeightsView(StretchedImage):
         """Show the target as it fills the square field, (height, width) in 0 to 1."""
         centre, radius = self.centre, self.radius
         self._size = max(image.shape)
-        self.show_over(image, (self._size, self._size), (0.0, 1.0))
+        self.show_image(image, 0.0, 1.0, extent=(self._size, self._size))
         self.set_fovea(centre, radius)
         self._place_brush()
         self._show_shade()
@@ -320,7 +320,6 @@ class HologramViews(QWidget):
 
     def restyle(self) -> None:
         """Take over the theme's colours."""
-        self.metrics.restyle()
         if self.computed is not None:
             self._draw_history(self.computed.result.hologram.history)
 

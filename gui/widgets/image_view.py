@@ -77,8 +77,10 @@ class ImageView(QWidget):
         self._mouse: QPointF | None = None
         """The last place of the mouse in the scene."""
         self._indices: npt.NDArray[np.uint8] = np.empty((0, 0), np.uint8)
-        self._levels: tuple[float, float, int | None] = (0.0, 1.0, None)
-        """What the image is shown with: low, high, full scale."""
+        self.extent = (1, 1)
+        """Width and height of what is shown."""
+        self._levels: tuple[float, float, int | None, tuple[int, int] | None] = (0.0, 1.0, None, None)
+        """What the image is shown with: low, high, full scale, extent."""
         self._table_key: tuple[Any, ...] = ()
         self._table: npt.NDArray[np.uint8] = np.empty(0, np.uint8)
         fill(self, self.graphics)
@@ -112,7 +114,14 @@ class ImageView(QWidget):
         self.graphics.setBackground(colours().window)
         self.set_colour_map(colours().colour_map)
 
-    def show_image(self, image: Image, low: float, high: float, full_scale: int | None = None) -> None:
+    def show_image(
+        self,
+        image: Image,
+        low: float,
+        high: float,
+        full_scale: int | None = None,
+        extent: tuple[int, int] | None = None,
+    ) -> None:
         """Show an image.
 
         Parameters
@@ -123,12 +132,15 @@ class ImageView(QWidget):
             Values shown darkest and brightest.
         full_scale : int, optional
             Counts from here on are drawn in the colour of saturation.
+        extent : (int, int), optional
+            Width and height that the image is stretched over; by default its own, in pixels.
         """
-        first = self.image is None or self.image.shape[:2] != image.shape[:2]
-        self.image = image
+        over = extent or (image.shape[1], image.shape[0])
+        first = self.image is None or self.extent != over
+        self.image, self.extent = image, over
         if first:
             self.whole()
-        self._levels = (low, high, full_scale)
+        self._levels = (low, high, full_scale, extent)
         step = self._step(image)
         size = (image.shape[0] // step, image.shape[1] // step)
         mapped = image.ndim == 2 or spares_hues(self._colour_map)
@@ -138,15 +150,15 @@ class ImageView(QWidget):
         self._fill(image, low, high, full_scale, step)
         lut = table(self._colour_map) if mapped else None
         self.item.setImage(self._indices, autoLevels=False, levels=None, lut=lut)
-        if (size, step) != self._placed:
-            self._placed = (size, step)
-            self.item.setRect(QRectF(0, 0, size[1] * step, size[0] * step))
+        if (place := extent or (size[1] * step, size[0] * step)) != self._placed:
+            self._placed = place
+            self.item.setRect(QRectF(0, 0, *place))
 
     def whole(self) -> None:
         """Show the whole image."""
         if self.image is not None:
-            height, width = self.image.shape[:2]
-            self.box.setRange(xRange=(0, width), yRange=(0, height), padding=0.01)
+            across, down = self.extent
+            self.box.setRange(xRange=(0, across), yRange=(0, down), padding=0.01)
 
     def clear(self) -> None:
         """Show nothing."""
@@ -203,8 +215,8 @@ class ImageView(QWidget):
             return None
         point = self.box.mapSceneToView(place)
         column, row = int(np.floor(point.x())), int(np.floor(point.y()))
-        height, width = self.image.shape[:2]
-        return (column, row) if 0 <= column < width and 0 <= row < height else None
+        across, down = self.extent
+        return (column, row) if 0 <= column < across and 0 <= row < down else None
 
     def describe(self, column: int, row: int) -> str:
         """Return a pixel's place and value in words."""
@@ -240,7 +252,7 @@ class ImageView(QWidget):
 
 
 class StretchedImage(ImageView):
-    """Shows images over ``extent``, (width, height) in voxels; places under the mouse are voxels.
+    """Shows images over another extent, in voxels: places under the mouse are voxels.
 
     Parameters
     ----------
@@ -250,31 +262,7 @@ class StretchedImage(ImageView):
 
     def __init__(self, *, keep_aspect: bool = True, parent: QWidget | None = None) -> None:
         super().__init__(parent=parent)
-        self.extent = (1, 1)
         self.box.setAspectLocked(keep_aspect)
-
-    def show_over(self, image: Image, extent: tuple[int, int], levels: tuple[float, float]) -> None:
-        """Show an image, (height, width[, 3]), over ``extent``."""
-        moved = self.extent != extent or self.image is None
-        self.extent = extent
-        self.show_image(image, *levels)
-        self.item.setRect(0, 0, *extent)
-        if moved:
-            self.whole()
-
-    def whole(self) -> None:
-        """Show the whole extent."""
-        across, down = self.extent
-        self.box.setRange(xRange=(0, across), yRange=(0, down), padding=0.01)
-
-    def pixel_at(self, place: QPointF) -> tuple[int, int] | None:
-        """Return column and row of the voxel at a place of the scene; None outside."""
-        if self.image is None:
-            return None
-        point: Any = self.box.mapSceneToView(place)
-        column, row = int(np.floor(point.x())), int(np.floor(point.y()))
-        across, down = self.extent
-        return (column, row) if 0 <= column < across and 0 <= row < down else None
 
     def describe(self, column: int, row: int) -> str:
         """Return a voxel's place and value in words."""
@@ -297,6 +285,13 @@ _ZOOM: dict[int, float] = {
     Qt.Key.Key_Minus: 0.8,
     Qt.Key.Key_0: 0.0,
 }
+
+
+def step_factor(event: QKeyEvent) -> float:
+    """Return what a key's step is multiplied with: Shift makes it ten times as large, Ctrl a tenth."""
+    if event.modifiers() & Qt.KeyboardModifier.ShiftModifier:
+        return 10.0
+    return 0.1 if event.modifiers() & Qt.KeyboardModifier.ControlModifier else 1.0
 
 
 class ArrowKeys(QObject):
@@ -347,11 +342,7 @@ class ArrowKeys(QObject):
             return False
         key, held = event.key(), event.modifiers()
         if key in ARROWS:
-            scale = 1.0
-            if held & Qt.KeyboardModifier.ShiftModifier:
-                scale = 10.0
-            elif held & Qt.KeyboardModifier.ControlModifier:
-                scale = 0.1
+            scale = step_factor(event)
             across, down = ARROWS[key]
             signal = self.resized if held & Qt.KeyboardModifier.AltModifier else self.moved
             signal.emit(across * scale, down * scale)

@@ -272,9 +272,8 @@ class LivePicture(QWidget):
             self._measure(self.frame)
 
     def restyle(self) -> None:
-        """Take over the theme's colour map and plot colours."""
+        """Take over the theme's colour map."""
         self.colour_map.setCurrentText(colours().colour_map)
-        self.histogram.restyle()
 
     def under_cross(self) -> str:
         """Return place and value under the cross-hair in words; empty where there is none."""

@@ -48,6 +48,15 @@ def restyle(plot: Any) -> None:
         plot.getAxis(axis).setTextPen(now.dim)
 
 
+def restyle_all(root: QWidget) -> None:
+    """Give a window's or panel's plots, and what has a ``restyle`` of its own, the colours of the theme."""
+    for widget in root.findChildren(QWidget):
+        if isinstance(widget, pg.PlotWidget):
+            restyle(widget)
+        if hasattr(widget, "restyle"):
+            widget.restyle()
+
+
 def curve_pen(number: int = 0, width: float = 1.5) -> Any:
     """Return the pen of the ``number``-th curve of a plot."""
     return pg.mkPen(curve_colour(number), width=width)

@@ -90,10 +90,6 @@ class PictureView(QWidget):
         self.turned_deg = (self.turned_deg + 90) % 360
         self._show()
 
-    def restyle(self) -> None:
-        """Take over the colours of the theme in use."""
-        self.levels.restyle()
-
     def _show(self) -> None:
         if (shown := self.shown) is not None:
             self.image.set_colour_map(self.levels.colour_map)

@@ -14,6 +14,7 @@ from gui.theme import colours
 from gui.widgets.building import choice, fill, in_row, label, offer
 from gui.widgets.image_view import ArrowKeys
 from gui.widgets.plots import curve_colour, curve_pen, dots, legend, plot_widget
+from instrument.evaluation.figures import label_of, ticks_of
 from recon.verdict.map import Failure
 
 _SPAN = 1.0
@@ -105,12 +106,8 @@ class StabilityView(QWidget):
         ]
         self.legend.setText(f"Boundaries: {legend(dict(enumerate(names)))}")
         for side, which in (("bottom", "x"), ("left", "y")):
-            about = record[which]
-            unit = f" ({about['unit']})" if about["unit"] else ""
-            self.plot.setLabel(side, f"{about['label']}{unit}")
-            self.plot.getAxis(side).setTicks(
-                [list(enumerate(about.get("ticks") or map(_short, about["values"])))]
-            )
+            self.plot.setLabel(side, label_of(record[which]))
+            self.plot.getAxis(side).setTicks([list(enumerate(ticks_of(record[which])))])
         rows, columns = severity.shape
         self.plot.setXRange(-0.5, columns - 0.5, padding=0.01)
         self.plot.setYRange(-0.5, rows - 0.5, padding=0.01)
@@ -207,8 +204,4 @@ def _place(axis: Mapping[str, Any], value: float) -> float:
 
 
 def _stress(axis: Mapping[str, Any], index: int) -> str:
-    return f"{axis['label']} {_short(axis['values'][index])} {axis['unit']}".rstrip()
-
-
-def _short(value: float) -> str:
-    return f"{value / 1000:g}k" if abs(value) >= 10000 else f"{value:g}"
+    return f"{axis['label']} {ticks_of(axis)[index]} {axis['unit']}".rstrip()

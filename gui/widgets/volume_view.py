@@ -174,7 +174,7 @@ class VolumeView(QWidget):
         self.release()
         self.levels.set_image(grey(front), keep_levels=keep_levels)
         self.front.set_colour_map(self.levels.colour_map)
-        self.front.show_over(front, (front.shape[1], front.shape[0]), self.levels.levels)
+        self.front.show_image(front, *self.levels.levels)
         for view in (self.side, self.top, self.coloured):
             view.clear()
 
@@ -252,7 +252,6 @@ class VolumeView(QWidget):
         """Take over the colours of the theme in use."""
         self._along.setPen(curve_pen(0))
         self._here.setPen(colours().dim)
-        self.levels.restyle()
         self._show()
 
     # Inside --------------------------------------------------------------------------------------
@@ -324,7 +323,7 @@ class VolumeView(QWidget):
         assert self._source is not None
         n_z, height, width = self._source.shape
         extents = {self.side: (n_z, height), self.top: (width, n_z)}
-        view.show_over(image, extents.get(view, (width, height)), levels)
+        view.show_image(image, *levels, extent=extents.get(view, (width, height)))
 
     def _show_profile(self) -> None:
         """Draw the values along depth through the point, from the slice at its row."""

@@ -341,7 +341,7 @@ def _draw_map(axes: Axes, name: str, method: Mapping[str, Any], record: Mapping[
         about = record[which]
         getattr(axes, f"set_{which}ticks")(range(count))
         getattr(axes, f"set_{which}ticklabels")(ticks_of(about), fontsize=8)
-        getattr(axes, f"set_{which}label")(_label(about), fontsize=9, color=_INK)
+        getattr(axes, f"set_{which}label")(label_of(about), fontsize=9, color=_INK)
     axes.set_title(f"{name} (numbers: {record['error']})", fontsize=10, color=_INK, loc="left")
     return image
 
@@ -352,7 +352,8 @@ def ticks_of(axis: Mapping[str, Any]) -> list[str]:
     return own or [_short(v) for v in axis["values"]]
 
 
-def _label(axis: Mapping[str, Any]) -> str:
+def label_of(axis: Mapping[str, Any]) -> str:
+    """Return an axis' label, with its unit where it has one."""
     return f"{axis['label']} ({axis['unit']})" if axis["unit"] else str(axis["label"])
 
 

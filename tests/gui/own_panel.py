@@ -21,8 +21,6 @@ class BlinkOptions:
 class BlinkPanel(Panel):
     """Says how it would blink."""
 
-    title = "Blink"
-
     def __init__(self, session: BenchSession, parent: QWidget | None = None) -> None:
         super().__init__(session, parent)
         self.form = OptionsForm([BlinkOptions])

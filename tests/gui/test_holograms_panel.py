@@ -63,7 +63,7 @@ def bench_text() -> str:
 def panel(qtbot: QtBot, make_session: Callable[[], BenchSession], tmp_path: Path) -> HologramsPanel:
     session = make_session()
     Path(session.config.path).write_text(aligned())
-    session._live_wanted = False
+    session.live_wanted = False
     with qtbot.waitSignal(session.opened, timeout=WAIT_MS):
         session.open()
     assert session.is_open("slm"), session.state("slm").text
@@ -106,7 +106,8 @@ def test_compute_show_and_photograph(qtbot: QtBot, panel: HologramsPanel) -> Non
     pattern = session.runs_folder / "holograms" / "picture.png"
     levels, facts = read_slm_image(pattern)
     assert facts["iterations"] == 12
-    assert panel.form.widgets["out"].text().endswith("picture-2.png")
+    out = panel.form.widgets["out"]
+    qtbot.waitUntil(lambda: out.text().endswith("picture-2.png"), timeout=WAIT_MS)
     click(qtbot, panel.show_button)
     with qtbot.waitSignal(panel.job.ended, timeout=WAIT_MS):
         pass

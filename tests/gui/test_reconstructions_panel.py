@@ -20,6 +20,7 @@ from gui.session import BenchSession
 from gui.theme import apply_theme
 from gui.widgets.dialogues import Question
 from gui.widgets.entry import NumberEdit
+from gui.widgets.plots import restyle_all
 from instrument.files.images import read_image, write_image
 from instrument.files.volumes import VolumeSource
 from instrument.reconstruction.request import VolumeRequest
@@ -105,7 +106,7 @@ def test_a_picture_by_mouse_is_written_and_shown(qtbot: QtBot, panel: Reconstruc
     assert "change" in panel.convergence.curves
     qtbot.waitUntil(lambda: panel.list.count() == 1, timeout=WAIT_MS)
     # The next one does not fall on top of it.
-    assert panel.form.text("out").endswith("photo-2.tif")
+    qtbot.waitUntil(lambda: panel.form.text("out").endswith("photo-2.tif"), timeout=WAIT_MS)
 
 
 def test_a_volume_by_mouse_and_slices_by_click(qtbot: QtBot, panel: ReconstructionsPanel, files) -> None:
@@ -457,7 +458,7 @@ def test_the_red_theme_shows_nothing_but_red(
     qtbot.waitUntil(lambda: panel.volume.projections is not None, timeout=WAIT_MS)
     apply_theme(qapp, "red")
     try:
-        panel.theme_changed()
+        restyle_all(panel)
         shown = panel.volume.coloured.image
         assert shown[..., 0].max() > 0.5
         assert shown[..., 1:].max() == 0
