@@ -41,6 +41,11 @@ class NewestOnly:
         self._wanted: dict[str, tuple[Read, Done]] = {}
         self._epoch = 0
 
+    @property
+    def is_reading(self) -> bool:
+        """Whether something is being read."""
+        return self._job is not None
+
     def ask(self, read: Read, done: Done, kind: str = "") -> None:
         """Have ``read`` called in a job's thread, then ``done`` with its result in the window's."""
         self._wanted[kind] = (read, done)
@@ -112,10 +117,7 @@ class LiveFollower:
             view.end()
         if view is not None and not view.is_running:
             self._view = None
-            try:
-                view.close()
-            except (DeviceError, BenchError, InputError) as error:
-                self.problem = in_words(error) or str(error)
+            self._close(view)
         stream = self._camera.stream
         if self._view is None and self.reconstructor is not None and stream not in (None, self._stream):
             assert stream is not None
@@ -146,7 +148,10 @@ class LiveFollower:
         with self._changing:
             view, self._view, self._stream = self._view, None, None
             if view is not None:
-                try:
-                    view.close()
-                except (DeviceError, BenchError, InputError) as error:
-                    self.problem = in_words(error) or str(error)
+                self._close(view)
+
+    def _close(self, view: LiveView) -> None:
+        try:
+            view.close()
+        except (DeviceError, BenchError, InputError) as error:
+            self.problem = in_words(error) or str(error)

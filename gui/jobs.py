@@ -309,10 +309,7 @@ class JobRunner(QObject):
 
         Also for those that have sent their last message: an interpreter that ends meanwhile aborts in Qt.
         """
-        deadline_s = time.monotonic() + timeout_s
-        for thread in self._threads:
-            thread.join(max(0.0, deadline_s - time.monotonic()))
-        return not any(thread.is_alive() for thread in self._threads)
+        return joined(self._threads, timeout_s)
 
     # Inside --------------------------------------------------------------------------------------
     def _require_free(self, lanes: Collection[str]) -> None:
@@ -384,6 +381,14 @@ class JobRunner(QObject):
         job.ended.emit()
         self.job_ended.emit(job)
         self._start_what_can()
+
+
+def joined(threads: Collection[threading.Thread], timeout_s: float) -> bool:
+    """Wait for threads; returns whether all ended in time."""
+    deadline_s = time.monotonic() + timeout_s
+    for thread in threads:
+        thread.join(max(0.0, deadline_s - time.monotonic()))
+    return not any(thread.is_alive() for thread in threads)
 
 
 def words_for(error: BaseException) -> str:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from PySide6.QtCore import QTimer
 from PySide6.QtGui import QGuiApplication
 from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
-from gui.jobs import BusyError, Job, JobRunner
+from gui.jobs import BusyError, Job, JobRunner, Work
 from gui.session import BenchSession
 from gui.session_news import name_of
 from gui.widgets.building import after_rest, button, every, fill, in_row, label, mark
 from gui.widgets.dialogues import elided
+from instrument.files.errors import BenchError
 from recon.base.declare import Imports
+from recon.errors import InputError
 
 _REFUSAL_MS = 12_000
+_T = TypeVar("_T")
 
 
 class Panel(QWidget):
@@ -85,6 +88,16 @@ class Panel(QWidget):
         self._note.clear()
         self._note.setToolTip("")
 
+    def asked(self, make: Callable[[], _T]) -> _T | None:
+        """Return what a form asks for; None, and the reason shown, where that makes no sense."""
+        try:
+            made = make()
+        except (BenchError, InputError) as error:
+            self.refused(None, str(error))
+            return None
+        self.accepted()
+        return made
+
     def follow(self, job: Job, field: QWidget | None = None) -> Job:
         """Have a job's failure shown at a field and in this panel's last line; returns the job."""
         job.failed.connect(lambda why: self.refused(field, why))
@@ -124,6 +137,17 @@ class DevicePanel(Panel):
     def look(self) -> None:
         """Show how the device is now."""
         raise NotImplementedError
+
+    def command(self, title: str, work: Work, field: QWidget | None = None) -> Job | None:
+        """Have the device do something, in a job; a refusal is shown at the field, then how the device is."""
+        job = self.begin(lambda: self.jobs.device(title, work, {self.kind}), field)
+        if job is not None:
+            job.succeeded.connect(lambda _: self._done(field))
+        return job
+
+    def _done(self, field: QWidget | None) -> None:
+        self.accepted(field)
+        self.look()
 
     def show_device(self, is_open: bool) -> None:
         """Let it be used, or not."""

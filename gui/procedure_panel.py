@@ -212,10 +212,7 @@ class ProcedurePanel(Panel):
 
     def carry_out(self, title: str, procedure: Procedure) -> None:
         """Carry out a procedure."""
-        try:
-            self.run.start(title, procedure)
-        except BusyError as error:
-            self.refused(None, str(error))
+        if self.begin(lambda: self.run.start(title, procedure)) is None:
             return
         self.accepted()
         self.use_button.hide()

@@ -185,8 +185,8 @@ class ProcedureRun(QObject):
         """Whether a procedure goes on."""
         return self._job is not None
 
-    def start(self, title: str, procedure: Procedure) -> None:
-        """Carry out a procedure.
+    def start(self, title: str, procedure: Procedure) -> Job:
+        """Carry out a procedure, in a job.
 
         Raises
         ------
@@ -204,13 +204,14 @@ class ProcedureRun(QObject):
             except EndedEarlyError as error:
                 return Ended("\n".join([str(error), *getattr(error, "__notes__", ())]))
 
-        self._job = self._session.exclusive_job(title, work)
+        self._job = job = self._session.exclusive_job(title, work)
         self._control, self._mailbox = control, mailbox
         self._job.succeeded.connect(self._succeeded)
         self._job.failed.connect(self._failed)
         self._job.cancelled.connect(self._cancelled)
         self._job.ended.connect(self._over)
         self._timer.start()
+        return job
 
     def pause(self) -> None:
         """Wait before the next step, light off."""

@@ -16,7 +16,7 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal
 from drivers.camera import Camera
 from drivers.errors import DeviceError, LimitError, StoppedError
 from drivers.frame import Frame
-from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, words_for
+from gui.jobs import BusyError, Job, JobContext, JobRunner, Work, joined, words_for
 from gui.session_news import DeviceState, LogBridge, OperatorRequest, is_gone, name_of
 from instrument.bench.bench import Bench
 from instrument.bench.config import BenchConfig, Kind
@@ -360,9 +360,7 @@ class BenchSession(QObject):
     def join(self, timeout_s: float = 5.0) -> bool:
         """Wait for all threads, after ``closed``; returns whether they ended. For the end of the program."""
         deadline_s = time.monotonic() + timeout_s
-        for thread in self._threads:
-            thread.join(max(0.0, deadline_s - time.monotonic()))
-        ended = not any(thread.is_alive() for thread in self._threads)
+        ended = joined(self._threads, timeout_s)
         return self.jobs.join(max(0.0, deadline_s - time.monotonic())) and ended
 
     def _in_thread(self, name: str, work: Callable[..., None], *arguments: object) -> None:

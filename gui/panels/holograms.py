@@ -209,12 +209,9 @@ class HologramsPanel(Panel):
         if slm is None or not self.session.is_open("slm"):
             self.refused(None, "The bench's SLM is not open: it is not known what to compute a hologram for.")
             return None
-        try:
-            order = self.order(preview=preview)
-        except (BenchError, InputError) as error:
-            self.refused(None, str(error))
+        order = self.asked(lambda: self.order(preview=preview))
+        if order is None:
             return None
-        self.accepted()
         config, size = self.session.config, (slm.shape, slm.pixel_pitch_um)
         title = "Previewing a hologram" if preview else f"Computing {order.out.name}"
 

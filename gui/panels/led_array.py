@@ -176,7 +176,7 @@ class LedPanel(DevicePanel):
             else:
                 leds.off()
 
-        self._start(f"LED array: {name}", work)
+        self.command(f"LED array: {name}", work)
 
     def dim(self) -> None:
         """Give the LEDs that are lit the chosen brightness, each in its colour; lights none that is dark."""
@@ -193,7 +193,7 @@ class LedPanel(DevicePanel):
                 leds.set_pattern(LedPattern(f"{what} at {top} of 255", lit))
                 self._dimmed = leds.pattern, hues
 
-        self._start(f"LED array: brightness {top}", work)
+        self.command(f"LED array: brightness {top}", work)
 
     def toggle(self, led: int) -> None:
         """Light an LED in the chosen colour, or darken it."""
@@ -211,24 +211,14 @@ class LedPanel(DevicePanel):
             else:
                 leds.off()
 
-        self._start(f"LED {led}", work)
-
-    def _start(self, title: str, work: Any) -> None:
-        job = self.begin(lambda: self.jobs.device(title, work, {"led_array"}))
-        if job is not None:
-            job.succeeded.connect(self._shown)
-
-    def _shown(self, _result: object) -> None:
-        self.accepted()
-        self.look()
+        self.command(f"LED {led}", work)
 
     def _clicked(self, _item: object, points: Any, _event: object) -> None:
         if len(points):
             self.toggle(int(points[0].data()))
 
     def _toggle_typed(self) -> None:
-        self.index.submit()
-        if self.index.value is not None and not self.index.property("refused"):
+        if self.index.submit() and self.index.value is not None:
             self.toggle(int(self.index.value))
 
 

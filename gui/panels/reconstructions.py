@@ -267,12 +267,9 @@ class ReconstructionsPanel(Panel):
 
     def reconstruct(self) -> Job | None:
         """Do what the form asks for; the picture so far is shown as it comes."""
-        try:
-            work = self.form.work()
-        except BenchError as error:
-            self.refused(None, str(error))
+        work = self.asked(self.form.work)
+        if work is None:
             return None
-        self.accepted()
         request = work.request
         volume = isinstance(request, VolumeRequest)
 
@@ -291,12 +288,9 @@ class ReconstructionsPanel(Panel):
 
     def explain(self) -> Job | None:
         """Say what the model ``auto`` would choose for the form, and why; nothing is reconstructed."""
-        try:
-            request = self.form.request()
-        except BenchError as error:
-            self.refused(None, str(error))
+        request = self.asked(self.form.request)
+        if request is None:
             return None
-        self.accepted()
 
         def work(context: JobContext) -> Choice:
             prepared = request.prepare()

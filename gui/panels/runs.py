@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
-from gui.jobs import BusyError, Job, JobContext
+from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
 from gui.session import BenchSession
@@ -94,7 +94,6 @@ class RunsPanel(Panel):
         self.run.succeeded.connect(
             lambda outcome: self.bar.show_end("; ".join(outcome.verdict), complete=outcome.good)
         )
-        self.run.failed.connect(lambda why: self.refused(None, why))
         self.run.over.connect(self._over)
         self.read_folder()
 
@@ -168,13 +167,9 @@ class RunsPanel(Panel):
         if self.opened is None or self.run.is_running:
             return
         path = self.opened.path
-        try:
-            self.run.start(f"Resuming {path.name}", ResumeProcedure(path))
-        except BusyError as error:
-            self.refused(None, str(error))
-            return
-        self.bar.set_running(True)
-        self.table.setEnabled(False)
+        if self.begin(lambda: self.run.start(f"Resuming {path.name}", ResumeProcedure(path))) is not None:
+            self.bar.set_running(True)
+            self.table.setEnabled(False)
 
     def take(self, path: Path) -> None:
         """Show a run that another panel hands on, and mark it in the list as soon as that is read."""

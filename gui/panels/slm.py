@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtWidgets import QCheckBox, QWidget
 
-from gui.jobs import Job
+from gui.background import NewestOnly
 from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
 from gui.widgets.building import button, fill, in_row, label
@@ -58,8 +56,9 @@ class SlmPanel(DevicePanel):
         self.table_plot.hide()
         self._shown: npt.NDArray[np.uint8] | None = None
         self._what = ""
-        self._reading: Job | None = None
-        """The newest job that reads a look-up table."""
+        self._reader = NewestOnly(
+            self.jobs, "Reading the look-up table", lambda why: self.refused(self.table_file, why)
+        )
         fill(
             self.body,
             self.now,
@@ -117,38 +116,30 @@ class SlmPanel(DevicePanel):
         correction = self.correction if self.use_table.isChecked() else None
         if slm is None:
             return
-        if self._reading is not None and not self._reading.is_over:
+        if self._reader.is_reading:
             self.refused(self.table_file, "The look-up table is still being read.")
             return
 
-        def work(_: object) -> str:
+        def work(_: object) -> None:
             levels, _facts = read_slm_image(path)
             show_levels(slm, levels, correction)
-            return path.name + (" through the look-up table" if correction else "")
+            through = " through the look-up table" if correction else ""
+            self._what, self._shown = f"{path.name}{through}", None
 
-        self._start(f"SLM: {path.name}", work, self.file)
+        self.command(f"SLM: {path.name}", work, self.file)
 
     def blank(self) -> None:
         """Show all zeros."""
         slm = self.session.bench.slm
-        if slm is None:
-            return
-
-        def work(_: object) -> str:
-            slm.blank()
-            return "blank"
-
-        self._start("SLM: blank", work, None)
+        if slm is not None:
+            self.command("SLM: blank", lambda _: slm.blank())
 
     def load_table(self) -> None:
         """Read the look-up table in the field, show it, and use it from now on."""
         path = Path(self.table_file.text().strip()).expanduser()
         self._use_table(None)
-        job = self.jobs.watch("Reading the look-up table", lambda _: load_slm_correction(path))
-        self._reading = self.follow(job, self.table_file)
-        job.succeeded.connect(
-            lambda correction: self._use_table(correction) if job is self._reading else None
-        )
+        self._reader.forget()
+        self._reader.ask(lambda: load_slm_correction(path), self._use_table)
 
     def _use_table(self, correction: SlmCorrection | None) -> None:
         self.correction = correction
@@ -159,13 +150,3 @@ class SlmPanel(DevicePanel):
             self.accepted(self.table_file)
             self.table_plot.clear()
             self.table_plot.plot(np.arange(256), correction.phase_of_level_rad, pen=curve_pen(0))
-
-    def _start(self, title: str, work: Callable[[Any], str], field: QWidget | None) -> None:
-        job = self.begin(lambda: self.session.jobs.device(title, work, {"slm"}), field)
-        if job is not None:
-            job.succeeded.connect(lambda what: self._done(what, field))
-
-    def _done(self, what: str, field: QWidget | None) -> None:
-        self._what, self._shown = what, None
-        self.accepted(field)
-        self.look()

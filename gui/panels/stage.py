@@ -10,6 +10,7 @@ from PySide6.QtGui import QFocusEvent, QKeyEvent
 from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
 from drivers.stage import StageAxis
+from gui.background import NewestOnly
 from gui.jobs import Job
 from gui.panel import DevicePanel, on_bench
 from gui.session import BenchSession
@@ -88,7 +89,7 @@ class StagePanel(DevicePanel):
         self.rows: dict[str, _Row] = {}
         self.steps: dict[str, NumberEdit] = {}
         self.question: Question | None = None
-        self._reading: Job | None = None
+        self._reader = NewestOnly(session.jobs, "Reading the stage")
         self.state = label(wraps=True)
         self.pad = JogPad(self)
         self.setFocusProxy(self.pad)
@@ -165,16 +166,8 @@ class StagePanel(DevicePanel):
     def look(self) -> None:
         """Ask the stage where it is, whatever else is going on."""
         stage = self.session.bench.stage
-        if stage is None or not self.is_ready or self._reading is not None:
-            return
-        self._reading = self.jobs.watch(
-            "Reading the stage", lambda _: (stage.position(), stage.is_homed, stage.is_moving)
-        )
-        self._reading.succeeded.connect(self._show)
-        self._reading.ended.connect(self._looked)
-
-    def _looked(self) -> None:
-        self._reading = None
+        if stage is not None and self.is_ready and not self._reader.is_reading:
+            self._reader.ask(lambda: (stage.position(), stage.is_homed, stage.is_moving), self._show)
 
     def _show(self, reading: tuple[dict[str, float], bool, bool]) -> None:
         position, is_homed, is_moving = reading
@@ -227,10 +220,7 @@ class StagePanel(DevicePanel):
         stage = self.session.bench.stage
         assert stage is not None
         move = stage.move_by if relative else stage.move_to
-        job = self.begin(lambda: self.session.jobs.device(title, lambda _: move(where), {"stage"}))
-        if job is not None:
-            job.succeeded.connect(lambda _: self.accepted())
-        return job
+        return self.command(title, lambda _: move(where))
 
     def ask_home(self) -> None:
         """Ask whether the stage may be homed, then do it."""
@@ -251,9 +241,7 @@ class StagePanel(DevicePanel):
         self.question = None
         stage = self.session.bench.stage
         if agreed and stage is not None:
-            self.begin(
-                lambda: self.session.jobs.device("Homing the stage", lambda _: stage.home(), {"stage"})
-            )
+            self.command("Homing the stage", lambda _: stage.home())
 
 
 def _words(unit: str) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PySide6.QtWidgets import QLineEdit, QProgressBar, QWidget
 
 from drivers.camera import Camera, Roi
+from gui.background import NewestOnly
 from gui.forms.fields import Behaviour, ChoiceField, NumberField
 from gui.forms.options_form import OptionsForm
 from gui.jobs import BusyError, Job, JobContext
@@ -176,7 +176,7 @@ class RecordBar(QWidget):
         self._session = panel.session
         self._recorder: Recorder | None = None
         self.job: Job | None = None
-        self._looking: Job | None = None
+        self._reader = NewestOnly(panel.jobs, "Looking at the disk", self._not_known)
         self._asked_s = 0.0
         tip = "Record every frame to the disk; again ends it (Ctrl+R)"
         self.button = button("● Record", tip, self.toggle)
@@ -260,26 +260,21 @@ class RecordBar(QWidget):
 
     def _look_at_disk(self) -> None:
         """Ask how full the disk is, in a job: one of a server that is silent would hold the window up."""
-        if self._looking is not None:
+        if self._reader.is_reading:
             if time.monotonic() - self._asked_s > _SILENT_S:
                 self._not_known(f"{self._session.runs_folder}: its disk has not answered yet.")
             return
         folder = self._session.runs_folder
         self._asked_s = time.monotonic()
-        self._looking = job = self._session.jobs.watch("Looking at the disk", lambda _: _disk_of(folder))
-        job.succeeded.connect(self._show_disk)
-        job.failed.connect(self._not_known)
-        job.ended.connect(self._looked)
+        self._reader.ask(lambda: _disk_of(folder), self._show_disk)
 
-    def _looked(self) -> None:
-        self._looking = None
-
-    def _show_disk(self, disk: _Disk) -> None:
-        if disk.problem:
-            self._not_known(disk.problem)
+    def _show_disk(self, disk: tuple[float, int] | str) -> None:
+        if isinstance(disk, str):
+            self._not_known(disk)
             return
-        self.gauge.setValue(round(1000 * disk.full))
-        self.gauge.setFormat(f"{size(disk.free)} free")
+        full, free = disk
+        self.gauge.setValue(round(1000 * full))
+        self.gauge.setFormat(f"{size(free)} free")
         self.gauge.setToolTip(f"How full the disk is that holds {self._session.runs_folder}")
 
     def _not_known(self, why: str) -> None:
@@ -288,23 +283,15 @@ class RecordBar(QWidget):
         self.gauge.setToolTip(why)
 
 
-@dataclass(frozen=True, slots=True)
-class _Disk:
-    """A disk's full share and free bytes, or why they are not known."""
-
-    full: float = 0.0
-    free: int = 0
-    problem: str = ""
-
-
-def _disk_of(folder: Path) -> _Disk:
+def _disk_of(folder: Path) -> tuple[float, int] | str:
+    """Return a disk's full share and its free bytes, or why they are not known."""
     try:
         free = free_bytes(folder)
         total = shutil.disk_usage(there_now(folder)).total
     except OSError as error:  # no such place, a drive taken away
-        return _Disk(problem=f"{folder}: {error.strerror or error}")
+        return f"{folder}: {error.strerror or error}"
     except FileError as error:
-        return _Disk(problem=str(error))
+        return str(error)
     if not total:  # as some file systems of servers and user space have it
-        return _Disk(problem=f"{folder}: its file system gives no size.")
-    return _Disk(1 - free / total, free)
+        return f"{folder}: its file system gives no size."
+    return 1 - free / total, free
