@@ -179,11 +179,11 @@ class ReconstructionsPanel(Panel):
                 self.export_to(target, overwrite=True, views=views)
 
         def looked(present: list[str]) -> None:
-            if not present:
+            if present:
+                text = f"{', '.join(present)}: exists already. Replace it?"
+                Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
+            elif self._still_shown(result):
                 self.export_to(target, views=views)
-                return
-            text = f"{', '.join(present)}: exists already. Replace it?"
-            Question(self, "Replace?", text, ("Replace", "Keep"), answered).ask()
 
         files = list(views or (target,))
         look = self.jobs.watch("Looking for files", lambda _: [file.name for file in files if file.exists()])

@@ -359,6 +359,7 @@ def test_another_result_is_not_exported_under_the_name_of_the_first(
     dialogue.fileSelected.emit(str(target))
     dialogue.close()
     if opened_during == "the question":
+        qtbot.waitUntil(lambda: bool(panel.findChildren(Question)), timeout=WAIT_MS)
         (question,) = panel.findChildren(Question)
         show("second")
         (replace,) = (button for button in question.buttons() if button.text() == "Replace")
@@ -380,6 +381,7 @@ def test_the_views_exported_are_those_that_were_asked_about(
     (dialogue,) = panel.findChildren(QFileDialog)
     dialogue.fileSelected.emit(str(tmp_path / "view.png"))
     dialogue.close()
+    qtbot.waitUntil(lambda: bool(panel.findChildren(Question)), timeout=WAIT_MS)
     (question,) = panel.findChildren(Question)
     panel.volume.set_mode("slices")  # by a key, behind the question
     (replace,) = (button for button in question.buttons() if button.text() == "Replace")
