@@ -16,7 +16,6 @@ from PySide6.QtWidgets import QSlider, QTableWidget, QWidget
 from calibration_routines.plan_procedures import ResumeProcedure, lacks_result
 from calibration_routines.psf.sweep_plan import SWEEP
 from gui.background import NewestOnly
-from gui.jobs import Job, JobContext
 from gui.panel import Panel
 from gui.procedure_run import ProcedureRun, RunBar, script
 from gui.session import BenchSession
@@ -76,8 +75,7 @@ class RunsPanel(Panel):
         self._stored: list[int] = []
         self._can_resume = False
         self._reader = NewestOnly(session.jobs, "Reading a run")
-        self._listing: Job | None = None
-        self._again = False
+        self._lister = NewestOnly(session.jobs, "Reading the list of runs")
         self._wanted: Path | None = None
         self._make_list()
         self._make_details()
@@ -100,23 +98,14 @@ class RunsPanel(Panel):
     # The list ------------------------------------------------------------------------------------
     def read_folder(self) -> None:
         """Read the folder of runs again, in a job."""
-        if self._listing is not None:
-            self._again = True
-            return
         folder = self.session.runs_folder
         if folder.is_dir() and str(folder) not in self._watcher.directories():
             self._watcher.addPath(str(folder))
 
-        def work(context: JobContext) -> list[RunSummary]:
-            summaries = []
-            for path in reversed(run_paths(folder)):
-                context.check()
-                summaries.append(summary(path))
-            return summaries
+        def read() -> list[RunSummary]:  # not to its end where the program ends
+            return [summary(path) for path in reversed(run_paths(folder)) if not self.session.is_closing]
 
-        self._listing = self.jobs.watch("Reading the list of runs", work)
-        self._listing.succeeded.connect(self._show_list)
-        self._listing.ended.connect(self._listed)
+        self._lister.ask(read, self._show_list)
 
     def open_run(self, path: Path) -> None:
         """Show a run, as soon as it is read."""
@@ -227,12 +216,6 @@ class RunsPanel(Panel):
         if chosen >= 0 and self._wanted is not None:
             self._wanted = None
             self.open_run(summaries[chosen].path)
-
-    def _listed(self) -> None:
-        self._listing = None
-        if self._again:
-            self._again = False
-            self.read_folder()
 
     def _row_chosen(self, row: int) -> None:
         if 0 <= row < len(self.summaries) and not self.run.is_running:

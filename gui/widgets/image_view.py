@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -292,6 +293,11 @@ def step_factor(event: QKeyEvent) -> float:
     if event.modifiers() & Qt.KeyboardModifier.ShiftModifier:
         return 10.0
     return 0.1 if event.modifiers() & Qt.KeyboardModifier.ControlModifier else 1.0
+
+
+def whole_steps(steps: float) -> int:
+    """Return whole pixels or voxels for a step by keys: at least one."""
+    return int(math.copysign(max(1, round(abs(steps))), steps)) if steps else 0
 
 
 class ArrowKeys(QObject):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pyqtgraph as pg
@@ -12,7 +11,7 @@ from PySide6.QtWidgets import QWidget
 from drivers.frame import Frame
 from gui.theme import NAMES, colours
 from gui.widgets.building import button, choice, fill, in_row
-from gui.widgets.image_view import ImageView
+from gui.widgets.image_view import ImageView, whole_steps
 from gui.widgets.plots import HistogramPlot, curve_pen, plot_widget
 from instrument.live.frame_view import histogram, line_profile, percentiles
 
@@ -54,10 +53,7 @@ class CrossHair(QObject):
         if self.pixel is None or self._view.image is None:
             return
         height, width = self._view.image.shape[:2]
-        column, row = (
-            place + (int(math.copysign(max(1, round(abs(by))), by)) if by else 0)
-            for place, by in zip(self.pixel, (across, down), strict=True)
-        )
+        column, row = (place + whole_steps(by) for place, by in zip(self.pixel, (across, down), strict=True))
         self.move_to(min(max(column, 0), width - 1), min(max(row, 0), height - 1))
 
     def move_to(self, column: int, row: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -17,7 +16,7 @@ from gui.background import NewestOnly
 from gui.jobs import Job, JobContext, JobRunner
 from gui.theme import colours
 from gui.widgets.building import button, fill, in_row, label
-from gui.widgets.image_view import StretchedImage
+from gui.widgets.image_view import StretchedImage, whole_steps
 from gui.widgets.plots import LevelsBar, curve_pen, plot_widget
 from instrument.files.volumes import Plane, VolumeSource
 from instrument.reconstruction.result_figures import Projections, grey, in_colour_of_depth, project
@@ -232,7 +231,7 @@ class VolumeView(QWidget):
 
         def moved(across: float, down: float) -> None:
             if self.mode == "slices":
-                plane, row, column = step(_voxels(across), _voxels(down))
+                plane, row, column = step(whole_steps(across), whole_steps(down))
                 self.go_to(self.point[0] + plane, self.point[1] + row, self.point[2] + column)
 
         view.keys.moved.connect(moved)
@@ -352,11 +351,6 @@ class VolumeView(QWidget):
 
     def _depth_words(self, plane: int) -> str:
         return "" if self._planes is None else f", {self._planes[0][plane] / 1000:.4g} mm"
-
-
-def _voxels(steps: float) -> int:
-    """Return whole voxels for a step by keys: at least one."""
-    return int(math.copysign(max(1, round(abs(steps))), steps)) if steps else 0
 
 
 def _line(view: StretchedImage, angle: int) -> Any:
