@@ -299,18 +299,16 @@ class HologramsPanel(Panel):
         except BenchError:
             return  # refused at its field
         self._suggest_out()
-        shown = self._target_shown
 
         def read() -> tuple[object, npt.NDArray[Any]] | str | None:
             try:
                 wanted = (path, path.stat().st_mtime_ns, fit, srgb)
-                if wanted == shown:
+                if wanted == self._target_shown:
                     return None
                 return wanted, field_picture(read_image(path).pixels, fit=fit, srgb=srgb)
             except (BenchError, InputError, OSError) as error:
                 return str(error)
 
-        self._reader.forget()  # another picture is on its way
         self._reader.ask(read, self._target_read)
 
     def _target_read(self, read: tuple[object, npt.NDArray[Any]] | str | None) -> None:

@@ -282,7 +282,7 @@ def test_the_copied_lines_show_the_same_levels_until_enter(
 def test_the_copied_lines_bring_the_stage_to_the_same_place(
     stage: StagePanel, bench_text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stage._timer.stop()
+    stage.shutdown()
     stage.rows["x_um"].target.set_value(250.0)
     place = run_copied(stage, bench_text, monkeypatch, lambda bench: bench.source_mount.stage.position())
     assert place["x_um"] == pytest.approx(250.0, abs=20)
