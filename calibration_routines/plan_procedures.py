@@ -77,7 +77,11 @@ class ResumeProcedure(Procedure):
             listener.step(found.label)
             control.follow(runner)
             found = runner.execute()
-        return finished(found, bench, control, listener) or run_outcome(found)
+        frames = run_outcome(found)
+        if found.condition is RunCondition.COMPLETED and lacks_result(self.run):
+            for words in frames.verdict:
+                listener.said(words)
+        return finished(found, bench, control, listener) or frames
 
 
 def routine_of(run: Path) -> Routine | None:
