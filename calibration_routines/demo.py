@@ -245,28 +245,18 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What the demo made and how good it is.
-
-    Attributes
-    ----------
-    folder : Path
-    measured : Measured
-    reconstruction : Reconstruction
-    comparison : Comparison
-        Of the reconstruction with the ground truth, inside the picture on the screen.
-    seconds : dict
-        Seconds of each stage.
-    files : dict
-        What it is, and where.
-    """
+    """What the demo made and how good it is."""
 
     folder: Path
     settings: DemoSettings
     measured: Measured
     reconstruction: Reconstruction
     comparison: Comparison
+    """Of the reconstruction with the ground truth, inside the picture on the screen."""
     seconds: dict[str, float]
+    """Seconds of each stage."""
     files: dict[str, Path]
+    """What it is, and where."""
 
 
 def run_demo(

@@ -204,28 +204,20 @@ def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) ->
 
 @dataclass(frozen=True, slots=True)
 class SpotLook:
-    """One picture of spots: each a hypothesis, and how bright it turned out.
-
-    Attributes
-    ----------
-    frame : ndarray, float64, (height, width)
-        Camera counts a millisecond, background subtracted.
-    rows, columns : ndarray, float64, (n,)
-        Where the spots are looked for, camera pixels.
-    spots : tuple of Spot
-        Places in the field of view, and the poses they were computed for.
-    brightness : ndarray, float64, (n,)
-        In units of an ideal spot; for sections' spots all of their light, in arbitrary units.
-    of_whole_slm : bool
-        Whether each spot is made by the whole SLM, not by a section of it.
-    """
+    """One picture of spots: each a hypothesis, and how bright it turned out."""
 
     frame: Array
+    """Float64, (height, width): camera counts a millisecond, background subtracted."""
     rows: Array
     columns: Array
+    """Float64, (n,): where the spots are looked for, camera pixels."""
     spots: tuple[Spot, ...]
+    """Places in the field of view, and the poses they were computed for."""
     brightness: Array
+    """Float64, (n,): in units of an ideal spot; for sections' spots all of their light, in arbitrary
+    units."""
     of_whole_slm: bool
+    """Whether each spot is made by the whole SLM, not by a section of it."""
 
 
 class SpotCamera:

@@ -156,20 +156,13 @@ class AlignmentSession:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A pose as measured.
-
-    Attributes
-    ----------
-    pose : Pose
-    error : ndarray, float64, (8,)
-        Standard uncertainty of each parameter.
-    efficiency : float
-        Brightness of spots at the pose that was probed last, over the model's ideal.
-    """
+    """A pose as measured."""
 
     pose: Pose
     error: npt.NDArray[np.float64]
+    """(8,): standard uncertainty of each parameter."""
     efficiency: float
+    """Brightness of spots at the pose that was probed last, over the model's ideal."""
 
 
 def refine_pose(

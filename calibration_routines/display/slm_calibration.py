@@ -37,24 +37,15 @@ _FLATNESS_FRAMES = 22
 
 @dataclass(frozen=True, slots=True)
 class SlmCalibration:
-    """What was measured.
-
-    Attributes
-    ----------
-    correction : SlmCorrection
-    levels : ndarray, int, (n,)
-        Grey levels measured.
-    phases_rad : ndarray, float64, (n,)
-        Their phases.
-    flatness_rms_rad : float or None
-        Of the flatness error found; None when it was not measured.
-    frames : int
-    """
+    """What was measured."""
 
     correction: SlmCorrection
     levels: npt.NDArray[np.int64]
+    """(n,): grey levels measured."""
     phases_rad: npt.NDArray[np.float64]
+    """(n,): their phases."""
     flatness_rms_rad: float | None
+    """Of the flatness error found; None when it was not measured."""
     frames: int
 
 

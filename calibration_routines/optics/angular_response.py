@@ -41,21 +41,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Response along one axis.
-
-    Attributes
-    ----------
-    angles_deg : tuple of float
-        Ascending, of both signs: where the light comes from.
-    response : tuple of float
-        Relative to the axis.
-    seen : tuple of float
-        Part of the pattern that the sensor still showed.
-    """
+    """Response along one axis."""
 
     angles_deg: tuple[float, ...]
+    """Ascending, of both signs: where the light comes from."""
     response: tuple[float, ...]
+    """Relative to the axis."""
     seen: tuple[float, ...]
+    """Part of the pattern that the sensor still showed."""
 
     def cut_offs_deg(self, level: float = CUT_OFF) -> tuple[float | None, float | None]:
         """Return where the response falls to ``level`` on the negative and the positive side; None: nowhere.
@@ -103,20 +96,12 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class AngularResponse:
-    """Response of the sensor to light from the side.
-
-    Attributes
-    ----------
-    along_x, along_y : Curve
-    findings : tuple of str
-        What is to be doubted; empty when all went well.
-    bench : str
-    simulated : bool
-    """
+    """Response of the sensor to light from the side."""
 
     along_x: Curve
     along_y: Curve
     findings: tuple[str, ...] = ()
+    """What is to be doubted; empty when all went well."""
     bench: str = ""
     simulated: bool = False
 

@@ -87,26 +87,17 @@ class DpcSetup(Checked):
 
 @dataclass(frozen=True)
 class DiffuserSurface:
-    """What was measured.
-
-    Attributes
-    ----------
-    height_um : ndarray, float32, (height, width)
-        Relative to the plane that fits best.
-    phase_rad : ndarray, float32, (height, width)
-    pitch_um : float
-        In the sample.
-    slope_deg, deflection_deg : ndarray, float64, (height, width)
-        Magnitudes of the surface's slope, and of a normal ray's deflection.
-    bench : str
-    simulated : bool
-    """
+    """What was measured."""
 
     height_um: Image
+    """(height, width): relative to the plane that fits best."""
     phase_rad: Image
+    """(height, width)."""
     pitch_um: float
+    """In the sample."""
     slope_deg: npt.NDArray[np.float64]
     deflection_deg: npt.NDArray[np.float64]
+    """(height, width): magnitudes of the surface's slope, and of a normal ray's deflection."""
     bench: str = ""
     simulated: bool = False
 

@@ -32,30 +32,21 @@ _NOISE_PX = 250_000
 
 @dataclass(frozen=True, slots=True)
 class PlaneFrames:
-    """The raw frames of one point of a sweep.
-
-    Attributes
-    ----------
-    source_um : (x, y, z)
-        Where the stage said the source was.
-    exposure_ms : float
-    frames : ndarray, uint8 or uint16, (n_frames, height, width) or (n_frames, height, width, 3)
-        All of the same light.
-    full_scale : int
-        The largest count the camera can report.
-    off_axis : bool
-        Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the pattern.
-    brightness : float
-        The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
-        PSF.
-    """
+    """The raw frames of one point of a sweep."""
 
     source_um: tuple[float, float, float]
+    """(x, y, z): where the stage said the source was."""
     exposure_ms: float
     frames: Counts
+    """Uint8 or uint16, (n_frames, height, width) or (n_frames, height, width, 3): all of the same light."""
     full_scale: int
+    """The largest count the camera can report."""
     off_axis: bool = False
+    """Whether another point of the same depth is nearer to the axis: the sensor's edge may cut the
+    pattern."""
     brightness: float = 1.0
+    """The source's, relative to its brightness at the sweep's first visit to the reference: taken out of the
+    PSF."""
 
 
 class DarkModel:
@@ -92,19 +83,14 @@ class DarkModel:
 
 @dataclass(frozen=True, slots=True)
 class SweepAnalysis:
-    """PSFs with what was found out about them, sorted as the planes came.
-
-    Attributes
-    ----------
-    psfs : ndarray, float32, (n_planes, n_channels, height, width)
-        Non-negative, in counts at ``reference_exposure_ms``, so that planes compare in brightness.
-    background : ndarray, float32, (n_channels, height, width)
-        What was subtracted at the reference exposure, mean over the planes: dark frame and stray light.
-    quality : tuple of PsfQuality
-    """
+    """PSFs with what was found out about them, sorted as the planes came."""
 
     psfs: Float
+    """(n_planes, n_channels, height, width): non-negative, in counts at ``reference_exposure_ms``,
+    so that planes compare in brightness."""
     background: Float
+    """(n_channels, height, width): what was subtracted at the reference exposure, mean over the
+    planes: dark frame and stray light."""
     quality: tuple[PsfQuality, ...]
     reference_exposure_ms: float
     stages: tuple[StageFit, ...] = ()

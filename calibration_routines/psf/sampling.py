@@ -137,21 +137,14 @@ _REACH_MARGIN = 0.98  # of the stage's travel
 
 @dataclass(frozen=True, slots=True)
 class GridSweep:
-    """The points of a sweep and why they lie where they do.
-
-    Attributes
-    ----------
-    points_um : tuple of (x, y, z)
-        Nearest depth first; within a depth row by row, every other row backwards.
-    reasons : tuple of str
-        What the numbers come from, in words.
-    shapes : tuple of (int, int)
-        Points along y and x at each depth.
-    """
+    """The points of a sweep and why they lie where they do."""
 
     points_um: tuple[Position, ...]
+    """Nearest depth first; within a depth row by row, every other row backwards."""
     reasons: tuple[str, ...]
+    """What the numbers come from, in words."""
     shapes: tuple[tuple[int, int], ...]
+    """Points along y and x at each depth."""
 
 
 def grid_sweep(

@@ -66,31 +66,20 @@ _INTERRUPTIONS = (KeyboardInterrupt, SystemExit, EndedEarlyError)
 
 @dataclass(frozen=True, slots=True)
 class SweepCalibration:
-    """A finished sweep.
-
-    Attributes
-    ----------
-    calibration : Calibration
-    path : Path
-        The calibration's folder, inside the first run's folder.
-    quality : tuple of PsfQuality
-        One a PSF.
-    runs : tuple of Run
-        The sweep, and one more for each round of retakes.
-    exposures : SweepExposures
-    stages : tuple of StageFit
-        For each depth with several points: measured shifts against the stage's.
-    drift : Drift or None
-        The source at the reference point; None for a sweep too short to have one.
-    """
+    """A finished sweep."""
 
     calibration: Calibration
     path: Path
+    """The calibration's folder, inside the first run's folder."""
     quality: tuple[PsfQuality, ...]
+    """One a PSF."""
     runs: tuple[Run, ...]
+    """The sweep, and one more for each round of retakes."""
     exposures: SweepExposures
     stages: tuple[StageFit, ...] = ()
+    """For each depth with several points: measured shifts against the stage's."""
     drift: Drift | None = None
+    """The source at the reference point; None for a sweep too short to have one."""
 
     @property
     def findings(self) -> tuple[str, ...]:

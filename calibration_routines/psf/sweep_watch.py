@@ -57,55 +57,37 @@ _SLACK = MAX_GAIN_ERROR + 1e-3 * MAX_ROTATION_MRAD  # of a shift: what a wrong d
 
 @dataclass(frozen=True, slots=True)
 class PointTaken:
-    """A PSF has been taken and judged.
-
-    Attributes
-    ----------
-    number, total : int
-        Which point of the sweep, from 1, and how many there are.
-    take : int
-        1, and more for what was taken again.
-    quality : PsfQuality
-        So far: lengths in pixels of the PSFs; the whole sweep may tell more when it is over.
-    exposure_ms : float
-    retaking : bool
-        Whether it is taken again at once.
-    image : ndarray, float32, (height, width)
-        The PSF without its dark frame, counts, colours averaged, binned to half a megapixel at most.
-    """
+    """A PSF has been taken and judged."""
 
     number: int
     total: int
+    """Which point of the sweep, from 1, and how many there are."""
     take: int
+    """1, and more for what was taken again."""
     quality: PsfQuality
+    """So far: lengths in pixels of the PSFs; the whole sweep may tell more when it is over."""
     exposure_ms: float
     retaking: bool
+    """Whether it is taken again at once."""
     image: Float
+    """(height, width): the PSF without its dark frame, counts, colours averaged, binned to half a
+    megapixel at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceVisit:
-    """The source has been at the reference point again.
-
-    Attributes
-    ----------
-    number : int
-        From 1, the first, which the others are held against.
-    before_point : int
-        Points of the sweep that had been taken before.
-    brightness : float
-        Light received, relative to the first visit.
-    shift_px : float
-        Distance of the pattern from its place at the first visit, pixels of the camera.
-    findings : tuple of str
-        What changed since the visit before; empty when the source stayed what it was.
-    """
+    """The source has been at the reference point again."""
 
     number: int
+    """From 1, the first, which the others are held against."""
     before_point: int
+    """Points of the sweep that had been taken before."""
     brightness: float
+    """Light received, relative to the first visit."""
     shift_px: float
+    """Distance of the pattern from its place at the first visit, pixels of the camera."""
     findings: tuple[str, ...]
+    """What changed since the visit before; empty when the source stayed what it was."""
 
 
 SweepEvent = PointTaken | SourceVisit
