@@ -98,10 +98,7 @@ def lacks_result(run: Path) -> bool:
 def finished(run: Run, bench: Bench | None, control: RunControl, listener: Listener) -> Outcome | None:
     """Make the result of a routine's run that lacks it; None for every other run.
 
-    Raises
-    ------
-    RunEndedError
-        When the run is not complete.
+    Raises RunEndedError when the run is not complete.
     """
     routine = routine_of(run.path)
     if routine is None or routine.finish is None or not lacks_result(run.path):

@@ -192,10 +192,7 @@ class Procedure(ABC):
         folder : Path, optional
             Where runs go; the bench's data folder by default.
 
-        Raises
-        ------
-        SettingsError, PlanError, BenchError
-            When it cannot be done as asked.
+        Raises SettingsError, PlanError, BenchError when it cannot be done as asked.
         """
 
     def carry_out(
@@ -208,12 +205,8 @@ class Procedure(ABC):
     ) -> Outcome:
         """Check it, then do it; the light is off and nothing moves when this returns or raises.
 
-        Raises
-        ------
-        EndedEarlyError, RunEndedError
-            When it was aborted or stopped; what was taken is kept.
-        BenchError, DeviceError
-            When it cannot be done or a device fails.
+        Raises EndedEarlyError, RunEndedError when it was aborted or stopped (what was taken is kept);
+        BenchError, DeviceError when it cannot be done or a device fails.
         """
         self.outlook(bench, folder)
         control = control or RunControl()

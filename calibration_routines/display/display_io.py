@@ -125,12 +125,7 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
 
     An empty place moves nothing.
 
-    Raises
-    ------
-    BenchError
-        When there is a place and no stage.
-    DeviceError
-        When the stage refuses or fails.
+    Raises BenchError when there is a place and no stage; DeviceError when the stage refuses or fails.
     """
     if not place:
         return
@@ -150,10 +145,7 @@ def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     float
         Counts a millisecond of the mean intensity.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
+    Raises InputError when the speckle is not recognised.
     """
     camera = io.bench.camera
     pitch_um = camera.pixel_pitch_um * camera.binning
@@ -261,10 +253,7 @@ class SpotCamera:
 
         The first time a frame of random phases tells how bright the mean intensity is.
 
-        Raises
-        ------
-        InputError
-            When the speckle is not recognised.
+        Raises InputError when the speckle is not recognised.
         """
         self._before_frame()
         self.camera, blank_per_ms = find_camera(self.io, self.display)

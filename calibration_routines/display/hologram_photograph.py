@@ -207,12 +207,7 @@ def photograph_hologram(
     progress : callable, optional
         ``progress(round, psnr_db)``.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
-    DeviceError
-        When a device fails.
+    Raises InputError when the speckle is not recognised; DeviceError when a device fails.
     """
     options = options or CaptureOptions()
     seen = HologramCamera.registered(io, display)

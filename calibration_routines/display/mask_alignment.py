@@ -124,12 +124,9 @@ class MaskAlignment:
     def run(self) -> AlignmentReport:
         """Align; returns what was found and leaves the stage at the best pose.
 
-        Raises
-        ------
-        AlignmentFailedError
-            When the pose was not found or too many frames would be needed. The stage is back where it was.
-        DeviceError
-            When a device fails or a move is refused; the stage stays where it is.
+        Raises AlignmentFailedError when the pose was not found or too many frames would be needed, with
+        the stage back where it was; DeviceError when a device fails or a move is refused, with the stage
+        where that left it.
         """
         stage = self.io.bench.stage
         start = stage.commanded_position() if stage is not None else {}

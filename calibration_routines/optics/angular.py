@@ -139,10 +139,7 @@ def farthest_um(bench: Bench, largest_deg: float) -> float:
 
     The farther the source, the narrower the range of angles within the aperture.
 
-    Raises
-    ------
-    BenchError
-        When there is no stage, or even its nearest distance is too far for the angle.
+    Raises BenchError when there is no stage, or even its nearest distance is too far for the angle.
     """
     reach, (low, high) = _reach(bench)
     z_um = min(_REACH_MARGIN * reach / float(np.tan(np.deg2rad(largest_deg))), high)
@@ -157,12 +154,7 @@ def farthest_um(bench: Bench, largest_deg: float) -> float:
 def check_angular(bench: Bench, sweep: AngularSweep, folder: Path | None = None) -> Plan:
     """Refuse what is out of the stage's reach or does not fit the disk, before anything moves; the plan.
 
-    Raises
-    ------
-    BenchError
-        When the stage does not reach so far; says which angle it reaches from there.
-    PlanError
-        When something else of the plan cannot be done.
+    Raises BenchError when the stage does not reach so far (which angle it reaches is said); PlanError when something else of the plan cannot be done.
     """
     reach, (low, high) = _reach(bench)
     z_um = sweep.distance_um
@@ -218,10 +210,7 @@ ANGULAR = Purpose(
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Compute the response from a complete run, and save it with its picture in its folder.
 
-    Raises
-    ------
-    CalibrationError
-        When too little can be seen.
+    Raises CalibrationError when too little can be seen.
     """
     listener.step("analysing")
     record = ANGULAR.read(run.path)

@@ -145,10 +145,7 @@ def save_response(response: AngularResponse, file: Path) -> Path:
 def load_response(file: Path | str) -> AngularResponse:
     """Read what :func:`save_response` wrote.
 
-    Raises
-    ------
-    FileError
-        When the file cannot be read or is something else.
+    Raises FileError when the file cannot be read or is something else.
     """
     data = _RESPONSE.read(Path(file))
     with _RESPONSE.damaged(Path(file)):
@@ -180,10 +177,7 @@ def analyse_angular(
     findings, bench, simulated
         Kept with the result.
 
-    Raises
-    ------
-    CalibrationError
-        When fewer than three angles along x or y could be measured.
+    Raises CalibrationError when fewer than three angles along x or y could be measured.
     """
     axis_image = np.asarray(images[0], np.float64)
     axis_bare = axis_image / _geometric(points_um[0], axis_image.shape, pitch_um, distance_um, emission)

@@ -125,10 +125,7 @@ def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
 def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
     """Return the plan: dark frames, then the four halves.
 
-    Raises
-    ------
-    BenchError
-        When the array does not reach beyond the objective's aperture.
+    Raises BenchError when the array does not reach beyond the objective's aperture.
     """
     na, rgb = _illumination_na(array, setup), _rgb(setup)
     lights = [Light.of(HalfCircle(side, na).on(array, rgb)) for side in SIDES]
@@ -172,10 +169,7 @@ _RESULT = RecordFormat("diffuserbench dpc", "diffuser's surface")
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Compute the surface from a complete run, and save it with its picture in its folder.
 
-    Raises
-    ------
-    CalibrationError
-        When a half saturates.
+    Raises CalibrationError when a half saturates.
     """
     listener.step("analysing")
     record = DPC.read(run.path)
@@ -211,10 +205,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
 def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
     """Return the optics that the phase is computed with.
 
-    Raises
-    ------
-    BenchError
-        As :func:`dpc_plan`.
+    Raises BenchError as :func:`dpc_plan`.
     """
     array = _array(bench)
     sines = array.led_na

@@ -99,12 +99,7 @@ def photograph(
         To pause, abort or stop the run from another thread.
     listener : Listener, optional
 
-    Raises
-    ------
-    PlanError, DeviceError, RunError
-        See :func:`instrument.runs.acquire.acquire`.
-    CalibrationError
-        When the run was ended before its last frame.
+    Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its last frame.
     """
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:
@@ -182,10 +177,7 @@ def fit_field_response(
     light : sequence of float
         Total counts above dark for each.
 
-    Raises
-    ------
-    CalibrationError
-        When the places do not determine the fit or a source was not seen.
+    Raises CalibrationError when the places do not determine the fit or a source was not seen.
     """
     x, y, z = np.array(sources_um, np.float64).T
     counts = np.array(light, np.float64)
@@ -233,12 +225,8 @@ def measure_field_response(
         Frames a place.
     listener : Listener, optional
 
-    Raises
-    ------
-    PlanError
-        When a place is out of reach; nothing moved.
-    CalibrationError
-        When the sensor's edge cuts the pattern at one of the places, or the run ended early.
+    Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
+    cuts the pattern at one of the places, or the run ended early.
     """
     half_y, half_x = half_field_um
     places = (

@@ -118,10 +118,7 @@ def analyse_sweep(
     binning : int
         Blocks of ``binning x binning`` pixels are averaged, after hot pixels were replaced.
 
-    Raises
-    ------
-    ValueError
-        When there is no plane, or the frames' shapes differ.
+    Raises ValueError when there is no plane, or the frames' shapes differ.
     """
     psfs: list[Float] = []
     quality: list[PsfQuality] = []
@@ -160,10 +157,7 @@ def analyse_sweep(
 def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
     """Return the mean of a point's frames without dark frame and hot pixels, float32 counts.
 
-    Raises
-    ------
-    ValueError
-        When the dark frames have another shape.
+    Raises ValueError when the dark frames have another shape.
     """
     dark_frame = dark.at(plane.exposure_ms)
     if dark_frame.shape != plane.frames.shape[1:]:

@@ -92,10 +92,7 @@ def axial_planes(
     wavelength_nm : float, optional
         For Eq. 5.10; the geometry's by default.
 
-    Raises
-    ------
-    BenchError
-        When what is needed is not known.
+    Raises BenchError when what is needed is not known.
     """
     if not 0 < z_min_um < z_max_um:
         raise BenchError(
@@ -174,11 +171,8 @@ def grid_sweep(
     x_um, y_um : float
         The grid's centre.
 
-    Raises
-    ------
-    BenchError
-        When a number makes no sense, the geometry is not known, there is no stage, or the grid would be too
-        large.
+    Raises BenchError when a number makes no sense, the geometry is not known, there is no stage, or the grid
+    would be too large.
     """
     _check_numbers(depths_um, half_field_um, spacing_um, (x_um, y_um))
     points: list[Position] = []

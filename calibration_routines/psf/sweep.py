@@ -122,12 +122,8 @@ def calibrate_sweep(
     SweepCalibration
         ``findings`` is empty when every PSF is good.
 
-    Raises
-    ------
-    PlanError, SettingsError
-        When the sweep leaves the limits of the bench or the disk; nothing moved.
-    CalibrationError
-        When no exposure is usable, or the run was ended before its last frame.
+    Raises PlanError, SettingsError when the sweep leaves the limits of the bench or the disk (nothing moved);
+    CalibrationError when no exposure is usable, or the run was ended before its last frame.
     """
     control, listener = control or RunControl(), listener or Listener()
     where = Path(folder) if folder is not None else None
@@ -164,10 +160,7 @@ def watch_resumed(bench: Bench, runner: Runner, listener: Listener) -> None:
     listener : Listener
         Its ``event`` is not called for what was taken before.
 
-    Raises
-    ------
-    CalibrationError
-        When the run is no sweep.
+    Raises CalibrationError when the run is no sweep.
     """
     record = SWEEP.read(runner.path)
     watch = SweepWatch(record.sweep, record.geometry)
@@ -197,12 +190,8 @@ def finish_sweep(
     control, listener : optional
         As :func:`calibrate_sweep`.
 
-    Raises
-    ------
-    CalibrationError
-        When the run is no sweep or is not complete.
-    CalibrationFileError
-        When it has its calibration already.
+    Raises CalibrationError when the run is no sweep or is not complete; CalibrationFileError when it has its
+    calibration already.
     """
     record = SWEEP.read(Path(run))
     return _finished(Run.open(Path(run)), record, bench, control or RunControl(), listener or Listener())
