@@ -284,11 +284,9 @@ def response_lines(response: AngularResponse) -> list[str]:
 
 def response_figure(response: AngularResponse) -> Figure:
     """Draw the response along x and y with the cut-off angles."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for name, curve, colour in zip("xy", (response.along_x, response.along_y), _COLOURS, strict=True):
         cut_off = curve.cut_off_deg

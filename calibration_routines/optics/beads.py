@@ -26,6 +26,7 @@ from calibration_routines.procedure import (
 )
 from calibration_routines.psf.analysis import binned
 from calibration_routines.psf.exposure import expose_scene
+from calibration_routines.psf.sampling import known
 from instrument.bench.bench import Bench
 from instrument.files.atomic import require_new
 from instrument.files.calibration_file import save_calibration
@@ -271,18 +272,15 @@ def calibrate_beads(
     return BeadCalibration(calibration, result)
 
 
-def needed_geometry(geometry: Geometry) -> tuple[float, float]:
-    """Return ``pixel_pitch_um`` and ``diffuser_distance_mm``.
-
-    Raises BenchError when one is not known.
-    """
-    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
-    if pitch_um is None or distance_mm is None:
-        raise BenchError(
-            "Where the PSFs belong follows from pixel_pitch_um and diffuser_distance_mm: give them in "
-            "[geometry] of bench.toml (or --pixel-um and --distance-mm with files)."
-        )
-    return pitch_um, distance_mm
+def needed_geometry(geometry: Geometry) -> list[float]:
+    """Return ``pixel_pitch_um`` and ``diffuser_distance_mm``; BenchError when one is not known."""
+    return known(
+        geometry,
+        "pixel_pitch_um",
+        "diffuser_distance_mm",
+        what="Where the PSFs belong follows",
+        otherwise=" (or --pixel-um and --distance-mm with files)",
+    )
 
 
 def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -> tuple[int, int]:
@@ -299,13 +297,14 @@ def window_of(geometry: Geometry, z_um: float, deflection_deg: float = 1.0) -> t
 
     Raises BenchError when the aperture, the distance d or the pitch are not known.
     """
-    aperture_mm, distance_mm = geometry.aperture_mm, geometry.diffuser_distance_mm
-    pitch_um = geometry.pixel_pitch_um
-    if aperture_mm is None or distance_mm is None or pitch_um is None:
-        raise BenchError(
-            "How large the pattern is follows from aperture_mm, diffuser_distance_mm and pixel_pitch_um: "
-            "give them in [geometry] of bench.toml, or the window with --window."
-        )
+    aperture_mm, distance_mm, pitch_um = known(
+        geometry,
+        "aperture_mm",
+        "diffuser_distance_mm",
+        "pixel_pitch_um",
+        what="How large the pattern is follows",
+        otherwise=", or the window with --window",
+    )
     bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(deflection_deg))
     height, width = (
         int((1e3 * side * (1 + 1e3 * distance_mm / z_um) + bent_um) / pitch_um) // 2 * 2 + 1

@@ -306,11 +306,9 @@ def surface_line(surface: DiffuserSurface) -> str:
 
 def surface_figure(surface: DiffuserSurface) -> Figure:
     """Draw a diffuser's height, a cut, and histograms of slope and deflection (Kuo 2020, Fig. A.1)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), height_ratios=(1.6, 1))
     height, width = (n * surface.pitch_um for n in surface.height_um.shape)
     axes = figure.add_subplot(grid[0, 0])

@@ -99,7 +99,8 @@ def photograph(
         To pause, abort or stop the run from another thread.
     listener : Listener, optional
 
-    Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its last frame.
+    Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its
+    last frame.
     """
     control, listener = control or RunControl(), listener or Listener()
     if exposure_ms is None:

@@ -129,14 +129,7 @@ def analyse_sweep(
         scale = np.float32(reference_ms / plane.exposure_ms / plane.brightness)
         light = block_mean(channels_first(plane_light(plane, dark)), binning)
         cleaned, stray = remove_low_frequencies(light, dct_order)
-        measured = measure_psf(
-            light - stray,
-            z_um=plane.source_um[2],
-            noise=noise_of_mean(plane.frames) / binning,
-            saturated_pixels=saturated_pixels(plane, dark.hot),
-            may_be_clipped=plane.off_axis,
-        )
-        quality.append(replace(measured, x_um=plane.source_um[0], y_um=plane.source_um[1]))
+        quality.append(measure_point(plane, light - stray, dark, binning))
         psfs.append(cleaned * scale)
         removed = channels_first(replace_hot(dark.at(reference_ms), dark.hot))
         background = block_mean(removed, binning) + stray * scale
@@ -152,6 +145,20 @@ def analyse_sweep(
         reference_exposure_ms=reference_ms,
         stages=stages,
     )
+
+
+def measure_point(plane: PlaneFrames, light: Float, dark: DarkModel, binning: int) -> PsfQuality:
+    """Measure a point's PSF alone, from its light (n_channels, height, width) and its frames."""
+    x_um, y_um, z_um = plane.source_um
+    ever = (plane.frames >= plane.full_scale).any(axis=0)
+    measured = measure_psf(
+        light,
+        z_um=z_um,
+        noise=noise_of_mean(plane.frames) / binning,
+        saturated_pixels=int(np.count_nonzero(ever & ~dark.hot)),
+        may_be_clipped=plane.off_axis,
+    )
+    return replace(measured, x_um=x_um, y_um=y_um)
 
 
 def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
@@ -208,12 +215,6 @@ def noise_of_mean(frames: Counts) -> float:
     # contain the pattern itself, which makes this an upper bound
     step = np.diff(frames[0].astype(np.float32), axis=1)
     return 1.4826 / 2**0.5 * float(np.median(np.abs(step - np.median(step))))
-
-
-def saturated_pixels(plane: PlaneFrames, hot: npt.NDArray[np.bool_]) -> int:
-    """Count the pixels at full scale in any of a point's frames, hot ones excepted."""
-    ever = (plane.frames >= plane.full_scale).any(axis=0)
-    return int(np.count_nonzero(ever & ~hot))
 
 
 FEATURE_PX = 2.0

@@ -93,8 +93,8 @@ def check_sweep(bench: Bench, sweep: PointSweep, folder: Path | None = None) -> 
     ones. The stage need not be homed yet: limits hold all the same, and the sweep itself is checked
     again.
 
-    Raises PlanError, which names every step that cannot be done, or SettingsError when binning or DCT order do not
-    fit the camera's frames.
+    Raises PlanError, which names every step that cannot be done, or SettingsError when binning or DCT order
+    do not fit the camera's frames.
     """
     check_image_settings(sweep, bench.camera.frame_shape)
     present_ms, (shortest_ms, longest_ms) = bench.camera.exposure_ms, bench.camera.exposure_limits_ms

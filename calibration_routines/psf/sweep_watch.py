@@ -21,15 +21,13 @@ from calibration_routines.psf.analysis import (
     DarkModel,
     PlaneFrames,
     channels_first,
-    noise_of_mean,
+    measure_point,
     plane_light,
-    saturated_pixels,
 )
 from calibration_routines.psf.psf_quality import (
     MAX_STEP_PX,
     PsfQuality,
     judge_next,
-    measure_psf,
     with_finding,
 )
 from calibration_routines.psf.sampling import Position
@@ -189,18 +187,9 @@ class SweepWatch:
         frame_shape = plane.frames.shape[1:3]
         factor = max(1, frame_shape[0] // image.shape[0])
         binning = max(1, self._sweep.binning)
-        x_um, y_um, z_um = plane.source_um
-        found = measure_psf(
-            image[np.newaxis],
-            z_um=z_um,
-            noise=noise_of_mean(plane.frames) / binning,
-            saturated_pixels=saturated_pixels(plane, self._dark_model(plane.full_scale).hot),
-            may_be_clipped=plane.off_axis,
-        )
+        found = measure_point(plane, image[np.newaxis], self._dark_model(plane.full_scale), binning)
         found = replace(
             found,
-            x_um=x_um,
-            y_um=y_um,
             centroid_px=(found.centroid_px[0] * factor / binning, found.centroid_px[1] * factor / binning),
             radius_px=found.radius_px * factor / binning,
         )
