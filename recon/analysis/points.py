@@ -275,16 +275,16 @@ def point_tests(
         return make(columns, 1 / at)
 
     on_progress(0.1)
-    across = WindowProblem(planes[len(planes) // 2][None], HALF_WINDOW)
     middle = len(planes) // 2
+    across = WindowProblem(planes[middle][None], HALF_WINDOW)
 
-    def on_axis_plane(columns: float, _s: float) -> Array:
+    def in_plane(columns: float, _s: float) -> Array:
         return point(columns, middle)
 
-    def try_lateral(px: float) -> PointTrial:
-        return try_points(across, on_axis_plane, PointGrid(2, separation_px=px), noise)
-
-    lateral, found = smallest_resolved(try_lateral, [v for v in LATERAL_PX if v >= 0.7 * lateral_px])
+    lateral, found = smallest_resolved(
+        lambda px: try_points(across, in_plane, PointGrid(2, separation_px=px), noise),
+        [v for v in LATERAL_PX if v >= 0.7 * lateral_px],
+    )
     if found is None:
         notes.append("No two points across the axis were resolved at any separation tried.")
     on_progress(0.3)

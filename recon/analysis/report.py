@@ -344,15 +344,14 @@ def _depth_to_analyse(depths: Floats, planes: Array, distance_um: float, notes: 
 
 def _geometry(calibration: Calibration) -> tuple[float, float]:
     geometry = calibration.geometry
-    missing = [n for n in ("pixel_pitch_um", "diffuser_distance_mm") if getattr(geometry, n) is None]
-    if missing:
+    pitch_um, distance_mm = geometry.pixel_pitch_um, geometry.diffuser_distance_mm
+    if pitch_um is None or distance_mm is None:
+        missing = [n for n in ("pixel_pitch_um", "diffuser_distance_mm") if getattr(geometry, n) is None]
         raise InputError(
             f"The calibration does not say its {' and '.join(missing)}, which the analysis needs: "
             "give them in [geometry] of bench.toml and calibrate again."
         )
-    assert geometry.pixel_pitch_um is not None
-    assert geometry.diffuser_distance_mm is not None
-    return geometry.pixel_pitch_um, 1e3 * geometry.diffuser_distance_mm
+    return pitch_um, 1e3 * distance_mm
 
 
 def _cut_to_light(calibration: Calibration) -> tuple[Calibration, tuple[int, int]]:

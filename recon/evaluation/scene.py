@@ -11,7 +11,7 @@ import numpy.typing as npt
 from recon.base.noise import NoiseModel
 from recon.errors import InputError
 from recon.evaluation import content
-from recon.evaluation.lenslets import SPOT_PX, LensletCamera, Optics, build_camera
+from recon.evaluation.lenslets import SPOT_PX, Floats, LensletCamera, Optics, build_camera
 from recon.types import Calibration, Geometry
 
 Family = Literal["dense-picture", "sparse-picture", "beads", "dense-volume", "microscope"]
@@ -176,10 +176,10 @@ class TestScene:
     noise: NoiseModel
     background: npt.NDArray[np.float32]
     camera: LensletCamera
-    points: npt.NDArray[np.float64]
+    points: Floats
 
     @property
-    def z_um(self) -> npt.NDArray[np.float64]:
+    def z_um(self) -> Floats:
         """Depths of the calibrated planes, the nearest first."""
         return np.unique(self.calibration.source_positions_um[:, 2])
 
@@ -247,7 +247,7 @@ def make_scene(spec: SceneSpec | Family, **changes: Any) -> TestScene:
 
 
 # Pieces ------------------------------------------------------------------------------------------------
-def _places(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _places(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     """Rows, columns (picture pixels from the axis), places in depth and brightness, (n, 4)."""
     side = max(spec.shape)
     if spec.is_picture:
@@ -271,9 +271,7 @@ def _places(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64
     return places
 
 
-def _tints(
-    spec: SceneSpec, places: npt.NDArray[np.float64], rng: np.random.Generator
-) -> npt.NDArray[np.float64]:
+def _tints(spec: SceneSpec, places: Floats, rng: np.random.Generator) -> Floats:
     """Brightness of every point in every channel, relative to its own, (n, channels)."""
     if spec.channels == 1 or not spec.colourful:
         return np.ones((len(places), spec.channels))
@@ -284,32 +282,30 @@ def _tints(
     return np.asarray(colours[nearest])
 
 
-def _channels(spec: SceneSpec, tints: npt.NDArray[np.float64]) -> list[tuple[int, npt.NDArray[np.float64]]]:
+def _channels(spec: SceneSpec, tints: Floats) -> list[tuple[int, Floats]]:
     """Return the camera's colours, each with every point's tint in it."""
     return [(1, tints[:, 0])] if spec.channels == 1 else [(c, tints[:, c]) for c in range(3)]
 
 
-def _points(
-    spec: SceneSpec, places: npt.NDArray[np.float64], camera: LensletCamera
-) -> npt.NDArray[np.float64]:
+def _points(spec: SceneSpec, places: Floats, camera: LensletCamera) -> Floats:
     """``x, y, z`` and power of every point, (n, 4)."""
     z = _depth_um(spec, places[:, 2], camera.distance_um)
     to_scene = -camera.pitch_um * z / camera.distance_um
     return np.column_stack([places[:, 1] * to_scene, places[:, 0] * to_scene, z, places[:, 3]])
 
 
-def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> npt.NDArray[np.float64]:
+def _depth_um(spec: SceneSpec, place: npt.ArrayLike, distance_um: float) -> Floats:
     """Depth of a place between far (0) and near (1), even in 1/z."""
     inverse = 1 / spec.z_far + np.asarray(place) * (1 / spec.z_near - 1 / spec.z_far)
     return distance_um / inverse
 
 
-def _plane_places(spec: SceneSpec) -> npt.NDArray[np.float64]:
+def _plane_places(spec: SceneSpec) -> Floats:
     """Places of the calibrated planes, the nearest first."""
     return np.linspace(1.0, 0.0, spec.depths) if spec.depths > 1 else np.array([0.5])
 
 
-def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> npt.NDArray[np.float64]:
+def _stray_light(spec: SceneSpec, rng: np.random.Generator) -> Floats:
     """Smooth light of mean ``spec.background``: a slope and a broad hill."""
     y, x = (np.linspace(-1, 1, n) for n in spec.shape)
     slope, place = rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.5, 0.5, 2)
@@ -353,9 +349,7 @@ def _calibrate(spec: SceneSpec, camera: LensletCamera, rng: np.random.Generator)
     return calibration, unit
 
 
-def _on_grid(
-    spec: SceneSpec, places: npt.NDArray[np.float64], tint: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _on_grid(spec: SceneSpec, places: Floats, tint: Floats) -> Floats:
     """Brightness of every pixel or voxel.
 
     In a volume every point's light is shared by its eight nearest voxels; a picture's points lie so densely
@@ -372,9 +366,7 @@ def _on_grid(
     return shared((spec.depths, height, width), np.column_stack([depth, row, column]), light)
 
 
-def shared(
-    shape: tuple[int, ...], places: npt.NDArray[np.float64], light: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def shared(shape: tuple[int, ...], places: Floats, light: Floats) -> Floats:
     """Return points (n, n_axes) on a grid, each shared by its nearest cells, two along each axis."""
     grid = np.zeros(shape)
     corner = np.floor(places).astype(int)
@@ -384,12 +376,12 @@ def shared(
     return grid
 
 
-def _drop(grid: npt.NDArray[np.float64], cells: npt.NDArray[np.int_], light: npt.NDArray[np.float64]) -> None:
+def _drop(grid: Floats, cells: npt.NDArray[np.int_], light: Floats) -> None:
     """Add light to cells, (n, n_axes); what falls outside is lost."""
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
     np.add.at(grid, tuple(cells[inside].T), light[inside])
 
 
-def _flat(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+def _flat(array: Floats) -> npt.NDArray[np.float32]:
     """Channels last, left out where there is one."""
     return np.ascontiguousarray(array[..., 0] if array.shape[-1] == 1 else array, np.float32)

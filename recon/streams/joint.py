@@ -120,10 +120,8 @@ OVER_TIME: tuple[OverTimeName, ...] = ("tv", "lowrank")
 
 JOINT_ITERATIONS = 60
 """Of a block that is solved together; its first ones are all cold."""
-
 JOINT_BLOCK = 16
 """Frames of such a block: 16 of a megapixel take 5 GB."""
-
 TIME_SHARE = 1.0
 """Penalty of the split over time relative to that of the pixels, whose scale it shares."""
 

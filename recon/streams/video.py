@@ -29,10 +29,8 @@ from recon.types import Calibration
 COLD_ITERATIONS, WARM_ITERATIONS = 20, 4
 """Iterations of a block's first frame and of the others: as good as independent frames at their best where
 the scene stands, and near it where it moves by less than a pixel a frame (docs/benchmarks/video.md)."""
-
 BLOCK = 32
 """Frames a block: its cold start is then a seventh of the work."""
-
 SETTLED = 2e-4
 """Change an iteration below which a video's frame is done before its iterations are."""
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -95,8 +95,7 @@ class Evidence:
 
     def as_json(self) -> dict[str, float]:
         """Return the numbers by name, but for those that were not measured."""
-        measured = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
-        return {name: float(value) for name, value in measured if value is not None}
+        return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +146,7 @@ def measure(
     signal2 = max(float(np.var(used)) - 1.0, NO_LESS)
     beyond2 = max(residual_norm**2 / len(used) - 1.0, 0.0)
     lit, edges = lit_and_edges(volume)
-    found = points_of(volume, _norms(psfs) / noise, len(used)) if points else None
+    found = asdict(points_of(volume, _norms(psfs) / noise, len(used))) if points else {}
     return Evidence(
         signal=float(np.sqrt(signal2)),
         detail=_detail(volume, psfs, noise, len(used)),
@@ -162,9 +161,7 @@ def measure(
         dimming=_dimming(psfs),
         ambiguity=_ambiguity(psfs[len(psfs) // 2]),
         unsettled=unsettled,
-        height=None if found is None else found.height,
-        peaks=None if found is None else found.peaks,
-        ends=None if found is None else found.ends,
+        **found,
     )
 
 
