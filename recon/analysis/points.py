@@ -42,15 +42,7 @@ FACTORS = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.4, 2.8, 3.4)
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Noise of the test images.
-
-    Attributes
-    ----------
-    electrons : float
-        At the brightest pixel of the image.
-    read_e : float
-        Read noise.
-    """
+    """Noise of the test images."""
 
     electrons: float = option(
         10_000.0, help="Electrons at the brightest pixel of the tests' images.", least=1, group="Point tests"

@@ -74,26 +74,11 @@ def _cutoff(typed: str) -> tuple[float, float]:
 class AnalysisSettings:
     """What the calibration itself does not tell.
 
-    Attributes
-    ----------
-    z_um : float or None
-        Depth at which resolution is stated and tested; default the middle of the calibrated range in 1/z, or
-        a nearer one where the tests along the axis would not fit.
-    deflection_deg : float
-        Largest deflection by the diffuser, ``beta`` (dissertation: 0.5 degrees).
-    cutoff_deg : (float, float) or None
-        Angle at which the sensor's response is down to 20 %, along y and x; None where not known.
-    fall_off : callable, optional
-        The sensor's response as a function of the tangents along y and x, for the lateral sampling.
-    fall_off_deg : float or None
-        Standard deviation of the sensor's angular response, as a Gaussian, for the lateral sampling where
-        ``fall_off`` is not given; default from ``cutoff_deg`` where known.
-    lenslet_um, wavelength_nm : float or None
-        Of a microlens diffuser, for the axial sampling of Eq. 5.10.
-    points : bool
-        Whether to run the point tests, which take most of the time.
-    noise : Noise
-        Of the point tests' images.
+    Resolution is stated and tested at ``z_um``: without it in the middle of the calibrated range in 1/z, or
+    nearer where the tests along the axis, which take most of the time, would not fit. ``deflection_deg`` is
+    the ``beta`` of Kuo 2020; ``cutoff_deg`` is along y and x. The lateral sampling follows from ``fall_off``,
+    the sensor's response as a function of the tangents along y and x, else from a Gaussian of
+    ``fall_off_deg``; the axial one (Eq. 5.10) from a microlens diffuser's ``lenslet_um`` and the wavelength.
     """
 
     z_um: float | None = option(

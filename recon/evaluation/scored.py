@@ -221,13 +221,11 @@ class Curve:
     finished: bool
 
 
-def pareto(points: Iterable[Point], score: Axis | str, cost: Axis = SECONDS) -> list[Point]:
+def pareto(points: Iterable[Point], score: Axis, cost: Axis = SECONDS) -> list[Point]:
     """Return the points that no other is both cheaper and better than, the cheapest first, without groups.
 
     Points that lack one of the two numbers do not compete.
     """
-    if isinstance(score, str):
-        score = next(s for kind in KINDS.values() for s in kind.scores if s.key == score)
     sign = 1.0 if score.more_is_better else -1.0
     known = [p for p in points if is_known(p, score.key) and is_known(p, cost.key)]
     front: list[Point] = []

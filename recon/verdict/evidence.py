@@ -128,18 +128,10 @@ def measure(
     unsettled: float,
     points: bool = False,
 ) -> Evidence:
-    """Measure a reconstruction of one channel.
+    """Measure one channel of a reconstruction, as :func:`evidence_of`.
 
-    Parameters
-    ----------
-    volume : ndarray, (n_z, rows, columns)
-        The result: ``measurement = sum_z PSF_z * volume_z``.
-    psfs : ndarray, (n_z, height, width)
-        On-axis PSFs as calibrated.
-    residual_norm : float
-        ``||A x - b||`` over the valid pixels, in units of the noise.
-    points : bool
-        Whether to look for its bright points as well.
+    ``volume`` is (n_z, rows, columns) and ``psfs`` (n_z, height, width): ``measurement = sum_z PSF_z *
+    volume_z``.
     """
     data, noise = seen.data, seen.noise
     used = data[seen.valid].astype(np.float64)
@@ -362,7 +354,8 @@ def evidence_of(
     psfs : ndarray, (n_z, 1 or n_channels, height, width)
         As calibrated.
     residuals : sequence of float
-        Residual norms in units of the noise: one a channel, or one of all together.
+        Norms ``||A x - b||`` over the valid pixels, in units of the noise: one a channel, or one of
+        all together.
     points : bool
         Whether to look for the result's bright points as well: of volumes.
     """

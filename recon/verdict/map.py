@@ -234,19 +234,12 @@ def cell_of(method: str, ix: int, iy: int, trial: Trial, seconds: float) -> Cell
     return Cell(method, ix, iy, float(trial.error), severity, failure, evidence, seconds)
 
 
-def severity_grid(cells: list[Cell], method: str, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """Return the severities of a method, (n_y, n_x); NaN where there is no cell yet."""
-    grid = np.full(shape, np.nan)
-    for cell in cells:
-        if cell.method == method:
-            grid[cell.iy, cell.ix] = cell.severity
-    return grid
-
-
 def boundary(
     x: tuple[float, ...], y: tuple[float, ...], severity: npt.NDArray[np.float64], *, logarithmic: bool
 ) -> list[tuple[float, float]]:
     """Return where each row crosses from working to failing, ``(x, y)``; other rows have no point.
+
+    ``severity`` is (n_y, n_x), NaN where it is not known.
 
     Between two cells the crossing is interpolated on the logarithm of the severity, along ``x`` or its
     logarithm. A row that crosses more than once counts where most of its cells are on the right side.
