@@ -54,25 +54,18 @@ _PRELOADED = [
 
 @dataclass(frozen=True)
 class ChartData:
-    """What a chart holds.
-
-    Attributes
-    ----------
-    kind_name : str
-        Of :data:`recon.evaluation.scored.KINDS`.
-    about : mapping
-        What was charted, JSON-compatible.
-    failed : mapping of str to str
-        Settings that could not be run, and why.
-    missing : tuple of str
-        Settings for which there was no time, or not enough: their points, if any, end before the last count.
-    """
+    """What a chart holds."""
 
     kind_name: KindName
+    """Of :data:`recon.evaluation.scored.KINDS`."""
     about: Mapping[str, Any]
+    """What was charted, JSON-compatible."""
     points: tuple[Point, ...]
     failed: Mapping[str, str]
+    """Settings that could not be run, and why."""
     missing: tuple[str, ...]
+    """Settings for which there was no time, or not enough: their points, if any, end before the last
+    count."""
 
     @property
     def kind(self) -> Kind:
@@ -173,10 +166,7 @@ def subject_of(kind: str, about: Mapping[str, Any]) -> str:
 def read_chart(path: Path, remedy: str = "Make it with diffuserbench chart.") -> ChartData:
     """Read what ``diffuserbench chart`` wrote; settings get the names that they have now.
 
-    Raises
-    ------
-    FileError
-        When it is no such file, or of another version.
+    Raises FileError when it is no such file, or of another version.
     """
     try:
         record = json.loads(path.read_text("utf-8"))
@@ -344,10 +334,7 @@ def make_chart(
 
     The chart is written after each setting, so that an interrupted one goes on where it was.
 
-    Raises
-    ------
-    FileError
-        When ``path`` is the chart of another problem.
+    Raises FileError when ``path`` is the chart of another problem.
     """
     about = {**about, "fingerprint": problem.fingerprint(), "pixels": list(problem.pixels)}
     kept = ChartData(problem.kind, about, (), {}, ())

@@ -66,22 +66,15 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class PointTrial:
-    """One image of points, reconstructed.
-
-    Attributes
-    ----------
-    separation_px, separation_planes : float
-        Between neighbours.
-    dip : float
-        The smallest dip between any two neighbours, of all draws.
-    map : ndarray, (n_z, width)
-        The reconstruction of the last draw, summed over rows.
-    """
+    """One image of points, reconstructed."""
 
     separation_px: float
     separation_planes: float
+    """``separation_px`` and ``separation_planes``: between neighbours."""
     dip: float
+    """The smallest dip between any two neighbours, of all draws."""
     map: Floats
+    """(n_z, width): the reconstruction of the last draw, summed over rows."""
 
     @property
     def resolved(self) -> bool:
@@ -198,26 +191,18 @@ def _dip(seen: Floats, first: npt.NDArray[np.int_], second: npt.NDArray[np.int_]
 # The tests of a calibration -------------------------------------------------------------------------
 @dataclass(frozen=True)
 class PointTests:
-    """What was resolved.
-
-    Attributes
-    ----------
-    lateral_px : float or None
-        Two points across: smallest resolved separation on the sensor; None where none tried was resolved.
-    axial_per_um : float or None
-        Two points along the axis: difference in 1/z.
-    sixteen_factor : float or None
-        By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7.
-    lateral, axial, sixteen : tuple of PointTrial
-        Every trial made.
-    """
+    """What was resolved."""
 
     lateral_px: float | None
+    """Two points across: smallest resolved separation on the sensor; None where none tried was resolved."""
     axial_per_um: float | None
+    """Two points along the axis: difference in 1/z."""
     sixteen_factor: float | None
+    """By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7."""
     lateral: tuple[PointTrial, ...]
     axial: tuple[PointTrial, ...]
     sixteen: tuple[PointTrial, ...]
+    """``lateral``, ``axial`` and ``sixteen``: every trial made."""
     notes: tuple[str, ...]
 
 

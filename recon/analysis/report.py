@@ -133,13 +133,6 @@ class Analysis:
 
     Lengths in micrometres, angles in degrees; ``None`` where the calibration cannot tell, with the reason in
     ``notes``.
-
-    Attributes
-    ----------
-    psf : ndarray, (height, width)
-        The central PSF at ``z_um``, as it was analysed (cut to its light, channels averaged).
-    autocorrelation : ndarray
-        Its cut along the columns, from the peak.
     """
 
     z_um: float
@@ -147,7 +140,10 @@ class Analysis:
     distance_um: float
     sensor_shape: tuple[int, int]
     psf: Array
+    """(height, width): the central PSF at ``z_um``, as it was analysed (cut to its light, channels
+    averaged)."""
     autocorrelation: Floats
+    """Its cut along the columns, from the peak."""
     support_px: tuple[float, float]
     lateral: LateralResolution
     lateral_inner: LateralResolution
@@ -191,6 +187,8 @@ def analyse(
 ) -> Analysis:
     """Analyse a calibration.
 
+    Raises InputError when the geometry or the depths are unknown.
+
     Parameters
     ----------
     calibration : Calibration
@@ -198,11 +196,6 @@ def analyse(
     settings : AnalysisSettings, optional
     on_progress : callable, optional
         Called with what is being done and the share done.
-
-    Raises
-    ------
-    InputError
-        When the geometry or the depths are unknown.
     """
     settings = settings or AnalysisSettings()
     on_progress = on_progress or (lambda _what, _share: None)

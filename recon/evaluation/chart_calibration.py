@@ -44,68 +44,48 @@ _SEARCH = 3
 
 @dataclass(frozen=True)
 class Photographed:
-    """A scene's photograph and what is true.
-
-    Attributes
-    ----------
-    image : ndarray, float32, (height, width)
-    truth : ndarray, float32, (FINE * height, FINE * width)
-        Light from all depths that reaches the sensor; the axis in the middle.
-    """
+    """A scene's photograph and what is true."""
 
     name: SceneName
     image: Floats
+    """(height, width)."""
     truth: Floats
+    """(FINE * height, FINE * width): light from all depths that reaches the sensor; the axis in the
+    middle."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """What a bench photographed; all of (height, width), float32, background removed, noise kept.
-
-    Attributes
-    ----------
-    psfs : ndarray, (n, height, width)
-        Of the point source at ``places``, one photograph each; several of the same place differ in noise.
-    places : ndarray, float64, (n, 3)
-        Row and column from the axis in object pixels, and depth in micrometres.
-    slides : ndarray, (m, height, width)
-        Of beads at unknown places in depth ``z_um``.
-    z_um : float
-        Depth of the flat picture, of the slides, and of calibrations of one depth.
-    window_px : int
-        Side of the square that holds a PSF of ``z_um``; odd.
-    reach : float
-        Part of the sensor's sides that scenes, grids and beads cover.
-    """
+    """What a bench photographed; all of (height, width), float32, background removed, noise kept."""
 
     psfs: Floats
+    """(n, height, width): of the point source at ``places``, one photograph each; several of the same place
+    differ in noise."""
     places: npt.NDArray[np.float64]
+    """(n, 3): row and column from the axis in object pixels, and depth in micrometres."""
     slides: Floats
+    """(m, height, width): of beads at unknown places in depth ``z_um``."""
     scenes: tuple[Photographed, ...]
     z_um: float
+    """Depth of the flat picture, of the slides, and of calibrations of one depth."""
     geometry: Geometry
     window_px: int
+    """Side of the square that holds a PSF of ``z_um``; odd."""
     reach: float
+    """Part of the sensor's sides that scenes, grids and beads cover."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSetting:
-    """One way to calibrate.
-
-    Attributes
-    ----------
-    grid : int
-        Points along each side of the field; 1: on the axis.
-    averaged : int
-        Photographs a place, whose mean is taken.
-    slides : int
-        Of beads, for a blind calibration, which photographs no point; else 0.
-    """
+    """One way to calibrate."""
 
     grid: int = 1
+    """Points along each side of the field; 1: on the axis."""
     depths: int = 1
     averaged: int = 1
+    """Photographs a place, whose mean is taken."""
     slides: int = 0
+    """Of beads, for a blind calibration, which photographs no point; else 0."""
 
     @property
     def images(self) -> int:

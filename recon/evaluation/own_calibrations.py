@@ -35,42 +35,29 @@ _SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse
 
 @dataclass(frozen=True)
 class OwnCalibration:
-    """A calibration, and the photograph that it is tried on.
-
-    Attributes
-    ----------
-    label : str
-        Different for each.
-    problem : ChartProblem
-        The same photograph for all; the calibration of this one.
-    photographs : float
-        How many were taken for each of its PSFs; of a blind one: for all of them together, over their number.
-    whole : bool
-        Whether it can only be had as a whole: a blind one.
-    """
+    """A calibration, and the photograph that it is tried on."""
 
     label: str
+    """Different for each."""
     problem: ChartProblem
+    """The same photograph for all; the calibration of this one."""
     photographs: float = 1.0
+    """How many were taken for each of its PSFs; of a blind one: for all of them together, over their
+    number."""
     whole: bool = False
+    """Whether it can only be had as a whole: a blind one."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnSetting:
-    """A part of a calibration.
-
-    Attributes
-    ----------
-    members : tuple of int
-        Its PSFs.
-    images : int
-        Photographs.
-    """
+    """A part of a calibration."""
 
     label: str
     part: str
     members: tuple[int, ...]
+    """Its PSFs."""
     images: int
+    """Photographs."""
     model: ModelName
 
     @property

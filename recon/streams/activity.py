@@ -34,18 +34,12 @@ _ANCHORS_A_WINDOW = 4
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How far each frame lies off the mean of all, less the median frame.
-
-    Attributes
-    ----------
-    shifts : ndarray, (n_frames, 2)
-        Rows and columns, pixels.
-    largest_px : float
-        Of the frames' distances from their median place.
-    """
+    """How far each frame lies off the mean of all, less the median frame."""
 
     shifts: npt.NDArray[np.float64]
+    """(n_frames, 2): rows and columns, pixels."""
     largest_px: float
+    """Of the frames' distances from their median place."""
 
     @property
     def is_still(self) -> bool:
@@ -199,22 +193,15 @@ What lasts for one frame cannot be told from noise."""
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Pixels that are active together.
-
-    Attributes
-    ----------
-    rows, columns : ndarray of int
-        Its pixels.
-    centre : (float, float)
-        Row and column, weighted with the activity.
-    correlation : float
-        Local correlation at its peak.
-    """
+    """Pixels that are active together."""
 
     rows: npt.NDArray[np.intp]
     columns: npt.NDArray[np.intp]
+    """``rows`` and ``columns``: its pixels."""
     centre: tuple[float, float]
+    """Row and column, weighted with the activity."""
     correlation: float
+    """Local correlation at its peak."""
 
     def trace(self, frames: Floats) -> Floats:
         """Return the mean over the region of each frame, (n_frames,)."""

@@ -52,6 +52,8 @@ class LiveReconstructor:
     Another binning is prepared in a thread of its own while pictures go on. One that finds no memory is said
     in ``warnings`` and not tried again until :meth:`restart`; pictures go on as they are.
 
+    Raises InputError when the calibration or an option is unusable, or no solver has a way for them.
+
     Parameters
     ----------
     calibration : Calibration or ndarray
@@ -71,11 +73,6 @@ class LiveReconstructor:
         May be changed at any time.
     warnings : tuple of str
         What is doubtful about the calibration, and what became of the pictures since.
-
-    Raises
-    ------
-    InputError
-        When the calibration or an option is unusable, or no solver has a way for them.
     """
 
     def __init__(
@@ -144,16 +141,13 @@ class LiveReconstructor:
         The first makes its filter, which takes about a tenth of a second; the first of another scene takes a
         little longer than others.
 
+        Raises InputError when the image does not fit the PSF or the frames before, or is not finite; such a
+        frame is left out, and the next goes on as if it had not been.
+
         Parameters
         ----------
         image : ndarray, (height, width) or (height, width, n_channels)
             Counts. Of the PSF's pixels, or of a whole multiple of them, which is then binned to them.
-
-        Raises
-        ------
-        InputError
-            When the image does not fit the PSF or the frames before, or is not finite; such a frame is left
-            out, and the next goes on as if it had not been.
         """
         began = _now()
         frame = self._measured(np.asarray(image))
@@ -215,17 +209,14 @@ class LiveReconstructor:
     ) -> Reconstruction:
         """Reconstruct a frame as a single picture, to the end, with the same options; from any thread.
 
+        Raises InputError when the image does not fit the calibration.
+
         Parameters
         ----------
         image : ndarray
             As of :meth:`feed`.
         on_progress, cancel
             As of :func:`recon.reconstruct`.
-
-        Raises
-        ------
-        InputError
-            When the image does not fit the calibration.
         """
         pixels = np.moveaxis(self._on_calibration_pixels(image), 0, -1)
         pixels = pixels[..., 0] if image.ndim == 2 else pixels

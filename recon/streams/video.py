@@ -43,6 +43,8 @@ def stream_problem(
 ) -> Problem:
     """Settle noise, scales and camera from one frame, for all frames of a video.
 
+    Raises InputError when the input is unusable, or no solver has a way for it.
+
     Parameters
     ----------
     frame : Measurement or array, (height, width[, n_channels])
@@ -52,11 +54,6 @@ def stream_problem(
         and the exact-data ADMM where that has a way.
     **overrides
         Single options, and facts about the frame, by their names, as of :func:`recon.reconstruct`.
-
-    Raises
-    ------
-    InputError
-        When the input is unusable, or no solver has a way for it.
     """
     known, options = given(overrides, options)
     measurement = frame if isinstance(frame, Measurement) else Measurement(frame)
@@ -77,6 +74,8 @@ class VideoSolver:
     takes new data in the memory that it has; other solvers are made anew for each frame, which costs what
     their making costs.
 
+    Raises InputError when the solver has no iterations, or no way for the problem.
+
     Parameters
     ----------
     problem : Problem
@@ -90,11 +89,6 @@ class VideoSolver:
     ----------
     iterations : int
         Since the last frame that began from zero.
-
-    Raises
-    ------
-    InputError
-        When the solver has no iterations, or no way for the problem.
     """
 
     def __init__(

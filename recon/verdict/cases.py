@@ -95,26 +95,18 @@ def group_of(method: str) -> str | None:
 
 @dataclass(frozen=True)
 class Cases:
-    """Cases of a group of methods.
-
-    Attributes
-    ----------
-    weights : mapping
-        The evidence that spans the space in which distances tell how alike they are, see :data:`ALIKE`.
-    places : ndarray, (n, n_features)
-        In that space.
-    severities : ndarray, (n,)
-    scenes : ndarray of int, (n,)
-        Numbers of the mixed scenes that they come from; -1 for those of maps.
-    maps : tuple of str
-        The maps that they come from.
-    """
+    """Cases of a group of methods."""
 
     weights: Mapping[str, float]
+    """The evidence that spans the space in which distances tell how alike they are, see :data:`ALIKE`."""
     places: Floats
+    """(n, n_features): in that space."""
     severities: Floats
+    """(n,)."""
     scenes: npt.NDArray[np.int_]
+    """(n,): numbers of the mixed scenes that they come from; -1 for those of maps."""
     maps: tuple[str, ...]
+    """The maps that they come from."""
 
     @cached_property
     def typical(self) -> Floats | None:

@@ -43,55 +43,40 @@ LIMITS = (StopReason.ITERATIONS, StopReason.TIME, StopReason.CANCELLED)
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What was measured.
-
-    Attributes
-    ----------
-    signal : float
-        Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
-        there is to reconstruct from.
-    detail : float
-        Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root
-        of the power of the picture times the PSF's on that ring of frequencies, over the noise'.
-    unexplained : float
-        Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
-        what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation).
-    erased, saturated : float
-        Shares of the pixels: not used; used though at full scale.
-    lit, edges : float
-        Shares of the voxels that are not dark, and that differ from a neighbour.
-    load : float
-        Unknowns a measured pixel: lit voxels or edges, whichever are fewer, over the pixels used.
-    planes : int
-        Depths.
-    similarity : float
-        Greatest inner product of PSFs of neighbouring depths; 0 for one depth.
-    dimming : float
-        Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are.
-    ambiguity : float
-        Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array.
-    unsettled : float
-        Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0.
-    height, peaks, ends : float or None
-        Of the bright points of a volume (:class:`Points`); None of a picture.
-    """
+    """What was measured."""
 
     signal: float
+    """Standard deviation of the measurement over its pixels, less the noise', in units of the noise: what
+    there is to reconstruct from."""
     detail: float
+    """Signal over noise of the picture's details of four to ten pixels, as the camera transmits them: root of
+    the power of the picture times the PSF's on that ring of frequencies, over the noise'."""
     unexplained: float
+    """Residual beyond the expected noise, relative to the measurement's standard deviation without noise:
+    what the model does not describe (a moved diffuser, another depth or colour, stray light, saturation)."""
     erased: float
     saturated: float
+    """``erased`` and ``saturated``: shares of the pixels: not used; used though at full scale."""
     lit: float
     edges: float
+    """``lit`` and ``edges``: shares of the voxels that are not dark, and that differ from a neighbour."""
     load: float
+    """Unknowns a measured pixel: lit voxels or edges, whichever are fewer, over the pixels used."""
     planes: int
+    """Depths."""
     similarity: float
+    """Greatest inner product of PSFs of neighbouring depths; 0 for one depth."""
     dimming: float
+    """Least norm of a depth's PSF relative to the greatest: how much dimmer the farthest points are."""
     ambiguity: float
+    """Greatest correlation of a PSF with itself, three pixels or more apart: near 1 for a regular array."""
     unsettled: float
+    """Change of the last iteration over ten times the tolerance, where a limit ended the run; else 0."""
     height: float | None = None
     peaks: float | None = None
     ends: float | None = None
+    """``height``, ``peaks`` and ``ends``: of the bright points of a volume (:class:`Points`); None of a
+    picture."""
 
     def as_json(self) -> dict[str, float]:
         """Return the numbers by name, but for those that were not measured."""
@@ -100,23 +85,16 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One channel of what the camera saw.
-
-    Attributes
-    ----------
-    data : ndarray, (height, width)
-        Measurement, background subtracted, in units of its noise.
-    valid : ndarray of bool, (height, width)
-    noise : float
-        Its deviation, counts.
-    saturated : float
-        Share of the valid pixels at full scale.
-    """
+    """One channel of what the camera saw."""
 
     data: Array
+    """(height, width): measurement, background subtracted, in units of its noise."""
     valid: npt.NDArray[np.bool_]
+    """(height, width)."""
     noise: float
+    """Its deviation, counts."""
     saturated: float = 0.0
+    """Share of the valid pixels at full scale."""
 
 
 def measure(
@@ -248,23 +226,16 @@ def lit_and_edges(volume: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """The bright points of a volume.
-
-    Attributes
-    ----------
-    height : float
-        Median height of the peaks found, as the camera sees them: a voxel's value times its PSF's norm, over
-        the noise. That is how far a single point stands above the noise of all pixels which it lights.
-    peaks : float
-        Strong peaks for each thousand measured pixels.
-    ends : float
-        Mean light of the two outermost planes over the mean plane's: above 1 where light that fits nowhere
-        gathers, or where the scene goes on beyond the calibrated depths.
-    """
+    """The bright points of a volume."""
 
     height: float
+    """Median height of the peaks found, as the camera sees them: a voxel's value times its PSF's norm, over
+    the noise. That is how far a single point stands above the noise of all pixels which it lights."""
     peaks: float
+    """Strong peaks for each thousand measured pixels."""
     ends: float
+    """Mean light of the two outermost planes over the mean plane's: above 1 where light that fits nowhere
+    gathers, or where the scene goes on beyond the calibrated depths."""
 
 
 def points_of(volume: Array, norms: npt.NDArray[np.float64], count: int) -> Points:

@@ -156,52 +156,35 @@ def reliable_share(method: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One stress that makes a reconstruction less reliable.
-
-    Attributes
-    ----------
-    stress : str
-        Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`.
-    value : float
-        What was measured.
-    gain : float
-        By how much the share of failing cases would fall, were this one as in a good case; where no case is
-        much like it, by how much nearer the nearest would be.
-    words, help : str
-        What it is, and what would help.
-    """
+    """One stress that makes a reconstruction less reliable."""
 
     stress: str
+    """Name of the evidence, see :class:`~recon.verdict.evidence.Evidence`."""
     value: float
+    """What was measured."""
     gain: float
+    """By how much the share of failing cases would fall, were this one as in a good case; where no case is
+    much like it, by how much nearer the nearest would be."""
     words: str
     help: str
+    """``words`` and ``help``: what it is, and what would help."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether to trust a reconstruction.
-
-    Attributes
-    ----------
-    method : str
-        The maps' name of the method.
-    failing : float or None
-        Share of the most similar cases of the maps that failed; None where there are none.
-    findings : tuple of Finding
-        What limits, the most limiting first.
-    evidence : mapping
-        What was measured, see :class:`~recon.verdict.evidence.Evidence`.
-    basis : str
-        By which cases it was judged.
-    """
+    """Whether to trust a reconstruction."""
 
     region: Region
     method: str
+    """The maps' name of the method."""
     failing: float | None
+    """Share of the most similar cases of the maps that failed; None where there are none."""
     findings: tuple[Finding, ...]
+    """What limits, the most limiting first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
+    """What was measured, see :class:`~recon.verdict.evidence.Evidence`."""
     basis: str = ""
+    """By which cases it was judged."""
 
     @property
     def sentences(self) -> tuple[str, ...]:
