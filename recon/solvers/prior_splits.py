@@ -16,10 +16,12 @@ import numpy as np
 
 from recon.base.namespace import namespace_of, to_host
 from recon.base.threads import in_blocks
-from recon.camera.base import Array
+from recon.camera.base import Array, LinearOperator
+from recon.camera.factors import as_cropped_convolution
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
+from recon.solvers.base import Solver
 
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
@@ -293,14 +295,6 @@ class PriorSplits:
         for other in self.others:
             other.restart()
 
-    def checkpoint(self) -> dict[str, Any]:
-        """Return what :attr:`others` keep, by name."""
-        return kept_splits(self.others)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
-        restore_splits(self.others, state)
-
     def _thresholds(self) -> Array:
         weights = np.array([[self.tv.weight if self.tv else 0.0], [self.separable.weight]])
         thresholds: Array = np.divide(weights, self.mu, out=np.zeros_like(self.mu), where=self.mu > 0)
@@ -310,6 +304,45 @@ class PriorSplits:
 def is_plain(tv: TotalVariation) -> bool:
     """Whether differences wrap around and weigh alike, as the sweeps of pictures have them."""
     return np.array_equal(tv.axis_weights, (1.0, 1.0)) and tv.wrap in (None, (True, True))
+
+
+class PictureSplitting(Solver):
+    """A splitting method for a (masked) convolution of pictures: the priors' splits are part of its state.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        A ``Convolution`` of a picture, with or without ``Erasures`` after it.
+    prior : Prior
+        (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
+    initial : ndarray, optional
+        Starting point on the operator's domain.
+    """
+
+    def __init__(self, operator: LinearOperator, prior: Prior, initial: Array | None) -> None:
+        super().__init__()
+        structure = as_cropped_convolution(operator)
+        self._camera, self._weight = structure.convolution, np.ascontiguousarray(structure.weight)
+        start = np.zeros(operator.domain_shape, operator.dtype)
+        if initial is not None:
+            start[...] = initial
+        self._splits = splits = PriorSplits(prior, start)
+        self._y, self._tx, self._ty, self._t_w = splits.y, splits.tx, splits.ty, splits.t_w
+        self._mu = splits.mu
+
+    @property
+    def solution(self) -> Array:
+        """The split variable that obeys the separable prior."""
+        return self._splits.solution()
+
+    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
+        """Return the state, with that of priors known by their prox."""
+        return {**super().checkpoint(copy=copy), **kept_splits(self._splits.others)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint taken from a solver of the same problem."""
+        super().restore(state)
+        restore_splits(self._splits.others, state)
 
 
 def split_prior(
