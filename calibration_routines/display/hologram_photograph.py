@@ -83,14 +83,13 @@ class HologramCamera:
             Photographs of each frame.
         """
         io, display = self.io, self.display
-        full = (1 << io.bench.camera.significant_bits) - 1
-        exposure_ms = full / (12 * self.mean_per_ms)
+        exposure_ms = io.exposure_ms(self.mean_per_ms)
         total = np.zeros(io.bench.camera.image_shape)
         for field in fields:
             io.show(field)
             for _ in range(average):
                 total += io.photograph(exposure_ms)
-        ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
+        ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
         shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
         picture = np.fft.ifftshift(self.camera.resample(total, shape))
         seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
