@@ -179,10 +179,7 @@ def photograph_slides(
 ) -> Floats:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
 
-    Returns
-    -------
-    ndarray, float32, (n_images, height, width)
-        Dark frame subtracted, colours averaged, binned.
+    Returns float32, (n_images, height, width): dark frame subtracted, colours averaged, binned.
 
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
     CalibrationError when an image saturates.
@@ -232,15 +229,10 @@ def calibrate_beads(
     provenance: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> BeadCalibration:
-    """Recover a calibration from bead images.
+    """Recover a calibration from bead images, (n_images, height, width), dark frame subtracted.
 
-    Parameters
-    ----------
-    images : ndarray, float32, (n_images, height, width)
-        Dark frame subtracted.
-    geometry : Geometry
-        Of the images' pixels. ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the PSFs;
-        ``aperture_mm`` gives the window where none is named.
+    ``geometry`` is that of the images' pixels: ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the
+    PSFs, ``aperture_mm`` gives the window where none is named.
 
     Raises BenchError when the geometry lacks what is needed; InputError when the images cannot be solved.
     """

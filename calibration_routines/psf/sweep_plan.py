@@ -54,12 +54,7 @@ def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
     """Return the plan: dark frames at the shortest and longest exposure, then every point in order.
 
     The reference point is visited before the first point, after every ``reference_every``, and after the
-    last, with its own exposure.
-
-    Parameters
-    ----------
-    exposures_ms : sequence of float
-        One a point.
+    last, with its own exposure. ``exposures_ms`` has one a point.
     """
     points_um = sweep.points_um
     if len(exposures_ms) != len(points_um):
