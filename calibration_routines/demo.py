@@ -38,6 +38,7 @@ from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
 from instrument.runs.finish import CtrlC
 from instrument.runs.runner import RunStatus
+from instrument.runs.writer import free_name
 from recon import Reconstruction, reconstruct
 from recon.base.declare import option
 from recon.optics.scene import Scene, picture
@@ -160,19 +161,14 @@ def new_folder(parent: Path) -> Path:
 
     Raises FileError when it cannot be made.
     """
-    name = f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}"
-    for suffix in ("", *(f"-{n}" for n in range(2, 100))):
-        folder = parent / f"{name}{suffix}"
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            if not parent.is_dir():
-                raise FileError(parent, "is no folder.", "Name a folder with --out.") from None
-            continue
-        except OSError as error:
-            raise FileError(folder, f"cannot be made: {error.strerror or error}.") from error
-        return folder
-    raise FileError(parent / name, "and 98 more of the same second exist already.")
+    if parent.exists() and not parent.is_dir():
+        raise FileError(parent, "is no folder.", "Name a folder with --out.")
+    folder = free_name(parent, f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}")
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise FileError(folder, f"cannot be made: {error.strerror or error}.") from error
+    return folder
 
 
 class Journal:
@@ -192,7 +188,7 @@ class Journal:
     def note(self, **entries: Any) -> None:
         """Add entries (JSON-compatible) and write the file."""
         self._record |= entries
-        self._write()
+        write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -203,9 +199,6 @@ class Journal:
             yield
         finally:
             self.seconds[name] = round(time.perf_counter() - started, 2)
-
-    def _write(self) -> None:
-        write_text(self.path, json.dumps(self._record | {"seconds": self.seconds}, indent=1) + "\n")
 
 
 class _Stages(Listener):

@@ -44,12 +44,7 @@ class CalibrationError(BenchError):
 class RunEndedError(CalibrationError):
     """The run behind a calibration was ended before its last frame; its frames are kept.
 
-    Parameters
-    ----------
-    what : str
-        Begins the sentence: ``"The sweep"``.
-    remedy : str
-        What to do about it.
+    ``what`` begins the sentence ("The sweep"), ``remedy`` says what to do about it.
     """
 
     def __init__(self, what: str, run: Run, remedy: str = "") -> None:

@@ -75,22 +75,17 @@ class HologramCamera:
     def capture(self, fields: Sequence[Array], target: Target, *, average: int = 1) -> Capture:
         """Show SLM fields one after the other, add their photographs, and compare with the target.
 
-        Parameters
-        ----------
-        fields : sequence of ndarray, complex, (height, width)
-            Time-multiplexed frames.
-        average : int
-            Photographs of each frame.
+        The fields, complex (height, width), are time-multiplexed frames; each is photographed ``average``
+        times.
         """
         io, display = self.io, self.display
-        full = (1 << io.bench.camera.significant_bits) - 1
-        exposure_ms = full / (12 * self.mean_per_ms)
+        exposure_ms = io.exposure_ms(self.mean_per_ms)
         total = np.zeros(io.bench.camera.image_shape)
         for field in fields:
             io.show(field)
             for _ in range(average):
                 total += io.photograph(exposure_ms)
-        ceiling = 0.98 * full / io.bench.camera.exposure_ms * len(fields) * average
+        ceiling = 0.98 * io.full_scale / io.bench.camera.exposure_ms * len(fields) * average
         shape = make_band(display.slm_shape, display.factor, "alias-free").seen_shape
         picture = np.fft.ifftshift(self.camera.resample(total, shape))
         seen = np.fft.fftshift(low_pass(picture, display.slm_shape))
@@ -197,15 +192,9 @@ def photograph_hologram(
 ) -> Photographed:
     """Register the camera by the mask's speckle, photograph a hologram, and compare it with its target.
 
-    Parameters
-    ----------
-    fields : sequence of ndarray, complex, (height, width)
-        Time-multiplexed frames; one where it is to be refined.
-    display : Display
-        With the mask's displacement where it is known.
-    options : CaptureOptions, optional
-    progress : callable, optional
-        ``progress(round, psnr_db)``.
+    ``fields``, complex (height, width), are time-multiplexed frames; one where it is to be refined. The
+    display has the mask's displacement where it is known; ``progress(round, psnr_db)`` is called when
+    refining.
 
     Raises InputError when the speckle is not recognised; DeviceError when a device fails.
     """

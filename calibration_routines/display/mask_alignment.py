@@ -97,14 +97,10 @@ class AlignmentReport:
 
 
 class MaskAlignment:
-    """Runs the procedure on an open bench.
+    """Runs the procedure on an open bench; what is known of the display's displacement is not used.
 
-    Parameters
-    ----------
-    display : Display
-        What is known of the display; its displacement is not used.
-    listener : Listener, optional
-        What is found is said to it, and every picture of spots shown; may raise to end the alignment.
+    What is found is said to the listener, and every picture of spots shown; it may raise to end the
+    alignment.
     """
 
     def __init__(

@@ -97,14 +97,9 @@ class AlignmentSettings(Checked):
 
 
 class AlignmentSession:
-    """One alignment in progress.
+    """One alignment in progress; what is known of the display's displacement is not used.
 
-    Parameters
-    ----------
-    display : Display
-        What is known of the display; its displacement is not used.
-    listener : Listener
-        What is found is said to it, and every picture of spots shown.
+    What is found is said to the listener, and every picture of spots shown to it.
     """
 
     def __init__(

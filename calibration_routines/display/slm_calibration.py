@@ -132,11 +132,10 @@ def _exposure_ms(io: DisplayBench) -> float:
     camera = io.bench.camera
     io.show_levels(np.zeros(io.slm.shape, np.uint8))
     first = io.photograph(camera.exposure_ms)
-    full = (1 << camera.significant_bits) - 1
     lit = float(np.mean(first[first > np.median(first) / 4]))
     if lit <= 0:
         raise BenchError(f"{camera.name}: it is dark. Check that the laser shines and the exposure.")
-    return full / (12 * lit)
+    return io.exposure_ms(lit)
 
 
 # Procedure -------------------------------------------------------------------------------------------

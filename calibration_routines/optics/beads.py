@@ -59,6 +59,7 @@ class SlideChanger(Protocol):
 
 
 _SOLVER = BlindSettings()
+_DEFLECTION_DEG = 1.0  # by which the diffuser bends light, for the window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,10 +179,7 @@ def photograph_slides(
 ) -> Floats:
     """Photograph a slide of beads several times, moved in between by the simulated world or the operator.
 
-    Returns
-    -------
-    ndarray, float32, (n_images, height, width)
-        Dark frame subtracted, colours averaged, binned.
+    Returns float32, (n_images, height, width): dark frame subtracted, colours averaged, binned.
 
     Raises OperatorNeededError when the slide has to be moved by hand and nobody can be asked;
     CalibrationError when an image saturates.
@@ -219,9 +217,8 @@ def photograph_slides(
                 f"Photograph {number + 1} saturates in {taken.saturated_pixels} pixels: dim the light or "
                 "spread the beads, and start again."
             )
-        light = taken.measurement
-        images.append(light if light.ndim == 2 else light.mean(axis=-1))
-    return np.stack(images).astype(np.float32)
+        images.append(taken.measurement)
+    return mean_images(images)
 
 
 def calibrate_beads(
@@ -232,15 +229,10 @@ def calibrate_beads(
     provenance: dict[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> BeadCalibration:
-    """Recover a calibration from bead images.
+    """Recover a calibration from bead images, (n_images, height, width), dark frame subtracted.
 
-    Parameters
-    ----------
-    images : ndarray, float32, (n_images, height, width)
-        Dark frame subtracted.
-    geometry : Geometry
-        Of the images' pixels. ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the PSFs;
-        ``aperture_mm`` gives the window where none is named.
+    ``geometry`` is that of the images' pixels: ``diffuser_distance_mm`` and ``pixel_pitch_um`` place the
+    PSFs, ``aperture_mm`` gives the window where none is named.
 
     Raises BenchError when the geometry lacks what is needed; InputError when the images cannot be solved.
     """
@@ -286,31 +278,27 @@ def needed_geometry(geometry: Geometry) -> list[float]:
 def window_for(slides: BeadSlides, geometry: Geometry, shape: tuple[int, int]) -> tuple[int, int]:
     """Return height and width in which a PSF is looked for, at most the images' ``shape``.
 
-    Raises BenchError when it neither is given nor follows from the geometry.
+    Unless given, the aperture's shadow at the slides' depth, and what is bent beyond it. Raises BenchError
+    where the aperture, the distance d or the pitch are not known for that.
     """
-    height, width = slides.window_px.shape if slides.window_px else window_of(geometry, slides.z_um)
-    return min(height, shape[0]), min(width, shape[1])
-
-
-def window_of(geometry: Geometry, z_um: float, deflection_deg: float = 1.0) -> tuple[int, int]:
-    """Return the pixels that hold a PSF: the aperture's shadow at a depth, and what is bent beyond it.
-
-    Raises BenchError when the aperture, the distance d or the pitch are not known.
-    """
-    aperture_mm, distance_mm, pitch_um = known(
-        geometry,
-        "aperture_mm",
-        "diffuser_distance_mm",
-        "pixel_pitch_um",
-        what="How large the pattern is follows",
-        otherwise=", or the window with --window",
-    )
-    bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(deflection_deg))
-    height, width = (
-        int((1e3 * side * (1 + 1e3 * distance_mm / z_um) + bent_um) / pitch_um) // 2 * 2 + 1
-        for side in aperture_mm
-    )
-    return height, width
+    if slides.window_px is not None:
+        window = slides.window_px.shape
+    else:
+        aperture_mm, distance_mm, pitch_um = known(
+            geometry,
+            "aperture_mm",
+            "diffuser_distance_mm",
+            "pixel_pitch_um",
+            what="How large the pattern is follows",
+            otherwise=", or the window with --window",
+        )
+        bent_um = 2e3 * distance_mm * np.tan(np.deg2rad(_DEFLECTION_DEG))
+        height, width = (
+            int((1e3 * side * (1 + 1e3 * distance_mm / slides.z_um) + bent_um) / pitch_um) // 2 * 2 + 1
+            for side in aperture_mm
+        )
+        window = height, width
+    return min(window[0], shape[0]), min(window[1], shape[1])
 
 
 def mean_images(frames: Sequence[npt.NDArray[Any]]) -> Floats:

@@ -85,8 +85,6 @@ def photograph(
 
     Parameters
     ----------
-    bench : Bench
-        Open.
     exposure_ms : float, optional
         By default what :func:`~calibration_routines.expose_scene` finds.
     folder : path, optional
@@ -97,7 +95,6 @@ def photograph(
         Software binning, on top of the camera's; the same as the calibration's.
     control : RunControl, optional
         To pause, abort or stop the run from another thread.
-    listener : Listener, optional
 
     Raises as :func:`instrument.runs.acquire.acquire`, and CalibrationError when the run was ended before its
     last frame.
@@ -169,16 +166,10 @@ class FieldResponse:
 def fit_field_response(
     sources_um: Sequence[tuple[float, float, float]], light: Sequence[float]
 ) -> FieldResponse:
-    """Fit the response to the total light of sources of equal intensity at one depth.
+    """Fit the response to the total light of sources of equal intensity at one depth, counts above dark.
 
-    Parameters
-    ----------
-    sources_um : sequence of (x, y, z)
-        At least three, off axis in x and in y.
-    light : sequence of float
-        Total counts above dark for each.
-
-    Raises CalibrationError when the places do not determine the fit or a source was not seen.
+    They are at least three, off axis in x and in y. Raises CalibrationError when the places do not determine
+    the fit or a source was not seen.
     """
     x, y, z = np.array(sources_um, np.float64).T
     counts = np.array(light, np.float64)
@@ -224,7 +215,6 @@ def measure_field_response(
         Where the run's folder is made; the bench's data folder by default.
     average : int
         Frames a place.
-    listener : Listener, optional
 
     Raises PlanError when a place is out of reach (nothing moved); CalibrationError when the sensor's edge
     cuts the pattern at one of the places, or the run ended early.

@@ -178,10 +178,7 @@ def plane_light(plane: PlaneFrames, dark: DarkModel) -> Float:
 def replace_hot(image: Float, hot: npt.NDArray[np.bool_]) -> Float:
     """Replace hot pixels by the median of the 3 x 3 pixels around them.
 
-    Parameters
-    ----------
-    image : ndarray, float32, (height, width) or (height, width, 3)
-    hot : ndarray of bool, shape of ``image``
+    Image and mask are (height, width) or (height, width, 3).
     """
     if not hot.any():
         return image

@@ -309,10 +309,7 @@ def source_limits(bench: Bench) -> dict[str, tuple[float, float]]:
 def require_reach(bench: Bench, places: Mapping[str, tuple[int, float]]) -> None:
     """Refuse settings that put the source beyond the stage's travel.
 
-    Parameters
-    ----------
-    places : mapping
-        Setting's name to axis (0: x, 1: y, 2: z) and place, micrometres from the diffuser's centre.
+    ``places`` maps a setting's name to axis (0: x, 1: y, 2: z) and micrometres from the diffuser's centre.
     """
     limits, problems = source_limits(bench), []  # no stage, no limits: what needs one says so
     for name, (axis, place_um) in places.items():

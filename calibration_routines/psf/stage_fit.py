@@ -122,12 +122,8 @@ def judge_visit(
 ) -> tuple[str, ...]:
     """Return what changed between two visits, in words.
 
-    Parameters
-    ----------
-    brightness, shift_px : (float, float)
-        At the earlier and at the later visit, relative to the first of all.
-    points : (int, int)
-        Points of the sweep that had been taken before each.
+    Each pair is of the earlier and of the later visit: brightness and shift relative to the first visit of
+    all, and how many of the sweep's points had been taken before.
     """
     findings = []
     where = f"between points {points[0] + 1} and {points[1]}"

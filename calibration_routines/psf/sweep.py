@@ -104,23 +104,16 @@ def calibrate_sweep(
     ----------
     bench : Bench
         Open, its stage homed.
-    sweep : AxialSweep, LateralSweep, VolumeSweep or PointSweep
     folder : path, optional
         Where the run's folder is made; the bench's data folder by default.
     exposures : SweepExposures, optional
         From :func:`~calibration_routines.expose_sweep`, which is called when None.
     control : RunControl, optional
-        To pause, abort or stop it from another thread; it follows the sweep's run, and that of each round of
-        retakes after it.
+        Pauses, aborts or stops it from another thread, in the sweep's run and in each round of retakes.
     listener : Listener, optional
         Its ``event`` is called with a :class:`~calibration_routines.PointTaken` as soon as a PSF has been
         taken and judged, and with a :class:`~calibration_routines.SourceVisit` after each visit to the
         reference point, in the thread that sweeps.
-
-    Returns
-    -------
-    SweepCalibration
-        ``findings`` is empty when every PSF is good.
 
     Raises PlanError, SettingsError when the sweep leaves the limits of the bench or the disk (nothing moved);
     CalibrationError when no exposure is usable, or the run was ended before its last frame.
@@ -147,18 +140,9 @@ def calibrate_sweep(
 
 
 def watch_sweep(bench: Bench, runner: Runner, listener: Listener) -> None:
-    """Let a sweep's run be watched; what one that goes on has already is looked at first.
+    """Let a sweep's run, not yet begun, be watched; what one that goes on has already is looked at first.
 
-    Parameters
-    ----------
-    bench : Bench
-        Open.
-    runner : Runner
-        Of a new run, or from :func:`~instrument.runs.acquire.prepare_resume`; not yet begun.
-    listener : Listener
-        Its ``event`` is not called for what was taken before.
-
-    Raises CalibrationError when the run is no sweep.
+    The listener's ``event`` is not called for that. Raises CalibrationError when the run is no sweep.
     """
     record = SWEEP.read(runner.path)
     watch = SweepWatch(record.sweep, record.geometry)
@@ -179,14 +163,7 @@ def finish_sweep(
 ) -> SweepCalibration:
     """Make the calibration of a sweep's complete run, e.g. of one that was resumed.
 
-    Parameters
-    ----------
-    run : path
-        The run's folder.
-    bench : Bench, optional
-        For retakes; without one, PSFs that need them are only flagged.
-    control, listener : optional
-        As :func:`calibrate_sweep`.
+    Without a ``bench``, for retakes, PSFs that need them are only flagged.
 
     Raises CalibrationError when the run is no sweep or is not complete; CalibrationFileError when it has its
     calibration already.

@@ -54,12 +54,7 @@ def sweep_plan(sweep: PointSweep, exposures_ms: Sequence[float]) -> Plan:
     """Return the plan: dark frames at the shortest and longest exposure, then every point in order.
 
     The reference point is visited before the first point, after every ``reference_every``, and after the
-    last, with its own exposure.
-
-    Parameters
-    ----------
-    exposures_ms : sequence of float
-        One a point.
+    last, with its own exposure. ``exposures_ms`` has one a point.
     """
     points_um = sweep.points_um
     if len(exposures_ms) != len(points_um):
@@ -192,14 +187,13 @@ def expose_sweep(bench: Bench, sweep: PointSweep, *, control: RunControl | None 
     Raises CalibrationError when a PSF saturates at the shortest exposure, stays too dark at the longest, or
     flickers; EndedEarlyError when it was ended through ``control``.
     """
-    depths = sweep.depths_um
+    control, depths = control or RunControl(), sweep.depths_um
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})
     found: list[tuple[float, AutoExposure]] = []
     slopes: list[float] = []
     try:
         for z_um in asked:
-            if control is not None:
-                control.check()
+            control.check()
             axis = sweep.axis_point(z_um)
             if not sweep.by_hand:
                 bench.place_source(*axis)
@@ -218,13 +212,10 @@ def expose_sweep(bench: Bench, sweep: PointSweep, *, control: RunControl | None 
     return SweepExposures(tuple(exposures), tuple(found))
 
 
-def _slope(
-    bench: Bench, sweep: PointSweep, axis: Position, on_axis_ms: float, control: RunControl | None
-) -> float:
+def _slope(bench: Bench, sweep: PointSweep, axis: Position, on_axis_ms: float, control: RunControl) -> float:
     """Return how the logarithm of the exposure grows with the squared tangent; 0 where no place tells."""
     for beside in _beside(sweep, axis):
-        if control is not None:
-            control.check()
+        control.check()
         bench.place_source(*beside)
         try:
             dimmer = expose_source(bench, target=sweep.target)

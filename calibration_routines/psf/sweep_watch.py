@@ -95,19 +95,10 @@ TakeAgain = Callable[[Position, float], list[Snapshot]]
 
 
 class SweepWatch:
-    """Sees a sweep's photographs one by one and judges its points.
+    """Sees a sweep's photographs one by one and judges its points; ``geometry``: of the camera's pixels.
 
-    Parameters
-    ----------
-    geometry : Geometry
-        Of the camera's pixels.
-
-    Attributes
-    ----------
-    on_event : callable or None
-        Called with a :class:`PointTaken` or :class:`SourceVisit` in the thread that executes.
-    take_again : callable or None
-        None: points that need it are only reported.
+    What is seen goes to ``on_event``, in the thread that executes; without ``take_again`` points that need it
+    are only reported.
     """
 
     def __init__(
