@@ -69,16 +69,9 @@ class Admm(Solver):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "_y",
-        "_tx",
-        "_ty",
-        "_t_w",
-        "_mu",
-        "_T",
-        "_Q",
-        "_t_v",
-        "_data_sums",
-    )
+        "_y", "_mu", "_priors.tx", "_priors.ty", "_priors.t_w",
+        "_split.T", "_split.Q", "_split.t", "_split.sums",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -102,16 +95,9 @@ class Admm(Solver):
         start = np.zeros(operator.domain_shape, operator.dtype)
         if initial is not None:
             start[...] = initial
-        self._split = split = DataSplit(camera, valid, weight, penalties.data, start, relax)
-        self._T, self._Q, self._t_v, self._data_sums = split.T, split.Q, split.t, split.sums
+        self._split = DataSplit(camera, valid, weight, penalties.data, start, relax)
         self._priors = priors = PriorSplits(prior, start)
-        self._y, self._tx, self._ty, self._t_w, self._mu = (
-            priors.y,
-            priors.tx,
-            priors.ty,
-            priors.t_w,
-            priors.mu,
-        )
+        self._y, self._mu, self.splits = priors.y, priors.mu, priors.others
         power = float(np.mean(camera.power()))
         differences = 1.0 if penalties.differences is None else penalties.differences
         self._mu_data = penalties.data
@@ -140,7 +126,7 @@ class Admm(Solver):
         if self._settles and tv and self.iteration in SETTLING:
             self._settle_differences(tv.weight)
         # What is known of the iterate that the sweep is about to turn into a right-hand side.
-        data = self._data_sums.sum(axis=0)
+        data = self._split.sums.sum(axis=0)
         if self._priors.others:
             if self.iteration in SETTLING:
                 self._priors.set_penalties(self._mu)
@@ -150,15 +136,6 @@ class Admm(Solver):
             self._priors.sweep(self.relax, c)
             self._split.solve(c, y, mu_u[c], mu_w[c])
         return self._record(*data)
-
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with that of priors known by their prox."""
-        return {**super().checkpoint(copy=copy), **self._priors.checkpoint()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint taken from a solver of the same problem."""
-        super().restore(state)
-        self._priors.restore(state)
 
     def _record(
         self, misfit: float, disagreement: float, change: float, norm: float, multiplier: float

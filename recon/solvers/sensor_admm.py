@@ -86,7 +86,9 @@ class SensorAdmm(Solver):
         Conjugate gradient steps an iteration.
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("_y", "_tx", "_ty", "_t_w", "_mu", "_e", "_E", "_data")
+    state_names: ClassVar[tuple[str, ...]] = (
+        "_y", "_mu", "_splits.tx", "_splits.ty", "_splits.t_w", "_e", "_E", "_data",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -119,13 +121,7 @@ class SensorAdmm(Solver):
         if initial is not None:
             start[...] = initial
         self._splits = splits = PriorSplits(prior, start)
-        self._y, self._tx, self._ty, self._t_w, self._mu = (
-            splits.y,
-            splits.tx,
-            splits.ty,
-            splits.t_w,
-            splits.mu,
-        )
+        self._y, self._mu, self.splits = splits.y, splits.mu, splits.others
         # ``e`` and its spectrum: keeping the latter saves a transform an iteration.
         self._e = np.zeros(operator.range_shape, operator.dtype)
         self._E = np.zeros(fft.spectrum_shape(start.shape), fft.complex_dtype(operator.dtype))
@@ -209,14 +205,9 @@ class SensorAdmm(Solver):
             self._splits.sweep(self.relax, channel)
         return misfit
 
-    def checkpoint(self, *, copy: bool = True) -> dict[str, Any]:
-        """Return the state, with that of priors known by their prox."""
-        return {**super().checkpoint(copy=copy), **self._splits.checkpoint()}
-
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint taken from a solver of the same problem."""
         super().restore(state)
-        self._splits.restore(state)
         self._adapt()
 
     def _solve(self, channel: int, steps: int) -> float:
@@ -321,7 +312,7 @@ class SensorAdmm(Solver):
             gradient = self._camera.adjoint(misfit)
             for c, pixels in enumerate(w):
                 size, slope = float(np.linalg.norm(pixels)), float(np.linalg.norm(gradient[c]))
-                multiplier = float(self._mu[1, c] * np.linalg.norm(self._t_w[c] - pixels))
+                multiplier = float(self._mu[1, c] * np.linalg.norm(self._splits.t_w[c] - pixels))
                 if size > 0:
                     balanced[1, c] = np.sqrt(multiplier * slope) / size
         steps = np.array(LARGEST_STEP)[:, None]
