@@ -200,6 +200,27 @@ def test_videos_take_them(fresh: Fresh) -> None:
     assert said[2].endswith("vignetting")
 
 
+def test_live_pictures_take_them(fresh: Fresh) -> None:
+    lines = (
+        "import time",
+        "import numpy as np",
+        "from recon.evaluation.scene import make_scene",
+        "from recon.streams.live import LiveReconstructor",
+        "scene = make_scene('sparse-picture', size=48)",
+        "for own in ({'solver': 'landweber'}, {'prior': 'colour-groups'}, {'model': 'vignetting'}):",
+        "    live = LiveReconstructor(scene.calibration, budget_ms=1000.0, **own)",
+        "    until_s = time.monotonic() + 60",
+        "    picture = live.feed(scene.measurement)",
+        "    while not picture.total_iterations and time.monotonic() < until_s:",
+        "        time.sleep(0.05)  # the solver is made in a thread beside the first pictures",
+        "        picture = live.feed(scene.measurement)",
+        "    assert picture.total_iterations > 0 and not live.warnings, (own, live.warnings)",
+        "    assert np.isfinite(picture.image).all() and picture.image.max() > 0, own",
+        "    print(picture.method)",
+    )
+    assert fresh.run("-c", "\n".join(lines)).split()[0] == "landweber"
+
+
 def test_the_prox_is_that_of_the_value() -> None:
     spec = importlib.util.spec_from_file_location("own_prior", EXAMPLE / "own_prior.py")
     assert spec is not None

@@ -52,7 +52,7 @@ class SimulatedCameraSettings(SimulatedDevice, Camera):
     Options = CameraOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        self._connect(shared)
+        self._join(shared)
         self.options = options = CameraOptions.of(options)
         self._spec = self.world.sensor
         self._reset_settings()

@@ -40,7 +40,7 @@ class SimulatedLedArray(SimulatedDevice, LedArray):
     world: SimulatedWorld
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        self._connect(shared)
+        self._join(shared)
         self.options = options = LedArrayOptions.of(options)
         self._positions_mm = _round_array(options.leds, options.led_pitch_mm)
         self._pattern = OFF

@@ -41,7 +41,7 @@ class SimulatedSlm(SimulatedDevice, Slm):
     Options = SlmOptions
 
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        self._connect(shared)
+        self._join(shared)
         self.options = options = SlmOptions.of(options)
         self._closing = threading.Event()
         self._displayed = np.zeros(options.shape, np.uint8)

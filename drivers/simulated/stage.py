@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import threading
+import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from drivers.common.stage_axes import AXIS_NAMES, check_target, trapezoid_duration_s
-from drivers.device import DriverOptions, Setting, SharedPart
-from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
+from drivers.common.polled_stage import PolledStage, StageState
+from drivers.common.stage_axes import AXIS_NAMES, trapezoid_duration_s
+from drivers.device import DeviceIdentity, DriverOptions, SharedPart
 from drivers.simulated.mechanics import AxisSpec, Carriage
 from drivers.simulated.options import NotNegative, Positive
 from drivers.simulated.surroundings import SimulatedDevice, Surroundings
 from drivers.simulated.world import SimulatedWorld
-from drivers.stage import Stage, StageAxis
+from drivers.stage import StageAxis
 
-POLL_S = 0.002
 REFERENCE_S = 1.0
 
 
@@ -68,7 +68,7 @@ class StageOptions(DriverOptions):
         return self
 
 
-class CarriageStage(SimulatedDevice, Stage):
+class CarriageStage(SimulatedDevice, PolledStage):
     """A stage of one to six axes that takes its time, has play, and carries something.
 
     What its axes are and what it carries is the subclasses' business. Before homing, moves are refused.
@@ -78,8 +78,12 @@ class CarriageStage(SimulatedDevice, Stage):
     Shared: ClassVar[type[Surroundings]] = SimulatedWorld
     Options = StageOptions
 
+    poll_s = 0.002
+    grace_s = 0.0
+
     def __init__(self, options: DriverOptions, shared: SharedPart | None = None) -> None:
-        self._connect(shared)
+        super().__init__()
+        self._join(shared)
         self.options = options = StageOptions.of(options)
         specs = tuple(
             self._axis_spec(name, options.axes.get(name, AxisOptions())) for name in options.axis_names
@@ -88,124 +92,61 @@ class CarriageStage(SimulatedDevice, Stage):
         self._axes = tuple(
             StageAxis(s.name, s.lower_limit, s.upper_limit, s.speed_per_s, s.resolution) for s in specs
         )
-        self._stop = threading.Event()
+        self.stuck_s *= max(1.0, self.world.clock.time_scale)  # on its reference mark it stays for a while
         self._lock = threading.RLock()
         self._homed = False
-        self._homing = False
-        self._commanded = self.carriage.reported()
+        self._referenced_after_s: float | None = None
+        """While homing: simulated seconds from ``_began_s`` until the axes have found their references."""
+        self._began_s = 0.0
 
     @abstractmethod
     def _axis_spec(self, name: str, options: AxisOptions) -> AxisSpec:
         """Return an axis with what the options leave out filled in."""
 
-    # Device ---
-    def open(self) -> None:
-        """Connect; nothing moves, and nothing may move before homing."""
+    # The protocol ---
+    def _connect(self) -> tuple[DeviceIdentity, tuple[StageAxis, ...]]:
         self.world.check_plugged(self.kind, self.name)
         self._is_open = True
+        return self.identity, self._axes
 
-    def close(self) -> None:
-        """Stop any motion and disconnect."""
-        if self._is_open:
-            self._halt()
-            self._is_open = False
+    def _disconnect(self) -> None:
+        self._is_open = False
 
-    def settings(self) -> Mapping[str, Setting]:
-        """Read position, limits and speeds."""
-        self._require()
-        settings: dict[str, Setting] = {"homed": self._homed}
-        return settings | self._common_settings(self.position())
+    @property
+    def _is_connected(self) -> bool:
+        return self._is_open and self.world.is_plugged(self.kind)
+
+    def _state(self) -> StageState:
+        with self._lock:
+            jammed, tripped = self.carriage.jammed_axes(), self.carriage.tripped_switches()
+            if self._referenced_after_s is None:
+                self._homed = self._homed and not (jammed or tripped)
+            elif not jammed and self.world.clock.elapsed_since(self._began_s) >= self._referenced_after_s:
+                self.carriage.find_reference()
+                self._homed, self._referenced_after_s = True, None
+            faults = [f"axis {', '.join(jammed)} does not move"] if jammed else []
+            if tripped:
+                faults.append(f"axis {', '.join(tripped)} ran into its limit switch")
+            moving = self.carriage.is_moving or self._referenced_after_s is not None
+            return StageState(self.carriage.reported(), moving, self._homed, tuple(faults))
+
+    def _start(self, target: Mapping[str, float]) -> None:
+        self.carriage.start(target)
+
+    def _start_homing(self) -> None:
+        """Run every axis to its reference mark, and slowly onto it."""
+        with self._lock:
+            self._homed = False
+            self._began_s = time.monotonic()
+            way_s = self.carriage.start({spec.name: spec.home for spec in self.carriage.axes.values()})
+            self._referenced_after_s = way_s + REFERENCE_S
+
+    def _halt(self) -> None:
+        with self._lock:
+            self._referenced_after_s = None
+            self.carriage.halt()
 
     # Stage ---
-    @property
-    def axes(self) -> tuple[StageAxis, ...]:
-        """The stage's axes."""
-        return self._axes
-
-    def position(self) -> dict[str, float]:
-        """Where the stage says it is."""
-        self._require()
-        return self.carriage.reported()
-
-    def commanded_position(self) -> dict[str, float]:
-        """Return the last target asked for."""
-        self._require()
-        return dict(self._commanded)
-
-    @property
-    def is_homed(self) -> bool:
-        """Whether positions refer to a known reference."""
-        return self._homed
-
-    @property
-    def is_moving(self) -> bool:
-        """Whether any axis moves."""
-        self._require()
-        return self.carriage.is_moving
-
-    def home(self) -> None:
-        """Run every axis to its reference mark, and slowly onto it."""
-        self._require()
-        with self._lock:
-            self._homed = False
-            self._homing = True
-            self._begin({spec.name: spec.home for spec in self.carriage.axes.values()})
-        try:
-            self.wait()
-            self.world.clock.wait(REFERENCE_S, self._stop)
-            with self._lock:
-                if self._stop.is_set():
-                    raise StoppedError(self.name, "homing was stopped.", "Home again before the next move.")
-                self.carriage.find_reference()
-                self._commanded = self.carriage.reported()
-                self._homed = True
-        finally:
-            self._homing = False
-
-    def move_to(self, target: Mapping[str, float], *, wait: bool = True) -> dict[str, float]:
-        """Move the named axes to absolute positions."""
-        self._require()
-        check_target(self.name, self._axes, target, self._homed)
-        with self._lock:
-            self._begin(target)
-        if wait:
-            self.wait()
-        return self.position()
-
-    def wait(self, timeout_s: float | None = None) -> None:
-        """Block until a running move has ended."""
-        self._require()
-        waited = 0.0
-        while not self._stop.is_set() and self.carriage.is_moving:
-            jammed = self.carriage.jammed_axes()
-            if jammed:
-                self.carriage.halt()
-                self._homed = False
-                raise DeviceTimeoutError(
-                    self.name, f"axis {', '.join(jammed)} does not move.", "Free it and home again."
-                )
-            if timeout_s is not None and waited >= timeout_s:
-                raise DeviceTimeoutError(
-                    self.name, f"still moves after {timeout_s:g} s.", "Wait longer or stop."
-                )
-            self._stop.wait(POLL_S)
-            waited += POLL_S
-            self._require()
-        if self._stop.is_set():
-            raise StoppedError(self.name, "the move was stopped.", "Check the position before going on.")
-        tripped = self.carriage.tripped_switches()
-        if tripped:
-            self.carriage.halt()
-            self._homed = False
-            raise DeviceError(
-                self.name, f"axis {', '.join(tripped)} ran into its limit switch.", "Home again."
-            )
-
-    def stop(self) -> None:
-        """Stop every axis at once."""
-        self._require()
-        self._halt()
-
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Seconds for a move, with acceleration; axes move together, so the slowest counts."""
         specs = self.carriage.axes
@@ -219,18 +160,6 @@ class CarriageStage(SimulatedDevice, Stage):
             ),
             default=0.0,
         )
-
-    def _begin(self, target: Mapping[str, float]) -> None:
-        self._stop.clear()
-        self._commanded = self._commanded | dict(target)
-        self.carriage.start(target)
-
-    def _halt(self) -> None:
-        with self._lock:
-            if self.carriage.is_moving or self._homing:
-                self._stop.set()
-            self.carriage.halt()
-            self._commanded = self.carriage.reported()
 
 
 class SimulatedStage(CarriageStage):

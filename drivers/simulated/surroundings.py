@@ -102,9 +102,13 @@ class Surroundings(SharedPart):
         """Plug a device in again."""
         self._unplugged -= {kind}
 
+    def is_plugged(self, kind: str) -> bool:
+        """Whether a device's plug is in."""
+        return kind not in self._unplugged
+
     def check_plugged(self, kind: str, name: str) -> None:
         """Raise :class:`DeviceError` when the device is unplugged."""
-        if kind in self._unplugged:
+        if not self.is_plugged(kind):
             raise DeviceError(name, "was unplugged.", "Plug it in and open the bench again.")
 
 
@@ -122,7 +126,7 @@ class SimulatedDevice(Device):
         """Claim nothing: every program has a simulated world of its own."""
         return ()
 
-    def _connect(self, shared: SharedPart | None) -> None:
+    def _join(self, shared: SharedPart | None) -> None:
         if not isinstance(shared, self.Shared):
             raise TypeError(
                 f"{self.name} needs the bench's {self.Shared.__name__}, not {type(shared).__name__}."

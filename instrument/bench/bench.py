@@ -220,17 +220,13 @@ class Bench:
     ) -> Position:
         """Move the point source to a place given from the diffuser's centre; None keeps a coordinate.
 
+        Raises LimitError when the place is out of the stage's reach; nothing moves. Raises BenchError when
+        there is no stage, or it lacks the axis; nothing moves.
+
         Returns
         -------
         tuple of float
             The place reached, as the stage reads.
-
-        Raises
-        ------
-        LimitError
-            When the place is out of the stage's reach; nothing moves.
-        BenchError
-            When there is no stage, or it lacks the axis; nothing moves.
         """
         mount = self.source_mount
         mount.stage.move_to(mount.target(x_um, y_um, z_um))

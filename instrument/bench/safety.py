@@ -176,12 +176,8 @@ def _made_sure(
 def try_all(steps: Iterable[SafeStep]) -> None:
     """Run every step in order, each even if those before it failed or were interrupted.
 
-    Raises
-    ------
-    KeyboardInterrupt, SystemExit
-        The first of them that came during a step, after every step was tried; failures are its notes.
-    StepsFailedError
-        When steps failed.
+    Raises KeyboardInterrupt or SystemExit: the first of them that came during a step, after every step was
+    tried; failures are its notes. Raises StepsFailedError when steps failed.
     """
     failures: list[tuple[str, BaseException]] = []
     interruption: BaseException | None = None
@@ -207,10 +203,7 @@ def stop_until(stop: Callable[[], None], ended: threading.Event, *, once: bool =
 
     Once is not enough: another thread may have been about to start a move, an exposure or a light.
 
-    Raises
-    ------
-    StepsFailedError
-        The last, when a device could not be made safe; all were tried.
+    Raises StepsFailedError: the last, when a device could not be made safe; all were tried.
     """
     failure: StepsFailedError | None = None
     deadline_s = time.monotonic() + _STOP_WAIT_S

@@ -253,10 +253,7 @@ def _folders(given: Sequence[Path], *, compared: bool) -> Sequence[Path]:
 def _subject(given: Given) -> _Subject:
     """Return what is to be charted.
 
-    Raises
-    ------
-    BenchError
-        When none or more than one is given.
+    Raises BenchError when none or more than one is given.
     """
     own = any(name in given for name in ("calibration", "psf", "image"))
     found = [s for s, name in ((_SCENE, "scene"), (_HOLOGRAM, "hologram")) if name in given]

@@ -58,10 +58,7 @@ class Given:
     def refuse(self, title: str, *subjects: str) -> None:
         """Refuse what was given and applies to none of these subjects, as the options declare it.
 
-        Raises
-        ------
-        BenchError
-            Which options, with the title ("--video"), and what they are for.
+        Raises BenchError: which options, with the title ("--video"), and what they are for.
         """
         applies = {name: o.declaration.applies for name, o in self.options.items()}
         wrong = [name for name, about in applies.items() if about and not set(about) & set(subjects)]
@@ -204,10 +201,7 @@ def _parameter(key: str, o: Option) -> inspect.Parameter:
 def _read(declared: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of what was typed.
 
-    Raises
-    ------
-    BenchError
-        With all mistakes at once, each with its flag.
+    Raises BenchError with all mistakes at once, each with its flag.
     """
     values: dict[str, Any] = {}
     wrong: list[str] = []

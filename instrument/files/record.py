@@ -203,18 +203,11 @@ def plain(value: Any) -> Any:
 def value_of(kind: type[T], data: Any, unknown: Unknown | None = None) -> T:
     """Return the value of a type that :func:`plain` turned into ``data``.
 
-    Parameters
-    ----------
-    kind : type
-        A dataclass, or what its fields may be: numbers, strings, dates, paths, enumerations, tuples, lists,
-        mappings, arrays, other dataclasses, and any of these or None.
-    unknown : dict, optional
-        Takes the fields that no dataclass here has, by dotted name; without it they are left out silently.
+    ``kind``: a dataclass, or what its fields may be: numbers, strings, dates, paths, enumerations, tuples,
+    lists, mappings, arrays, other dataclasses, and any of these or None. ``unknown``: takes the fields that
+    no dataclass here has, by dotted name; without it they are left out silently.
 
-    Raises
-    ------
-    LookupError, TypeError, ValueError
-        When ``data`` describe no such value.
+    Raises LookupError, TypeError or ValueError when ``data`` describe no such value.
     """
     value: T = _reader(typing.cast(Any, kind))(data, unknown if unknown is not None else {}, "")
     return value

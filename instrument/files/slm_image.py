@@ -134,10 +134,7 @@ def read_slm_levels(path: Path | str) -> npt.NDArray[np.uint8]:
 def read_slm_image(path: Path | str) -> tuple[npt.NDArray[np.uint8], dict[str, Any]]:
     """Read a pattern and the facts beside it (empty where there is no JSON file: any 8-bit grey image goes).
 
-    Raises
-    ------
-    FileError
-        As :func:`read_slm_levels`; or when the JSON file is no description of a pattern.
+    Raises FileError as :func:`read_slm_levels`; or when the JSON file is no description of a pattern.
     """
     levels, beside = read_slm_levels(path), side_car(path)
     return levels, SLM_PHASE.read(beside) if beside.exists() else {}

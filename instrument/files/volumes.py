@@ -62,6 +62,8 @@ def write_volume_zarr(
 ) -> None:
     """Write a volume as OME-Zarr 0.5, whole or not at all; a folder of that name is replaced.
 
+    Raises OSError when the disk is full or not writable; what was there before stays as it was.
+
     Parameters
     ----------
     path : Path
@@ -73,11 +75,6 @@ def write_volume_zarr(
         every plane's own ``z_um`` and ``pitch_um`` beside it in the group's attribute ``diffuserbench``.
     attributes : dict
         JSON-compatible; what else shall stand in the attribute ``diffuserbench``.
-
-    Raises
-    ------
-    OSError
-        When the disk is full or not writable; what was there before stays as it was.
     """
     import zarr
 

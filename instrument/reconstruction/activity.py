@@ -52,19 +52,7 @@ TRACES_SHOWN = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActivitySettings:
-    """How activity is looked for.
-
-    Attributes
-    ----------
-    window_s : float
-        Of the baseline.
-    percentile : float
-        Of a pixel's values within it.
-    align : bool
-        Move frames back to one place first.
-    least_correlation, radius_px
-        As :func:`recon.streams.activity.find_regions`.
-    """
+    """How activity is looked for."""
 
     window_s: float = option(
         WINDOW_S, help="Of the sliding baseline.", unit="s", least=0, flags=("--window",), group="Activity"
@@ -89,39 +77,29 @@ class ActivitySettings:
         flags=("--radius",),
         group="Activity",
     )
+    """As :func:`recon.streams.activity.find_regions`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Activity:
-    """What was found in a video.
-
-    Attributes
-    ----------
-    indices : tuple of int
-        The video's frames that there are; all arrays below hold these.
-    times_s : ndarray, float64, (n_frames,)
-        Frame numbers, where the video's times are not known.
-    frames, dff : ndarray, float32, (n_frames, height, width)
-        Fluorescence, and its relative change.
-    correlation : ndarray, float32, (height, width)
-    regions : list of Region
-    traces : ndarray, float32, (n_regions, n_frames)
-        dF/F of the regions' mean fluorescence.
-    motion : Motion
-        Before alignment.
-    faded : float
-        Share of the field's light that is lost by the end; negative where it grows.
-    """
+    """What was found in a video."""
 
     indices: tuple[int, ...]
+    """The video's frames that there are; all arrays below hold these."""
     times_s: npt.NDArray[np.float64]
+    """float64, (n_frames,): frame numbers, where the video's times are not known."""
     frames: Floats
     dff: Floats
+    """float32, (n_frames, height, width): fluorescence, and its relative change."""
     correlation: Floats
+    """float32, (height, width)."""
     regions: list[Region]
     traces: Floats
+    """float32, (n_regions, n_frames): dF/F of the regions' mean fluorescence."""
     motion: Motion
+    """Before alignment."""
     faded: float
+    """Share of the field's light that is lost by the end; negative where it grows."""
 
 
 def find_activity(
@@ -129,18 +107,10 @@ def find_activity(
 ) -> Activity:
     """Look for activity in a reconstructed video.
 
-    Parameters
-    ----------
-    video : VideoPictures
-        Colour is averaged.
-    settings : ActivitySettings, optional
-    free_bytes : int, optional
-        Memory that may be taken; refused where the video needs more.
+    ``video``: colour is averaged. ``free_bytes``: memory that may be taken; refused where the video needs
+    more.
 
-    Raises
-    ------
-    BenchError, FileError, InputError
-        When the video is too short, too large, or dark.
+    Raises BenchError, FileError or InputError when the video is too short, too large, or dark.
     """
     settings = settings or ActivitySettings()
     indices = [index for index in range(len(video)) if video.is_written(index)]

@@ -35,9 +35,7 @@ _FINISHED = (StopReason.CONVERGED, StopReason.NOISE_LEVEL)
 def require_kept(request: PictureRequest | VolumeRequest) -> None:
     """Refuse to keep what has no iterations.
 
-    Raises
-    ------
-    BenchError
+    Raises BenchError.
     """
     solver = request.options.solver
     if solver != "auto" and SOLVERS.named(solver).one_step:
@@ -51,12 +49,7 @@ def checkpoint_for(
 
     What only says when to stop may differ from the earlier run.
 
-    Raises
-    ------
-    BenchError
-        As :func:`require_kept`.
-    FileError
-        When the folder keeps something else.
+    Raises BenchError as :func:`require_kept`; FileError when the folder keeps something else.
     """
     if folder is None:
         return None
@@ -106,6 +99,8 @@ EVERY_S = 60.0
 class CheckpointFolder:
     """A :class:`recon.solvers.base.Keeper` in a folder.
 
+    Raises FileError when the folder holds something else, or cannot be written to.
+
     Parameters
     ----------
     folder : Path
@@ -114,11 +109,6 @@ class CheckpointFolder:
         What decides the result, JSON-compatible: a folder kept for something else is refused.
     every_s : float
         Least time between two writings of a part.
-
-    Raises
-    ------
-    FileError
-        When the folder holds something else, or cannot be written to.
     """
 
     def __init__(self, folder: Path, problem: Mapping[str, Any], *, every_s: float = EVERY_S) -> None:

@@ -47,23 +47,15 @@ from recon.types import Calibration
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """How a photograph became a measurement, to be done again to others of the same camera.
-
-    Attributes
-    ----------
-    first_binning : int
-        To the calibration's pixels, before everything else.
-    dark : float or ndarray
-        Subtracted then, counts.
-    crop : Crop or None
-    binning : int
-        Last.
-    """
+    """How a photograph became a measurement, to be done again to others of the same camera."""
 
     first_binning: int
+    """To the calibration's pixels, before everything else."""
     dark: float | FloatImage
+    """Subtracted then, counts."""
     crop: Crop | None
     binning: int
+    """Last."""
 
     def apply(self, pixels: npt.NDArray[Any]) -> FloatImage:
         """Return a photograph (height, width[, 3]) as a measurement."""
@@ -72,35 +64,25 @@ class Reduction:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What :func:`recon.reconstruct` is called with, and how it came about.
-
-    Attributes
-    ----------
-    measurement : ndarray, float32, (height, width) or (height, width, 3)
-    calibration : Calibration
-        On the measurement's pixels.
-    notes : mapping of str to str
-        What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``.
-    valid : ndarray of bool, shape of the measurement or (height, width), or None
-        The pixels that take part; None means all of them.
-    warnings : tuple of str
-    provenance : mapping
-        Files with checksums and every setting, JSON-compatible.
-    simulated : bool
-        Whether any of the input is known to come from the simulated bench.
-    known_noise : NoiseModel or None
-        Of single pixels, where the photograph's metadata tell.
-    """
+    """What :func:`recon.reconstruct` is called with, and how it came about."""
 
     measurement: FloatImage
+    """float32, (height, width) or (height, width, 3)."""
     calibration: Calibration
+    """On the measurement's pixels."""
     notes: Mapping[str, str]
+    """What was read and chosen, to be shown: ``"Dark"`` to ``"34.1 counts from both ..."``."""
     valid: npt.NDArray[np.bool_] | None = None
+    """bool, shape of the measurement or (height, width), or None: the pixels that take part; None means all
+    of them."""
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Files with checksums and every setting, JSON-compatible."""
     simulated: bool = False
+    """Whether any of the input is known to come from the simulated bench."""
     reduction: Reduction | None = None
     known_noise: NoiseModel | None = None
+    """Of single pixels, where the photograph's metadata tell."""
 
     def binned_noise(self, noise: NoiseChoice) -> NoiseModel | float | None:
         """Return what is left of a single pixel's noise after the averaging that made the measurement.
@@ -127,10 +109,8 @@ def job_from_files(
     Where a grey image is the raw frame of a colour mosaic, its PSF, when grey as well, is taken to be one
     too.
 
-    Raises
-    ------
-    FileError, BenchError
-        When a file cannot be used, the two do not belong together, or the window or binning does not fit.
+    Raises FileError or BenchError when a file cannot be used, the two do not belong together, or the window
+    or binning does not fit.
     """
     psf, image = read_image(psf_path), read_image(image_path)
     crop, binning = inputs.crop, inputs.binning
@@ -265,10 +245,7 @@ def job_with(
 def find_calibration(folder: Path) -> Path:
     """Return the calibration folder that ``folder`` is, or the one that it holds.
 
-    Raises
-    ------
-    FileError
-        When there is none, or more than one.
+    Raises FileError when there is none, or more than one.
     """
     if not folder.is_dir():
         found = "is no folder" if folder.exists() else "does not exist"

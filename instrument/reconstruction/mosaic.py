@@ -24,9 +24,7 @@ _GENICAM: dict[str, Pattern] = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": 
 def mosaic_named(text: str) -> MosaicChoice:
     """Return the pattern of that name; None for ``none``.
 
-    Raises
-    ------
-    InputError
+    Raises InputError.
     """
     if text == "none":
         return None
@@ -50,9 +48,7 @@ def mosaic_of(image: ImageFile) -> Pattern | None:
 def require_mosaic(image: ImageFile, pattern: Pattern) -> None:
     """Refuse an image that cannot be a mosaic's raw frame.
 
-    Raises
-    ------
-    FileError
+    Raises FileError.
     """
     height, width = image.pixels.shape[:2]
     if image.is_colour or min(height, width) < 2:
@@ -68,6 +64,8 @@ def reduce_mosaic(
 ) -> tuple[FloatImage, npt.NDArray[np.bool_]]:
     """Split a raw frame into colours, cut the window out and average each colour's pixels.
 
+    Raises BenchError when the binning is odd.
+
     Parameters
     ----------
     raw : ndarray, (height, width)
@@ -80,11 +78,6 @@ def reduce_mosaic(
     image : ndarray, float32, (height, width, 3)
     known : ndarray of bool, as ``image``
         Where the colour was measured.
-
-    Raises
-    ------
-    BenchError
-        When the binning is odd.
     """
     if binning > 1 and binning % 2:
         raise BenchError(

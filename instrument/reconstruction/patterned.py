@@ -44,44 +44,28 @@ BRIGHT_PERCENTILE = 99.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatternedRequest:
-    """What a picture is reconstructed from, and how.
-
-    Attributes
-    ----------
-    run : Path
-        Of a plan of :func:`instrument.plan.model.illumination_plan`, the scene in place.
-    sheet : Path
-        A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
-        (n_patterns, height, width) on the calibration's pixels.
-    calibration : Path
-    binning : int
-        Of the calibration's pixels.
-    options : ReconstructionOptions
-    """
+    """What a picture is reconstructed from, and how."""
 
     run: Path
+    """Of a plan of :func:`instrument.plan.model.illumination_plan`, the scene in place."""
     sheet: Path
+    """A run of the same plan, a plain white sheet in the scene's place; or patterns themselves as ``.npy``,
+    (n_patterns, height, width) on the calibration's pixels."""
     calibration: Path
     binning: int = 1
+    """Of the calibration's pixels."""
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
 
 
 @dataclass(frozen=True, slots=True)
 class PreparedPatterned:
-    """Everything on the picture's pixels.
-
-    Attributes
-    ----------
-    job : Job
-        Its measurement is the sum of all frames: the scene in even light.
-    frames, patterns : ndarray, float32, (n_patterns, height, width)
-        Counts less dark; shares of the light of all groups together.
-    request : PatternedRequest
-    """
+    """Everything on the picture's pixels."""
 
     job: Job
+    """Its measurement is the sum of all frames: the scene in even light."""
     frames: Floats
     patterns: Floats
+    """float32, (n_patterns, height, width): counts less dark; shares of the light of all groups together."""
     request: PatternedRequest
 
 
@@ -90,16 +74,10 @@ def prepare_patterned(
 ) -> PreparedPatterned:
     """Read both runs, and reconstruct the patterns from the sheet's.
 
-    Parameters
-    ----------
-    request : PatternedRequest
-    on_progress : callable
-        ``on_progress(patterns done, patterns)`` after each.
+    ``on_progress``: ``on_progress(patterns done, patterns)`` after each.
 
-    Raises
-    ------
-    FileError, BenchError, InputError
-        When something cannot be used, or the runs do not belong together.
+    Raises FileError, BenchError or InputError when something cannot be used, or the runs do not belong
+    together.
     """
     folder = find_calibration(request.calibration)
     calibration = _grey(load_calibration(folder), request.binning)

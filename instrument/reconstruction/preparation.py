@@ -54,9 +54,7 @@ class Crop:
     def parse(cls, text: str) -> Crop:
         """Read ``"TOP,LEFT,HEIGHT,WIDTH"`` or ``"HEIGHTxWIDTH"``.
 
-        Raises
-        ------
-        InputError
+        Raises InputError.
         """
         if match := re.fullmatch(r"\s*(\d+)\s*[x×]\s*(\d+)\s*", text):
             window = cls(None, None, int(match[1]), int(match[2]))
@@ -74,9 +72,7 @@ class Crop:
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
         """Return the window as slices of an image; refused where it leaves the image.
 
-        Raises
-        ------
-        BenchError
+        Raises BenchError.
         """
         top = (shape[0] - self.height) // 2 if self.top is None else self.top
         left = (shape[1] - self.width) // 2 if self.left is None else self.left
@@ -107,10 +103,7 @@ def check_pair(
 
     ``mosaic``: the image is a colour sensor's raw frame, so that a PSF in colour may belong to it.
 
-    Raises
-    ------
-    FileError
-        When shape, channels or bit depth differ.
+    Raises FileError when shape, channels or bit depth differ.
     """
     psf_shape, shape = psf.pixels.shape[:2], image.pixels.shape[:2]
     if psf_shape != shape:
@@ -140,10 +133,7 @@ def check_pair(
 def check_psf(psf: ImageFile, *, allow_saturated: bool = False) -> tuple[str, ...]:
     """Refuse a PSF that nothing can be reconstructed with; return warnings in sentences.
 
-    Raises
-    ------
-    FileError
-        When it is constant or too much of its light lies in saturated pixels.
+    Raises FileError when it is constant or too much of its light lies in saturated pixels.
     """
     pixels = psf.pixels
     lowest, highest = float(pixels.min()), float(pixels.max())
@@ -186,10 +176,7 @@ def dark_from_counts(counts: float) -> Dark:
 def dark_from_file(dark: ImageFile, image: ImageFile) -> Dark:
     """Return a dark frame for both.
 
-    Raises
-    ------
-    FileError
-        When its shape, channels or bit depth differ from the image's.
+    Raises FileError when its shape, channels or bit depth differ from the image's.
     """
     if dark.pixels.shape[:2] != image.pixels.shape[:2] or (dark.is_colour and not image.is_colour):
         raise FileError(
@@ -294,10 +281,7 @@ def auto_binning(shape: tuple[int, int]) -> int:
 def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
     """Return the mean of ``factor`` x ``factor`` pixels, float32; a rest at the right and bottom is left out.
 
-    Raises
-    ------
-    BenchError
-        When the image is smaller than one binned pixel.
+    Raises BenchError when the image is smaller than one binned pixel.
     """
     if factor < 1 or factor > min(image.shape[:2]):
         raise BenchError(f"--bin {factor}: the image has {image.shape[0]} x {image.shape[1]} pixels.")
@@ -312,10 +296,7 @@ def bin_image(image: npt.NDArray[Any], factor: int) -> FloatImage:
 def reduce(pixels: npt.NDArray[Any], dark: float | FloatImage, crop: Crop | None, binning: int) -> FloatImage:
     """Subtract the dark level, cut the window out, bin; float32, negative values kept.
 
-    Raises
-    ------
-    BenchError
-        When binning leaves less than :data:`LEAST_BINNED` pixels along a side.
+    Raises BenchError when binning leaves less than :data:`LEAST_BINNED` pixels along a side.
     """
     if isinstance(dark, np.ndarray) and dark.ndim < pixels.ndim:
         dark = dark[..., None]
@@ -345,10 +326,8 @@ class Erased:
 def erasures_of(choice: ErasuresChoice, image: ImageFile) -> Erased:
     """Return which pixels of an image take part.
 
-    Raises
-    ------
-    BenchError, FileError
-        When the share is not from 0 to below 1, or the mask does not fit or leaves nothing.
+    Raises BenchError or FileError when the share is not from 0 to below 1, or the mask does not fit or leaves
+    nothing.
     """
     if choice == "none":
         return Erased(None, "none")

@@ -52,19 +52,12 @@ def _require_choice(asked: str, model: ModelName) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Request:
-    """What pictures and volumes have in common.
-
-    Attributes
-    ----------
-    image : Path
-        The photograph.
-    inputs : InputOptions
-        How it becomes a measurement, and what it is explained with a camera.
-    options : ReconstructionOptions
-    """
+    """What pictures and volumes have in common."""
 
     image: Path
+    """The photograph."""
     inputs: InputOptions = field(default_factory=InputOptions)
+    """How it becomes a measurement, and what it is explained with a camera."""
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
 
     def solve(
@@ -77,10 +70,7 @@ class _Request:
     ) -> Reconstruction:
         """Reconstruct what ``prepare`` returned.
 
-        Raises
-        ------
-        InputError
-            When the input does not allow it.
+        Raises InputError when the input does not allow it.
         """
         measurement = self._measurement(job)
         return reconstruct(
@@ -90,10 +80,7 @@ class _Request:
     def explain(self, job: Job) -> Choice:
         """Say what the model ``"auto"`` would choose, and why; errors as :meth:`solve`.
 
-        Raises
-        ------
-        BenchError
-            Where it would not be asked for all of it.
+        Raises BenchError where it would not be asked for all of it.
         """
         _require_choice("--explain", self.options.model)
         return choice_for(Problem.of(self._measurement(job), job.calibration, self.options))
@@ -106,26 +93,17 @@ class _Request:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureRequest(_Request):
-    """A picture of one depth, from a photograph and either a PSF file or a calibration.
-
-    Attributes
-    ----------
-    psf, calibration : Path or None
-        One of the two.
-    """
+    """A picture of one depth, from a photograph and either a PSF file or a calibration."""
 
     psf: Path | None = None
     calibration: Path | None = None
+    """One of the two."""
 
     def prepare(self) -> Job:
         """Read the files and bring them together; the options are checked first.
 
-        Raises
-        ------
-        InputError
-            When an option cannot be.
-        FileError, BenchError
-            When a file cannot be used, or the files do not belong together.
+        Raises InputError when an option cannot be; FileError or BenchError when a file cannot be used, or the
+        files do not belong together.
         """
         options, inputs = self.options, self.inputs
         _require_known(inputs, options)
@@ -154,15 +132,10 @@ class PictureRequest(_Request):
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeRequest(_Request):
-    """A volume, from a photograph and PSFs at several depths.
-
-    Attributes
-    ----------
-    psfs : Path
-        As :func:`volume_job`.
-    """
+    """A volume, from a photograph and PSFs at several depths."""
 
     psfs: Path
+    """As :func:`volume_job`."""
 
     def prepare(self) -> Job:
         """Read the files and bring them together; errors as :meth:`PictureRequest.prepare`."""
@@ -178,10 +151,7 @@ def request_of(
 ) -> PictureRequest | VolumeRequest:
     """Return what a photograph is to be made into: a volume where PSFs of several depths are given.
 
-    Raises
-    ------
-    BenchError
-        When there is no photograph.
+    Raises BenchError when there is no photograph.
     """
     if source.image is None:
         raise BenchError("Give a photograph with --image FILE, or a recording: RUN --video.")
@@ -225,18 +195,12 @@ def volume_job(
 ) -> Job:
     """Prepare a photograph and PSFs at several depths.
 
-    Parameters
-    ----------
-    psfs : Path
-        A calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one image
-        file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs lose
-        their darkest level; float ones are taken to be free of any offset.
-    image, inputs
-        As :func:`~instrument.reconstruction.job.job_from_calibration`.
+    ``psfs``: a calibration folder or the run it lies in, a multi-page TIFF or array, or a folder with one
+    image file a depth, in the order of their names (the photograph itself may lie there too). Integer PSFs
+    lose their darkest level; float ones are taken to be free of any offset. ``image`` and ``inputs``: as
+    :func:`~instrument.reconstruction.job.job_from_calibration`.
 
-    Raises
-    ------
-    FileError, BenchError
+    Raises FileError or BenchError.
     """
     if psfs.is_dir() and (is_calibration(psfs) or (psfs / STATE).is_file()):  # or the run it was made in
         return job_from_calibration(psfs, image, inputs)
@@ -264,10 +228,7 @@ def refocused(job: Job, z_um: float) -> Job:
     diffuser to sensor, are not known, as with a PSF image, no PSF can be refocused: a note says so, and the
     reconstruction takes the PSF as it is, or the nearest one.
 
-    Raises
-    ------
-    BenchError
-        When ``z_um`` is no distance.
+    Raises BenchError when ``z_um`` is no distance.
     """
     require_distance(z_um)
     calibration = job.calibration

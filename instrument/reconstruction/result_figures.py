@@ -23,39 +23,24 @@ Grey = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Projections:
-    """Brightest voxels along each axis; of colour volumes, of the channels' mean.
-
-    Attributes
-    ----------
-    front : ndarray, float32, (height, width)
-        Over depth.
-    deepest : ndarray, int32, (height, width)
-        The plane in which the brightest voxel of ``front`` lies.
-    top : ndarray, float32, (n_z, width)
-        Over y.
-    side : ndarray, float32, (n_z, height)
-        Over x.
-    """
+    """Brightest voxels along each axis; of colour volumes, of the channels' mean."""
 
     front: Grey
+    """float32, (height, width): over depth."""
     deepest: npt.NDArray[np.int32]
+    """int32, (height, width): the plane in which the brightest voxel of ``front`` lies."""
     top: Grey
+    """float32, (n_z, width): over y."""
     side: Grey
+    """float32, (n_z, height): over x."""
 
 
 def project(source: VolumeSource, advance: Callable[[int, int], object] | None = None) -> Projections:
     """Return the brightest voxels along each axis, with one plane in memory at a time.
 
-    Parameters
-    ----------
-    source : VolumeSource
-    advance : callable, optional
-        ``advance(planes done, planes)`` after each plane; may raise to end the work.
+    ``advance``: ``advance(planes done, planes)`` after each plane; may raise to end the work.
 
-    Raises
-    ------
-    FileError
-        When the volume cannot be read.
+    Raises FileError when the volume cannot be read.
     """
     n_z, height, width = source.shape
     front = np.full((height, width), -np.inf, np.float32)
@@ -148,10 +133,7 @@ def write_figure(path: Path, result: Reconstruction, job: Job, *, rotate_deg: in
 
     ``rotate_deg``, a multiple of 90, turns the picture counter-clockwise.
 
-    Raises
-    ------
-    FileError, OSError
-        When it cannot be written.
+    Raises FileError or OSError when it cannot be written.
     """
     save_figure(summary_figure(_summary(result, job, rotate_deg)), path)
 

@@ -42,9 +42,7 @@ class Outputs:
     def named(cls, out: Path, figure: Path | None = None, *, volume: bool = False) -> Outputs:
         """Return the files that go with ``out``, whose suffix must be ``.tif`` (volumes: or ``.ome.zarr``).
 
-        Raises
-        ------
-        FileError
+        Raises FileError.
         """
         if volume and is_zarr_name(out):
             stem = out.name.lower().removesuffix(".zarr").removesuffix(".ome")
@@ -74,9 +72,7 @@ class Outputs:
     def check(self, n_pixels: int, *, overwrite: bool = False) -> None:
         """Refuse places that cannot be written, or are taken, before the work.
 
-        Raises
-        ------
-        FileError
+        Raises FileError.
         """
         for path in self.files():
             folder = is_zarr_name(path)
@@ -97,10 +93,7 @@ def write_reconstruction(outputs: Outputs, result: Reconstruction, job: Job, *, 
 
     ``rotate_deg``, a multiple of 90, turns the written picture counter-clockwise.
 
-    Raises
-    ------
-    FileError, OSError
-        When a file cannot be written (a full disk), naming it.
+    Raises FileError or OSError when a file cannot be written (a full disk), naming it.
     """
     image = np.rot90(result.image, rotate_deg // 90)
     write_image(outputs.image, image, {"simulated": job.simulated, "record": outputs.record.name})
@@ -200,10 +193,7 @@ def write_volume(outputs: Outputs, result: Reconstruction, job: Job) -> None:
     A TIFF holds ``ZYX`` or ``ZCYX`` float32, an OME-Zarr ``zyx`` or ``czyx``; the name says which. OME knows
     one voxel size for all: that of the middle plane is written there; every plane's own is in the record.
 
-    Raises
-    ------
-    FileError, OSError
-        When a file cannot be written, naming it.
+    Raises FileError or OSError when a file cannot be written, naming it.
     """
     from instrument.reconstruction.result_figures import volume_figure
 

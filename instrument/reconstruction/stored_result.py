@@ -29,24 +29,16 @@ from recon.verdict.judge import Region
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:
-    """A reconstruction on disk.
-
-    Attributes
-    ----------
-    path : Path
-        The image's or volume's file or folder.
-    image : ndarray, float32, (height, width) or (height, width, 3), or None
-        The picture; None for a volume.
-    volume : VolumeSource or None
-        The volume; None for a picture. Close it in the end.
-    record : mapping
-        What was written beside it; empty for results from elsewhere.
-    """
+    """A reconstruction on disk."""
 
     path: Path
+    """The image's or volume's file or folder."""
     image: npt.NDArray[np.float32] | None
+    """float32, (height, width) or (height, width, 3): the picture; None for a volume."""
     volume: VolumeSource | None
+    """The volume; None for a picture. Close it in the end."""
     record: Mapping[str, Any]
+    """What was written beside it; empty for results from elsewhere."""
 
     @property
     def simulated(self) -> bool:
@@ -179,10 +171,7 @@ def open_result(path: Path | str) -> StoredResult:
     A volume's voxels are read when they are looked at. An image or volume from elsewhere opens too; nothing
     is known of it then.
 
-    Raises
-    ------
-    FileError
-        When it is none, or its record is damaged.
+    Raises FileError when it is none, or its record is damaged.
     """
     path = _data_file(Path(path))
     record = _record_of(path)
@@ -323,24 +312,18 @@ def export_result(
 ) -> None:
     """Write a picture or volume in the format that the target's name asks for, whole or not at all.
 
+    Raises FileError when the name asks for no format that there is, something is there already, or it cannot
+    be written; OSError when the disk is full.
+
     Parameters
     ----------
-    result : StoredResult
     target : Path
         A picture: ``.tif`` and ``.npy`` (float32) or ``.png`` (8 bit, as the preview). A volume: ``.tif``
         (OME-TIFF), ``.npy``, both plane by plane, or ``.ome.zarr``, for which it must fit into memory.
     rotate_deg : int
         A multiple of 90 by which a picture is turned counter-clockwise.
-    overwrite : bool
     advance : callable, optional
         ``advance(planes done, planes)``; may raise to end the work.
-
-    Raises
-    ------
-    FileError
-        When the name asks for no format that there is, something is there already, or it cannot be written.
-    OSError
-        When the disk is full.
     """
     target = Path(target)
     volume = result.volume is not None

@@ -47,47 +47,32 @@ from recon.streams.video import BLOCK, COLD_ITERATIONS, WARM_ITERATIONS, VideoSo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoRequest:
-    """What a video is reconstructed from and how.
-
-    Attributes
-    ----------
-    run : Path
-        A recording (any run with frames).
-    out : Path
-        ``NAME.ome.zarr``; ``NAME.mp4`` and ``NAME.json`` go beside it.
-    psf, calibration : Path or None
-        One of the two.
-    inputs : InputOptions
-        As for a picture.
-    options : ReconstructionOptions
-        As for a picture; ``iterations`` are those of a block's first frame. Stopping by time or tolerance
-        would make pictures depend on the machine: they do not apply.
-    warm_iterations : int
-        Of the frames after a block's first.
-    block : int or None
-        Frames a block; None: 32, with a prior over time 16.
-    over_time : "tv", "lowrank" or None
-        A prior that joins the frames of a block (:mod:`recon.streams.joint`); then every frame has the
-        ``iterations``, 60 by default.
-    rotate_deg : int
-    fps : float or None
-        Of the film; None: the recording's own rate, else 25.
-    film : bool
-        Whether to write the MP4.
-    """
+    """What a video is reconstructed from and how."""
 
     run: Path
+    """A recording (any run with frames)."""
     out: Path
+    """``NAME.ome.zarr``; ``NAME.mp4`` and ``NAME.json`` go beside it."""
     psf: Path | None = None
     calibration: Path | None = None
+    """One of the two."""
     inputs: InputOptions = field(default_factory=InputOptions)
+    """As for a picture."""
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
+    """As for a picture; ``iterations`` are those of a block's first frame. Stopping by time or tolerance
+    would make pictures depend on the machine: they do not apply."""
     warm_iterations: int = WARM_ITERATIONS
+    """Of the frames after a block's first."""
     block: int | None = None
+    """Frames a block; None: 32, with a prior over time 16."""
     over_time: OverTimeName | None = None
+    """A prior that joins the frames of a block (:mod:`recon.streams.joint`); then every frame has the
+    ``iterations``, 60 by default."""
     rotate_deg: int = 0
     fps: float | None = None
+    """Of the film; None: the recording's own rate, else 25."""
     film: bool = True
+    """Whether to write the MP4."""
 
     @property
     def film_path(self) -> Path:
@@ -106,24 +91,15 @@ class VideoRequest:
 
 @dataclass(frozen=True, slots=True)
 class PreparedVideo:
-    """A job ready to be worked on.
-
-    Attributes
-    ----------
-    job : VideoJob
-    request : VideoRequest
-    notes : dict of str to str
-        What was read and chosen, to be shown.
-    warnings : tuple of str
-    resumed : bool
-        Whether part of it was done before.
-    """
+    """A job ready to be worked on."""
 
     job: VideoJob
     request: VideoRequest
     notes: dict[str, str]
+    """What was read and chosen, to be shown."""
     warnings: tuple[str, ...]
     resumed: bool
+    """Whether part of it was done before."""
 
     @property
     def left(self) -> list[int]:
@@ -135,16 +111,10 @@ class PreparedVideo:
 def prepare_video(request: VideoRequest, *, force: bool = False) -> PreparedVideo:
     """Read the recording's first frame and the PSF, settle everything, and make the job or find it begun.
 
-    Parameters
-    ----------
-    request : VideoRequest
-    force : bool
-        Begin anew where there is an output already.
+    ``force``: begin anew where there is an output already.
 
-    Raises
-    ------
-    FileError, BenchError, InputError
-        When something cannot be used, or the output holds another video.
+    Raises FileError, BenchError or InputError when something cannot be used, or the output holds another
+    video.
     """
     _check(request)
     run = Run.open(request.run)
@@ -210,17 +180,13 @@ def solve_video(
 ) -> bool:
     """Solve what is left: in this process, on ``workers`` processes, or on a scheduler's cluster.
 
+    Raises BenchError when there is no Dask or no scheduler; FileError or OSError when a frame cannot be read
+    or a picture written.
+
     Returns
     -------
     bool
         False when cancelled; what is on the disk stays, and the same request goes on with the rest.
-
-    Raises
-    ------
-    BenchError
-        When there is no Dask or no scheduler.
-    FileError, OSError
-        When a frame cannot be read or a picture written.
     """
     job, output = prepared.job, prepared.request.out.resolve()
     folder = job.folder.resolve()
@@ -238,9 +204,7 @@ def solve_video(
 def finish_video(prepared: PreparedVideo) -> list[Path]:
     """Write film and record, and remove the job; returns what there is now.
 
-    Raises
-    ------
-    FileError, OSError
+    Raises FileError or OSError.
     """
     request, plan = prepared.request, prepared.job.plan
     pictures = VideoPictures(request.out)

@@ -50,10 +50,7 @@ def require_video(run: Run) -> None:
 
     A recording is one; so is a plan that takes the same photograph again and again.
 
-    Raises
-    ------
-    FileError
-        With what differs from frame to frame, and what to do.
+    Raises FileError with what differs from frame to frame, and what to do.
     """
     if not run.records:
         raise FileError(run.path, "has no frames to reconstruct.")
@@ -167,11 +164,7 @@ def create_output(
 class VideoPictures:
     """The pictures of a video, to be read and written one by one.
 
-    Parameters
-    ----------
-    path : Path
-        The OME-Zarr folder.
-    write : bool
+    ``path``: the OME-Zarr folder.
     """
 
     def __init__(self, path: Path, *, write: bool = False) -> None:
@@ -238,10 +231,7 @@ def write_mp4(path: Path, pictures: Iterable[npt.NDArray[np.uint8]], fps: float)
 
     Sides are made even by repeating the last row or column, as the codec needs.
 
-    Raises
-    ------
-    FileError
-        When OpenCV here cannot encode, or the folder cannot be written to.
+    Raises FileError when OpenCV here cannot encode, or the folder cannot be written to.
     """
     import cv2
 

@@ -46,53 +46,34 @@ _JSON, _CAMERA, _DONE = "job.json", "camera.npz", "done"
 
 @dataclass(frozen=True)
 class VideoPlan:
-    """What shall be computed, as plain data; two jobs are one when their plans are equal.
-
-    Attributes
-    ----------
-    run : str
-        The recording's folder, absolute.
-    frames : tuple of int
-        The recording's frames that there are, ascending.
-    n_frames : int
-        Frames of the output: the recording's, with its gaps.
-    block : int
-        Frames a block, by number.
-    cold_iterations, warm_iterations : int
-    over_time : str or None
-        A prior over time, with which the frames of a block are solved together (then ``cold_iterations``).
-    rotate_deg : int
-        By how much pictures are turned, counter-clockwise.
-    picture_shape : tuple of int
-        ``(height, width)`` or ``(height, width, 3)``, before turning.
-    settings : dict
-        Everything that was chosen for preparation and prior, JSON-compatible.
-    """
+    """What shall be computed, as plain data; two jobs are one when their plans are equal."""
 
     run: str
+    """The recording's folder, absolute."""
     frames: tuple[int, ...]
+    """The recording's frames that there are, ascending."""
     n_frames: int
+    """Frames of the output: the recording's, with its gaps."""
     block: int
+    """Frames a block, by number."""
     cold_iterations: int
     warm_iterations: int
     over_time: OverTimeName | None
+    """A prior over time, with which the frames of a block are solved together (then ``cold_iterations``)."""
     rotate_deg: int
+    """By how much pictures are turned, counter-clockwise."""
     picture_shape: tuple[int, ...]
+    """``(height, width)`` or ``(height, width, 3)``, before turning."""
     settings: dict[str, Any]
+    """Everything that was chosen for preparation and prior, JSON-compatible."""
 
 
 class VideoJob:
     """A job's folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Of a job that exists; :meth:`create` makes one.
+    ``folder``: of a job that exists; :meth:`create` makes one.
 
-    Raises
-    ------
-    FileError
-        When there is none, or it is damaged.
+    Raises FileError when there is none, or it is damaged.
     """
 
     def __init__(self, folder: Path) -> None:

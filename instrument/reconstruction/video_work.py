@@ -64,6 +64,8 @@ def solve_block(
 
     Runs anywhere where the recording and the output are under the same paths. Done already, it does nothing.
 
+    Raises FileError or OSError when a file cannot be read or written; CancelledError.
+
     Parameters
     ----------
     job_folder, output : str
@@ -74,12 +76,6 @@ def solve_block(
         FFT and kernel threads of this process.
     ended : callable
         Asked before each frame; True ends the work.
-
-    Raises
-    ------
-    FileError, OSError
-        When a file cannot be read or written.
-    CancelledError
     """
     began_s = time.perf_counter()
     if threads is not None:
@@ -157,12 +153,8 @@ def in_process(
 
     With a prior over time, whose blocks take much memory, one after the other with all threads.
 
-    Raises
-    ------
-    CancelledError
-        When ``cancel`` was set; blocks in progress end after their frame.
-    Exception
-        What went wrong in a block; the others are ended.
+    Raises CancelledError when ``cancel`` was set; blocks in progress end after their frame. Raises Exception:
+    what went wrong in a block; the others are ended.
     """
     cores = get_threads()
     together = VideoJob(job).plan.over_time is not None
@@ -217,10 +209,7 @@ def on_cluster(
 def cluster(*, workers: int | None = None, scheduler: str | None = None) -> Iterator[Any]:
     """Give a client of a cluster: a new one of ``workers`` processes here, or that of a scheduler's address.
 
-    Raises
-    ------
-    BenchError
-        When Dask is not installed, or there is no scheduler at the address.
+    Raises BenchError when Dask is not installed, or there is no scheduler at the address.
     """
     distributed = _dask()
     if scheduler is not None:

@@ -196,14 +196,9 @@ def prepare_resume(
     ``bench.toml``. ``on_verify`` is called with frames verified and frames to verify, ``on_progress`` as in
     :func:`acquire`.
 
-    Raises
-    ------
-    RunError
-        When the folder is no run of a plan, or some program writes to it.
-    PlanError
-        When the bench cannot do what is left.
-    DeviceError, BenchError
-        When the camera does not take the settings of the run.
+    Raises RunError when the folder is no run of a plan, or some program writes to it; PlanError when the
+    bench cannot do what is left; DeviceError or BenchError when the camera does not take the settings of the
+    run.
     """
     before = Run.open(path)
     condition = before.condition  # asked before this program's own lock answers "running"

@@ -38,6 +38,9 @@ def export(
     Frames that are not there (gaps, steps not done) are left out; the numbers of those written are returned,
     and kept inside the file where the format allows it.
 
+    Raises FileError when the target exists, cannot be written, or has another suffix; RunError when a frame
+    is not there.
+
     Parameters
     ----------
     target : path
@@ -48,13 +51,6 @@ def export(
         Of an MP4; None means the recording's own rate, 10 for a run of a plan.
     on_progress : callable, optional
         Called after each frame.
-
-    Raises
-    ------
-    FileError
-        When the target exists, cannot be written, or has another suffix.
-    RunError
-        When a frame is not there.
     """
     target = Path(target)
     indices = sorted(run.records) if frames is None else list(frames)

@@ -106,26 +106,17 @@ _log = logging.getLogger(__name__)
 def end_run(bench: Bench, writer: RunWriter, reason: FinishReason, error: BaseException | None) -> Run:
     """Make the bench safe (light off, motion stopped), then finish the run: both tried whatever happens.
 
-    Parameters
-    ----------
-    writer : RunWriter
-        Closed afterwards.
-    error : BaseException, optional
-        What ended the acquisition. It gets notes on what failed here and on where the run is, and stays the
-        error that matters, also when Ctrl-C is pressed meanwhile.
+    ``writer``: closed afterwards. ``error``: what ended the acquisition. It gets notes on what failed here
+    and on where the run is, and stays the error that matters, also when Ctrl-C is pressed meanwhile.
+
+    Raises StepsFailedError or RunError when something failed here and there is no ``error`` to note it on:
+    the bench could not be made safe, or the run's end not be written. Raises KeyboardInterrupt or SystemExit
+    when it was asked for meanwhile and there is no ``error``; everything was done before.
 
     Returns
     -------
     Run
         For reading.
-
-    Raises
-    ------
-    StepsFailedError, RunError
-        When something failed here and there is no ``error`` to note it on: the bench could not be made safe,
-        or the run's end not be written.
-    KeyboardInterrupt, SystemExit
-        When it was asked for meanwhile and there is no ``error``; everything was done before.
     """
     with interrupts_held() as held:
         run = _end(bench, writer, reason, error)

@@ -148,12 +148,8 @@ class FrameArray:
 
         Several at a time cost less than one by one, as folders are synced once for all.
 
-        Raises
-        ------
-        ValueError
-            When an index or an image does not fit the array; nothing is stored.
-        OSError
-            When the disk is full or not writable. Frames that were there before stay as they were.
+        Raises ValueError when an index or an image does not fit the array; nothing is stored. Raises OSError
+        when the disk is full or not writable. Frames that were there before stay as they were.
         """
         for index, image in items:
             if not 0 <= index < self.n_frames:

@@ -253,13 +253,9 @@ class Runner:
     def execute(self) -> Run:
         """Do the steps; returns the finished run, whose ``reason`` says how it ended.
 
-        Raises
-        ------
-        DeviceError, BenchError
-            What made the run fail; it was marked as failed, and the bench made safe. A note says where the
-            run is.
-        KeyboardInterrupt, SystemExit
-            After the run was marked as aborted and the bench made safe.
+        Raises DeviceError or BenchError: what made the run fail; it was marked as failed, and the bench made
+        safe. A note says where the run is. Raises KeyboardInterrupt or SystemExit after the run was marked as
+        aborted and the bench made safe.
         """
         if self._thread is not None:
             raise RuntimeError("A runner executes its plan once; make a new one (or resume the run).")

@@ -23,12 +23,11 @@ from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
-from recon.camera.factors import as_cropped_convolution
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import IterationRecord, Solver
+from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import laplacian_eigenvalues
-from recon.solvers.prior_splits import PriorSplits, ratio
+from recon.solvers.prior_splits import PictureSplitting, ratio
 
 SETTLING = (4, 8, 16, 32)
 """Iterations before which the penalty of the differences is set from the object so far."""
@@ -51,7 +50,7 @@ class Penalties:
     separable: float = 0.3
 
 
-class Admm(Solver):
+class Admm(PictureSplitting):
     """ADMM for a (masked) :class:`~recon.camera.convolution.Convolution`.
 
     Parameters
@@ -69,7 +68,7 @@ class Admm(Solver):
     """
 
     state_names: ClassVar[tuple[str, ...]] = (
-        "_y", "_mu", "_priors.tx", "_priors.ty", "_priors.t_w",
+        "_y", "_mu", "_splits.tx", "_splits.ty", "_splits.t_w",
         "_split.T", "_split.Q", "_split.t", "_split.sums",
     )  # fmt: skip
 
@@ -83,33 +82,19 @@ class Admm(Solver):
         penalties: Penalties | None = None,
         relax: float = 1.7,
     ) -> None:
-        super().__init__()
-        structure = as_cropped_convolution(operator)
-        camera = structure.convolution
-        weight = np.ascontiguousarray(structure.weight)
-        valid = np.ascontiguousarray(np.where(weight > 0, data, 0), operator.dtype)
+        super().__init__(operator, prior, initial)
+        valid = np.ascontiguousarray(np.where(self._weight > 0, data, 0), operator.dtype)
         self.relax = relax
-
         penalties = penalties or Penalties()
         self._settles = penalties.differences is None
-        start = np.zeros(operator.domain_shape, operator.dtype)
-        if initial is not None:
-            start[...] = initial
-        self._split = DataSplit(camera, valid, weight, penalties.data, start, relax)
-        self._priors = priors = PriorSplits(prior, start)
-        self._y, self._mu, self.splits = priors.y, priors.mu, priors.others
-        power = float(np.mean(camera.power()))
+        self._split = DataSplit(self._camera, valid, self._weight, penalties.data, self._y, relax)
+        power = float(np.mean(self._camera.power()))
         differences = 1.0 if penalties.differences is None else penalties.differences
         self._mu_data = penalties.data
         mu = np.array([[differences * power], [penalties.separable * power]])
-        if priors.others:
-            priors.set_penalties(np.broadcast_to(mu, self._mu.shape))
+        if self._splits.others:
+            self._splits.set_penalties(np.broadcast_to(mu, self._mu.shape))
         self._mu[...] = mu
-
-    @property
-    def solution(self) -> Array:
-        """The split variable that obeys the separable prior."""
-        return self._priors.solution()
 
     @property
     def penalties(self) -> Array:
@@ -122,29 +107,29 @@ class Admm(Solver):
 
     def step(self) -> IterationRecord:
         """Update the priors' splits in a sweep over memory, then solve for ``y`` in Fourier space."""
-        tv = self._priors.tv
+        tv = self._splits.tv
         if self._settles and tv and self.iteration in SETTLING:
             self._settle_differences(tv.weight)
         # What is known of the iterate that the sweep is about to turn into a right-hand side.
         data = self._split.sums.sum(axis=0)
-        if self._priors.others:
+        if self._splits.others:
             if self.iteration in SETTLING:
-                self._priors.set_penalties(self._mu)
-            self._priors.meet(self.relax)
-        mu_u, mu_w = self._mu[0].astype(self._y.dtype), self._priors.pixel_penalties.astype(self._y.dtype)
+                self._splits.set_penalties(self._mu)
+            self._splits.meet(self.relax)
+        mu_u, mu_w = self._mu[0].astype(self._y.dtype), self._splits.pixel_penalties.astype(self._y.dtype)
         for c, y in enumerate(self._y):  # one after the other, so that the caches hold it
-            self._priors.sweep(self.relax, c)
+            self._splits.sweep(self.relax, c)
             self._split.solve(c, y, mu_u[c], mu_w[c])
         return self._record(*data)
 
     def _record(
         self, misfit: float, disagreement: float, change: float, norm: float, multiplier: float
     ) -> IterationRecord:
-        primal, dual, moved = self._priors.residuals()
+        primal, dual, moved = self._splits.residuals()
         return IterationRecord(
             0,
             0.0,
-            objective=float(0.5 * misfit + self._priors.value()),
+            objective=float(0.5 * misfit + self._splits.value()),
             data_residual=float(np.sqrt(misfit)),
             primal_residual=max(primal, ratio(disagreement, norm)),
             dual_residual=max(dual, ratio(change, multiplier)),
@@ -158,7 +143,7 @@ class Admm(Solver):
             brightness = float(np.percentile(np.abs(image), 99.9))
             if brightness > 0 and weight > 0:
                 mu[0, c] = 10 * weight / brightness
-        self._priors.set_penalties(mu)
+        self._splits.set_penalties(mu)
 
 
 class DataSplit:

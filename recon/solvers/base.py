@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from recon.base.namespace import Namespace, to_host
 from recon.priors.base import Prior
-from recon.solvers.prior_splits import ProxSplit
 
 
 class StopReason(enum.StrEnum):
@@ -153,6 +152,21 @@ class Keeper(Protocol):
         ...
 
 
+class KeptPart(Protocol):
+    """A part of a solver with a state of its own: a prior that was split off."""
+
+    kept: ClassVar[tuple[str, ...]]
+    """Names of the state's entries."""
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return the state."""
+        ...
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        ...
+
+
 class Solver(ABC):
     """An iterative solver of ``min_x 1/2 ||A x - b||^2 + prior(x)``.
 
@@ -166,14 +180,14 @@ class Solver(ABC):
         Whose arrays its own are: ``numpy`` or ``cupy``.
     prior : Prior or None
         A prior whose prox the solver itself takes.
-    splits : tuple of ProxSplit
+    splits : sequence of KeptPart
         Priors that were split off.
     """
 
     state_names: ClassVar[tuple[str, ...]] = ()
     xp: Namespace = np
     prior: Prior | None = None
-    splits: tuple[ProxSplit, ...] = ()
+    splits: Sequence[KeptPart] = ()
 
     def __init__(self) -> None:
         self.iteration = 0

@@ -9,16 +9,18 @@ split ``z = y`` with its own prox and penalty, which adds to the pixels'.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from recon.base.namespace import namespace_of, to_host
 from recon.base.threads import in_blocks
-from recon.camera.base import Array
+from recon.camera.base import Array, LinearOperator
+from recon.camera.factors import as_cropped_convolution
 from recon.errors import StructureError
 from recon.priors.base import Prior, Separable
 from recon.priors.total_variation import TotalVariation
+from recon.solvers.base import Solver
 
 STRIPS = 16
 """Strips a channel is cut into: enough to share among many cores, few enough to cost nothing."""
@@ -54,7 +56,7 @@ class ProxSplit:
         What :meth:`checkpoint` returns, by name.
     """
 
-    kept = ("state", "split", "mu", "sums", "memory")
+    kept: ClassVar[tuple[str, ...]] = ("state", "split", "mu", "sums", "memory")
 
     def __init__(self, prior: Prior, start: Array) -> None:
         self.prior = prior.for_a_run()
@@ -288,6 +290,35 @@ class PriorSplits:
 def is_plain(tv: TotalVariation) -> bool:
     """Whether differences wrap around and weigh alike, as the sweeps of pictures have them."""
     return np.array_equal(tv.axis_weights, (1.0, 1.0)) and tv.wrap in (None, (True, True))
+
+
+class PictureSplitting(Solver):
+    """A splitting method for a (masked) convolution of pictures: the priors' splits are part of its state.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        A ``Convolution`` of a picture, with or without ``Erasures`` after it.
+    prior : Prior
+        (Wrapped) :class:`~recon.priors.TotalVariation`, separable priors, and any other with an exact prox.
+    initial : ndarray, optional
+        Starting point on the operator's domain.
+    """
+
+    def __init__(self, operator: LinearOperator, prior: Prior, initial: Array | None) -> None:
+        super().__init__()
+        structure = as_cropped_convolution(operator)
+        self._camera, self._weight = structure.convolution, np.ascontiguousarray(structure.weight)
+        start = np.zeros(operator.domain_shape, operator.dtype)
+        if initial is not None:
+            start[...] = initial
+        self._splits = PriorSplits(prior, start)
+        self._y, self._mu, self.splits = self._splits.y, self._splits.mu, self._splits.others
+
+    @property
+    def solution(self) -> Array:
+        """The split variable that obeys the separable prior."""
+        return self._splits.solution()
 
 
 def split_prior(

@@ -31,12 +31,12 @@ from recon.base import fft
 from recon.base.threads import over_rows
 from recon.camera.base import Array, LinearOperator
 from recon.camera.convolution import Convolution
-from recon.camera.factors import Erasures, as_cropped_convolution
+from recon.camera.factors import Erasures
 from recon.priors.base import Prior
 from recon.priors.total_variation import TotalVariation
-from recon.solvers.base import IterationRecord, Solver
+from recon.solvers.base import IterationRecord
 from recon.solvers.cosine_preconditioner import CosinePreconditioner, laplacian_eigenvalues
-from recon.solvers.prior_splits import PriorSplits
+from recon.solvers.prior_splits import PictureSplitting
 
 BALANCING = (3, 6, 12, 24, 48, 96, 192)
 """Iterations before which the penalties are balanced; fixed after the last, so that convergence is sure."""
@@ -67,7 +67,7 @@ FIRST_DATA_STEPS = 4
 """Conjugate gradient steps of the first iteration, whose start is nowhere near."""
 
 
-class SensorAdmm(Solver):
+class SensorAdmm(PictureSplitting):
     """ADMM that solves the data term on the sensor's pixels, for a (masked) cropped convolution.
 
     Parameters
@@ -100,28 +100,20 @@ class SensorAdmm(Solver):
         relax: float = 1.5,
         data_steps: int = 1,
     ) -> None:
-        super().__init__()
+        super().__init__(operator, prior, initial)
         from recon.solvers import _picture_kernels
 
         self._kernels: Any = _picture_kernels
-        structure = as_cropped_convolution(operator)
-        camera = structure.convolution
-        self._weight = np.ascontiguousarray(structure.weight)
-        self._erased = not np.all(structure.weight)
+        camera, splits, start = self._camera, self._splits, self._y
+        self._erased = not np.all(self._weight)
         # Imputed on erased pixels, so part of the state.
         self._data = np.empty(operator.range_shape, operator.dtype)
         self.set_data(data)
         self._top, self._left = camera.corner
-        self._camera = camera
         self._spectrum = camera.spectrum[:, 0]
         self.relax = relax
         self.data_steps = data_steps
 
-        start = np.zeros(operator.domain_shape, operator.dtype)
-        if initial is not None:
-            start[...] = initial
-        self._splits = splits = PriorSplits(prior, start)
-        self._y, self._mu, self.splits = splits.y, splits.mu, splits.others
         # ``e`` and its spectrum: keeping the latter saves a transform an iteration.
         self._e = np.zeros(operator.range_shape, operator.dtype)
         self._E = np.zeros(fft.spectrum_shape(start.shape), fft.complex_dtype(operator.dtype))
@@ -165,11 +157,6 @@ class SensorAdmm(Solver):
         self._splits.set_penalties(self._first_penalties())
         self._adapt()
         self._splits.sweep(0)
-
-    @property
-    def solution(self) -> Array:
-        """The split variable that obeys the separable prior."""
-        return self._splits.solution()
 
     def compile(self) -> None:
         """Do two data steps of a tiny problem of the same precision."""

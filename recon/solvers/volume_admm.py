@@ -64,6 +64,7 @@ class ExactAdmm(VolumeSplitting):
     """
 
     S: Array
+    splits: tuple[ProxSplit, ...]
     separable: Separable
     kappa: np.floating[Any]
     _q: Array

@@ -188,7 +188,7 @@ def test_settling_a_penalty_leaves_split_and_multiplier(name):
         solver.step()
 
     def split_and_multiplier():
-        t = np.stack([solver._priors.tx, solver._priors.ty])
+        t = np.stack([solver._splits.tx, solver._splits.ty])
         size = np.linalg.norm(t, axis=0) if "iso" in name else np.abs(t)
         mu = solver._mu[0][:, None, None]
         u = t * np.maximum(1 - 0.05 / mu / np.maximum(size, 1e-300), 0)
