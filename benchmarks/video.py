@@ -38,8 +38,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_work import cluster, in_process, on_cluster
-from recon.base import fft as project_fft
 from recon.base.metrics import psnr
+from recon.base.threads import set_threads
 from recon.streams.video import COLD_ITERATIONS, VideoSolver, stream_problem
 from tests.mocks.recordings import write_recording
 
@@ -191,7 +191,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     if options.only != "offline":
-        project_fft.set_threads(1)
+        set_threads(1)
     when, load = datetime.now(UTC), os.getloadavg()[0]
     print(f"{when:%Y-%m-%d %H:%M} UTC, {os.cpu_count()} cores, {platform.machine()}, load {load:.1f}")
     if options.only == "offline":

@@ -56,6 +56,7 @@ def checkpoint_for(
     require_kept(request)
     problem = {
         "program": f"diffuserbench {version('diffuserbench')}",
+        "format": FORMAT,
         "measurement": digest(job.measurement),
         "psfs": digest(job.calibration.psfs),
         "psf positions": digest(job.calibration.source_positions_um),
@@ -88,6 +89,8 @@ def settle_checkpoint(
 
 
 PROBLEM = "problem.json"
+FORMAT = 2
+"""Of solvers' states: another one's are refused, as those kept before there was a number."""
 _STATE = "state/"
 EVERY_S = 60.0
 """Seconds between two writings: the most that a kill costs, and rare enough to cost little itself."""
@@ -141,7 +144,13 @@ class CheckpointFolder:
             with np.load(path, allow_pickle=False) as kept:
                 records = tuple(_record(row) for row in kept["history"])
                 solver.restore(_state(kept))
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except KeyError as error:
+            raise FileError(
+                path,
+                f"was kept by another version of the program, or of another solver: it has no {error}.",
+                f"Delete {self.folder} to start over.",
+            ) from None
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
             raise FileError(
                 path, f"cannot be read as a checkpoint ({error}).", "Delete it to start over."
             ) from None
@@ -172,6 +181,12 @@ class CheckpointFolder:
             kept = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise FileError(path, f"cannot be read ({error}).", "Name another folder.") from None
+        if not isinstance(kept, dict) or kept.get("format") != problem.get("format"):
+            raise FileError(
+                self.folder,
+                "was kept by another version of the program, which this one cannot go on from.",
+                "Name another folder, or delete this one to start over.",
+            )
         for name in sorted({*problem, *kept}):
             if problem.get(name) != kept.get(name):
                 raise FileError(
@@ -215,7 +230,9 @@ class _Lazy(dict[str, Any]):
         self._kept = kept
 
     def __missing__(self, name: str) -> Any:
-        return _value(self._kept[f"{_STATE}{name}"])
+        if (stored := f"{_STATE}{name}") not in self._kept.files:
+            raise KeyError(name)
+        return _value(self._kept[stored])
 
 
 def _state(kept: Any) -> dict[str, Any]:

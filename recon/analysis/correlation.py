@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from recon.base import fft
 from recon.camera.camera_model import members_of_depths
-from recon.camera.refocus import rescaled
-from recon.camera.registration import register
+from recon.camera.registration import register, rescaled
 from recon.errors import InputError
 from recon.types import Calibration
 
