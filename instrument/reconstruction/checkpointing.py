@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instrument.files.atomic import check_writable, whole_file, write_text
+from instrument.files.atomic import check_writable, whole_file, write_json
 from instrument.files.errors import BenchError, FileError
 from instrument.files.record import plain
 from instrument.reconstruction.job import Job
@@ -128,7 +128,7 @@ class CheckpointFolder:
         else:
             check_writable(folder)
             folder.mkdir(exist_ok=True)
-            write_text(folder / PROBLEM, json.dumps(problem, indent=1, sort_keys=True) + "\n")
+            write_json(folder / PROBLEM, problem)
 
     @property
     def resumed_from(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import tempfile
 import threading
@@ -15,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from instrument.files.atomic import write_text
+from instrument.files.atomic import write_json
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import as_shown, write_mp4
 from instrument.files.record import plain
-from instrument.files.volumes import is_zarr_name
+from instrument.files.volumes import is_zarr_name, stem_of
 from instrument.reconstruction.job import Job, Reduction
 from instrument.reconstruction.options import InputOptions
 from instrument.reconstruction.preparation import Crop
@@ -27,12 +27,10 @@ from instrument.reconstruction.video_files import (
     DEFAULT_FPS,
     SAMPLES,
     VideoPictures,
-    as_shown,
     create_output,
     has_light,
     levels_of,
     require_video,
-    write_mp4,
 )
 from instrument.reconstruction.video_job import VideoJob, VideoPlan
 from instrument.reconstruction.video_work import BlockReport, CancelledError, cluster, in_process, on_cluster
@@ -77,16 +75,12 @@ class VideoRequest:
     @property
     def film_path(self) -> Path:
         """The MP4."""
-        return self._beside(".mp4")
+        return self.out.with_name(f"{stem_of(self.out)}.mp4")
 
     @property
     def record_path(self) -> Path:
         """The JSON with settings and origin."""
-        return self._beside(".json")
-
-    def _beside(self, suffix: str) -> Path:
-        stem = self.out.name.lower().removesuffix(".zarr").removesuffix(".ome")
-        return self.out.with_name(self.out.name[: len(stem)] + suffix)
+        return self.out.with_name(f"{stem_of(self.out)}.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +212,7 @@ def finish_video(prepared: PreparedVideo) -> list[Path]:
         written.append(request.film_path)
     unlit = prepared.job.unlit()
     record = {**plain(plan.settings), "frames": len(plan.frames), "run": plan.run, "frames_unlit": unlit}
-    write_text(request.record_path, json.dumps(record, indent=1, sort_keys=True))
+    write_json(request.record_path, record)
     prepared.job.remove()
     return [*written, request.record_path]
 

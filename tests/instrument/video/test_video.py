@@ -20,6 +20,7 @@ from ome_zarr_models.v05 import Image
 
 from instrument.cli import main
 from instrument.files.errors import BenchError, FileError
+from instrument.files.images import as_shown
 from instrument.plan import Part, Plan
 from instrument.reconstruction import video_work as block_module
 from instrument.reconstruction.options import InputOptions
@@ -30,7 +31,7 @@ from instrument.reconstruction.video import (
     prepare_video,
     solve_video,
 )
-from instrument.reconstruction.video_files import VideoPictures, as_shown, has_light, levels_of, require_video
+from instrument.reconstruction.video_files import VideoPictures, has_light, levels_of, require_video
 from instrument.reconstruction.video_work import BlockReport, cluster, on_cluster
 from instrument.runs.run import Run
 from recon import reconstruct
