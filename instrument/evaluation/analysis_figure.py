@@ -33,7 +33,6 @@ def draw_analysis(analysis: Analysis, title: str, subtitle: str = "", *, simulat
 
     Parameters
     ----------
-    analysis : Analysis
     title : str
         What was analysed, in a reader's words.
     subtitle : str

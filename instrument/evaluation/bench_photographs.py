@@ -55,12 +55,7 @@ Floats = npt.NDArray[np.float32]
 
 
 class OutOfTimeError(Exception):
-    """There was no time for all photographs; those taken are kept.
-
-    Attributes
-    ----------
-    done, total : int
-    """
+    """There was no time for all photographs; those taken are kept."""
 
     def __init__(self, done: int, total: int) -> None:
         super().__init__(f"{done} of {total} photographs were taken.")

@@ -62,7 +62,6 @@ class ChartData:
         Of :data:`recon.evaluation.scored.KINDS`.
     about : mapping
         What was charted, JSON-compatible.
-    points : tuple of Point
     failed : mapping of str to str
         Settings that could not be run, and why.
     missing : tuple of str

@@ -139,7 +139,6 @@ def problem_of_pictures(
         Depth of each; empty: one picture in focus.
     expansions : sequence of int
         Empty: the bench's own, and :data:`EXPANSIONS`.
-    frames : sequence of int
     slm : (int, int), optional
         Rows and columns to compute for, on the bench's SLM's pitch. Default: the SLM's own.
 

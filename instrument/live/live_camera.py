@@ -25,7 +25,6 @@ class LiveCameraStatus:
 
     Attributes
     ----------
-    running : bool
     frames_per_s : float
         Of the camera, over the last two seconds; zero before the second frame.
     acquired, dropped : int
@@ -42,10 +41,6 @@ class LiveCamera:
     """Runs a camera's stream and gives its newest frame to whoever asks; never a queue.
 
     Callable from any thread; ``start``, ``stop`` and ``paused`` talk to the camera and block.
-
-    Parameters
-    ----------
-    camera : Camera
     """
 
     def __init__(self, camera: Camera) -> None:

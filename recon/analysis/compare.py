@@ -45,7 +45,6 @@ class Change:
 
     Attributes
     ----------
-    z_um : float
     rows, columns : float
         By how much the pattern moved, pixels.
     scale : float

@@ -40,8 +40,6 @@ class DpcOptics:
     ----------
     pitch_um : float
         Of the pixels, in the object.
-    wavelength_nm : float
-    objective_na, illumination_na : float
     lit_share : float
         Of the LEDs inside the objective's aperture, how many belong to a half: those on the line between the
         halves are dark in both, and miss in the sum that the difference is divided by.
@@ -80,7 +78,6 @@ def phase_from_halves(
     halves : mapping of str to array, (height, width)
         ``"left"``, ``"right"``, ``"top"``, ``"bottom"``: lit by the LEDs with negative and positive x, and
         with positive and negative y; dark frame subtracted.
-    optics : DpcOptics
     regularisation : float
         Weight of the phase's curvature (in units of the aperture) against the data: keeps the finest
         structure, which the pupil hardly passes, from drowning in noise; what is ten times as coarse as the
@@ -131,7 +128,6 @@ def transfer(shape: tuple[int, int], optics: DpcOptics, *, axis: int) -> npt.NDA
     Parameters
     ----------
     shape : (int, int)
-    optics : DpcOptics
     axis : {0, 1}
         0: half with positive y minus the other; 1: the same along x.
     """

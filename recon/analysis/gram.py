@@ -79,7 +79,6 @@ def gram_matrix(planes: Array, voxels: Sequence[Voxel]) -> Floats:
     ----------
     planes : ndarray, (n_z, height, width)
         On-axis PSFs.
-    voxels : sequence of Voxel
 
     Returns
     -------

@@ -218,7 +218,6 @@ class PointTests:
         By how much both separations had to grow for 4 x 4 points in x and z: the dissertation's 1.7.
     lateral, axial, sixteen : tuple of PointTrial
         Every trial made.
-    notes : tuple of str
     """
 
     lateral_px: float | None
@@ -244,7 +243,6 @@ def point_tests(
 
     Parameters
     ----------
-    calibration : Calibration
     z_um : float
         Depth of the middle of the tests.
     lateral_px, step_per_um : float

@@ -80,16 +80,11 @@ degrees, nearest objects at 1.7 mm) needs a PSF every 0.4 mm, as the dissertatio
 MOST_PLANES = 512
 
 
-def lateral_spacing_um(
-    response: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]],
-    z_um: float,
-    *,
-    level: float = SPECTRUM_LEVEL,
-) -> float:
+def lateral_spacing_um(response: Callable[[Floats], Floats], z_um: float) -> float:
     """Spacing of calibration points that samples the angular fall-off at Nyquist's rate (Eqs. 5.8, 5.9).
 
     The registered fall-off is ``f(atan(x / z))``; its spectrum is computed numerically and cut where it is
-    below ``level`` of its value at zero from there on.
+    below :data:`SPECTRUM_LEVEL` of its value at zero from there on.
 
     Parameters
     ----------
@@ -109,21 +104,14 @@ def lateral_spacing_um(
     spectrum = np.abs(np.fft.rfft(values))
     if spectrum[0] <= 0:
         return float("inf")
-    above = np.flatnonzero(spectrum > level * spectrum[0])
+    above = np.flatnonzero(spectrum > SPECTRUM_LEVEL * spectrum[0])
     highest = (int(above[-1]) + 1) / (n * step)
     return float(z_um / (2 * highest))
 
 
-def gaussian_response(
-    sigma_deg: float,
-) -> Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]:
+def gaussian_response(sigma_deg: float) -> Callable[[Floats], Floats]:
     """Return a Gaussian angular response (Fig. 5.3a: 13 degrees)."""
-    sigma = np.deg2rad(sigma_deg)
-
-    def response(angles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.asarray(np.exp(-0.5 * (angles / sigma) ** 2))
-
-    return response
+    return lambda angles: np.asarray(np.exp(-0.5 * (angles / np.deg2rad(sigma_deg)) ** 2))
 
 
 def axial_spacing_per_um(lenslet_um: float, wavelength_um: float) -> float:
@@ -238,7 +226,6 @@ class AxialResolution:
 
     Attributes
     ----------
-    level : float
     scale : float
         Enlargement at which the PSF is only ``level`` similar to itself.
     step_per_um : float
@@ -272,8 +259,8 @@ def axial_resolution(
     return AxialResolution(level, scale, (scale - 1) * (1 + distance_um / z_um) / distance_um)
 
 
-def support_extent_px(psf: Array, share: float = 0.99) -> tuple[float, float]:
-    """Return height and width of the box about the centre of light that holds ``share`` of it each way."""
+def support_extent_px(psf: Array) -> tuple[float, float]:
+    """Return height and width of the box about the centre of light that holds 99 % of it each way."""
     light = np.maximum(np.asarray(psf, np.float64), 0)
     # What is below a thousandth of the brightest blocks is noise and stray light, not pattern.
     light[light < 1e-3 * np.quantile(light, 0.999)] = 0
@@ -282,6 +269,6 @@ def support_extent_px(psf: Array, share: float = 0.99) -> tuple[float, float]:
         profile = light.sum(axis=1 - axis)
         distance = np.abs(np.arange(len(profile)) - centre)
         order = np.argsort(distance)
-        reached = np.searchsorted(np.cumsum(profile[order]), share * profile.sum())
+        reached = np.searchsorted(np.cumsum(profile[order]), 0.99 * profile.sum())
         sizes.append(2 * float(distance[order[min(int(reached), len(order) - 1)]]) + 1)
     return sizes[0], sizes[1]

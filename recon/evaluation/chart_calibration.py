@@ -47,7 +47,6 @@ class Photographed:
 
     Attributes
     ----------
-    name : str
     image : ndarray, float32, (height, width)
     truth : ndarray, float32, (FINE * height, FINE * width)
         Light from all depths that reaches the sensor; the axis in the middle.
@@ -70,10 +69,8 @@ class Photographs:
         Row and column from the axis in object pixels, and depth in micrometres.
     slides : ndarray, (m, height, width)
         Of beads at unknown places in depth ``z_um``.
-    scenes : tuple of Photographed
     z_um : float
         Depth of the flat picture, of the slides, and of calibrations of one depth.
-    geometry : Geometry
     window_px : int
         Side of the square that holds a PSF of ``z_um``; odd.
     reach : float
@@ -98,7 +95,6 @@ class CalibrationSetting:
     ----------
     grid : int
         Points along each side of the field; 1: on the axis.
-    depths : int
     averaged : int
         Photographs a place, whose mean is taken.
     slides : int
@@ -314,10 +310,8 @@ class CalibrationProblem(Subject[CalibrationSetting]):
 
     def _flat(self, calibration: Calibration) -> Calibration:
         """Return the part of a calibration that is of the flat picture's depth."""
-        positions = calibration.source_positions_um
-        away = np.abs(1 / positions[:, 2] - 1 / self.photographs.z_um)
-        mine = away <= away.min() + 1e-9
-        return replace(calibration, psfs=calibration.psfs[mine], source_positions_um=positions[mine])
+        away = np.abs(1 / calibration.source_positions_um[:, 2] - 1 / self.photographs.z_um)
+        return calibration.part(away <= away.min() + 1e-9)
 
     def _at(self, row: float, column: float, z_um: float) -> npt.NDArray[np.int_]:
         return np.flatnonzero(np.all(np.abs(self.photographs.places - (row, column, z_um)) < 1e-6, axis=1))

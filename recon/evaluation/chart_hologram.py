@@ -84,7 +84,6 @@ class HologramProblem(Subject[HologramSetting]):
         One an expansion.
     targets : tuple of tuple of Target
         For each display, one a plane.
-    frames : tuple of int
     weights : ndarray
         Of the losses that take them.
     seed : int

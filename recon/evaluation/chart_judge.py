@@ -11,7 +11,7 @@ for it (docs/benchmarks/charts.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -129,21 +129,11 @@ class Judge:
         )
 
     @property
-    def central(self) -> Calibration:
-        """The PSF nearest to the axis alone."""
-        positions = self.calibration.source_positions_um
-        nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
-        return replace(
-            self.calibration,
-            psfs=self.calibration.psfs[nearest : nearest + 1],
-            source_positions_um=positions[nearest : nearest + 1],
-        )
-
-    @property
     def used(self) -> Calibration:
-        """What the setting reconstructs with: of a picture with one PSF that PSF alone."""
-        plain = self.setting.is_plain and not self.problem.volume
-        return self.central if plain else self.calibration
+        """What the setting reconstructs with: of a picture with one PSF the one nearest to the axis alone."""
+        if self.problem.volume or not self.setting.is_plain:
+            return self.calibration
+        return self.calibration.part([self.calibration.nearest_to_axis()])
 
     def point(self, found: Array, iterations: int, seconds: float) -> Point:
         """Score a picture or volume of the full field."""

@@ -49,7 +49,6 @@ class ChartProblem(Subject[Setting]):
     ----------
     measurement : ndarray, (height, width)
         One channel, counts, background subtracted.
-    calibration : Calibration
     volume : bool
         Whether all depths take part; else the calibration holds one depth.
     erasures : ndarray of bool or None
@@ -176,12 +175,7 @@ def _asked(problem: ChartProblem) -> Problem:
     """Return the problem that solvers are asked about."""
     calibration = problem.calibration
     if not problem.volume:
-        first = members_of_depths(calibration.source_positions_um)[0][:1]
-        calibration = replace(
-            calibration,
-            psfs=calibration.psfs[first],
-            source_positions_um=calibration.source_positions_um[first],
-        )
+        calibration = calibration.part(members_of_depths(calibration.source_positions_um)[0][:1])
     measurement = Measurement(problem.measurement, erasures=problem.erasures, noise=problem.noise)
     return Problem.of(measurement, calibration, ReconstructionOptions(model="convolution"))
 

@@ -14,7 +14,7 @@ from recon.analysis.points import DIP, Noise, PointGrid, try_points
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.evaluation.scene import SceneSpec, TestScene
+from recon.evaluation.scene import SceneSpec, TestScene, shared
 from recon.evaluation.scene_trial import PIXELS, judge_image, scene_of, spec_at
 from recon.holography import Display, Target, random_mask
 from recon.holography.pose import PlacedHologram, Pose
@@ -241,14 +241,7 @@ def _picture(pixels: int, places: Array, light: Array) -> Array:
     """Return points as a picture, each shared by its four nearest pixels, blurred by one pixel."""
     from scipy.ndimage import gaussian_filter
 
-    image = np.zeros((pixels, pixels))
-    for place, value in zip(places + pixels // 2, light, strict=True):
-        corner = np.floor(place).astype(int)
-        for offset in np.ndindex(2, 2):
-            y, x = corner + offset
-            if 0 <= y < pixels and 0 <= x < pixels:
-                image[y, x] += value * float(np.prod(1 - np.abs(place - (y, x))))
-    return np.asarray(gaussian_filter(image, 1.0))
+    return np.asarray(gaussian_filter(shared((pixels, pixels), places + pixels // 2, light), 1.0))
 
 
 @lru_cache(maxsize=2)

@@ -427,7 +427,6 @@ def run_map(
 
     Parameters
     ----------
-    stress : StressMap
     size : "quick" or "full"
     methods : sequence of str, optional
         Of the map's; default all.
@@ -442,6 +441,5 @@ def run_map(
         if (method, ix, iy) in done:
             continue
         began = time.perf_counter()
-        draws = stress.draws if size == "full" else 1
-        trials = [stress.trial(method, x[ix], y[iy], seed + k, size) for k in range(draws)]
-        yield cell_of(method, ix, iy, trials, time.perf_counter() - began)
+        trial = stress.trial(method, x[ix], y[iy], seed, size)
+        yield cell_of(method, ix, iy, trial, time.perf_counter() - began)

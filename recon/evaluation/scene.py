@@ -51,7 +51,6 @@ class SceneSpec:
         Whether the three channels of the scene differ.
     photons : float
         Photo-electrons at the brightest pixel.
-    read_noise_e : float
     background : float
         Smooth stray light, relative to the mean of the scene's.
     saturation : float or None
@@ -148,7 +147,6 @@ class TestScene:
 
     Attributes
     ----------
-    spec : SceneSpec
     measurement : ndarray, float32, (height, width) or (height, width, 3)
         Counts, one a photo-electron; 0 where erased.
     calibration : Calibration
@@ -368,31 +366,28 @@ def _on_grid(
     light = places[:, 3] * tint
     if spec.is_picture:
         image = np.zeros((height, width))
-        _drop(image, (np.floor(row + 0.5).astype(int), np.floor(column + 0.5).astype(int)), light)
+        _drop(image, np.floor(np.column_stack([row, column]) + 0.5).astype(int), light)
         return image
-    depth = (1 - places[:, 2]) * (spec.depths - 1)
-    volume = np.zeros((spec.depths, height, width))
-    corner = [np.floor(v).astype(int) for v in (depth, row, column)]
-    part = [v - np.floor(v) for v in (depth, row, column)]
-    for bits in range(8):
-        index, share = [], light.copy()
-        for axis in range(3):
-            far = bits >> axis & 1
-            index.append(corner[axis] + far)
-            share = share * (part[axis] if far else 1 - part[axis])
-        index[0] = np.clip(index[0], 0, spec.depths - 1)
-        _drop(volume, tuple(index), share)
-    return volume
+    depth = np.clip(1 - places[:, 2], 0, 1) * (spec.depths - 1)
+    return shared((spec.depths, height, width), np.column_stack([depth, row, column]), light)
 
 
-def _drop(
-    grid: npt.NDArray[np.float64], index: tuple[npt.NDArray[np.int_], ...], light: npt.NDArray[np.float64]
-) -> None:
-    """Add light to cells; what falls outside is lost."""
-    inside = np.ones(light.shape, bool)
-    for values, count in zip(index, grid.shape, strict=True):
-        inside &= (values >= 0) & (values < count)
-    np.add.at(grid, tuple(v[inside] for v in index), light[inside])
+def shared(
+    shape: tuple[int, ...], places: npt.NDArray[np.float64], light: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return points (n, n_axes) on a grid, each shared by its nearest cells, two along each axis."""
+    grid = np.zeros(shape)
+    corner = np.floor(places).astype(int)
+    part = places - corner
+    for far in np.ndindex((2,) * len(shape)):
+        _drop(grid, corner + far, light * np.prod(np.where(far, part, 1 - part), axis=1))
+    return grid
+
+
+def _drop(grid: npt.NDArray[np.float64], cells: npt.NDArray[np.int_], light: npt.NDArray[np.float64]) -> None:
+    """Add light to cells, (n, n_axes); what falls outside is lost."""
+    inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
+    np.add.at(grid, tuple(cells[inside].T), light[inside])
 
 
 def _flat(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:

@@ -72,7 +72,6 @@ class Axis:
         The attribute of :class:`Point`.
     words : str
         With the unit.
-    more_is_better : bool
     logarithmic : bool
         Whether it is drawn so.
     """
@@ -100,7 +99,6 @@ class Kind:
 
     Attributes
     ----------
-    name : str
     costs : tuple of Axis
         The first is the one that fronts are made of.
     scores : tuple of Axis
@@ -215,7 +213,6 @@ class Curve:
 
     Attributes
     ----------
-    points : tuple of Point
     finished : bool
         False where the time limit cut the run off: given longer, it would go on.
     """

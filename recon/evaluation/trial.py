@@ -40,12 +40,10 @@ class Setting:
         Names of :data:`recon.reconstruction.solvers.SOLVERS` and :data:`recon.priors.PRIORS`.
     model : str
         Of the camera.
-    binning : int
     background : bool
         Whether a smooth one is estimated as well.
     precision : str
         Of the arithmetic.
-    device : str
     """
 
     solver: str

@@ -143,7 +143,6 @@ def baseline(
     frames : ndarray, (n_frames, height, width)
     window : int
         Frames that a baseline looks at. Much longer than activity.
-    percentile : float
     fade : ndarray, (n_frames,), optional
         As of :func:`fading`: taken out before the percentile and put back after. Without it, light that
         fades within a window pulls its percentile down, and the ends of the video up.
@@ -280,7 +279,6 @@ def find_regions(
         Fewer are taken for noise.
     alike : float
         Correlation of a pixel's course with that of the region's core from which it belongs to it.
-    at_most : int
     """
     from scipy import ndimage
 

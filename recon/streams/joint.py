@@ -142,7 +142,6 @@ class JointAdmm(SensorAdmm):
         A ``Convolution`` with a channel a frame, with or without ``Erasures`` after it.
     data, prior
         As of :class:`~recon.solvers.SensorAdmm`.
-    over_time : OverTime
     """
 
     def __init__(self, operator: LinearOperator, data: Array, prior: Prior, over_time: OverTime) -> None:
@@ -218,7 +217,6 @@ def solve_together(
         Total variation along time, or low rank plus sparse (background and activity).
     weight : float, optional
         Of the prior over time relative to the frames' own; default 1.
-    iterations : int
     ended : callable
         Asked before each iteration; True gives the block up.
 

@@ -78,7 +78,6 @@ class LivePicture:
     image : ndarray, float32, (height, width) or (height, width, n_channels)
         The part of the scene opposite to the sensor, on pixels binned ``binning x binning``; brightness does
         not depend on the binning.
-    binning : int
     method : str
         The solver that made it; ``"wiener"`` for a filter, which is of one depth and one PSF.
     iterations : int
@@ -138,7 +137,6 @@ class Level:
         Pixels averaged along each axis.
     preview : Part
         Of the same frame through one PSF, without a background: what the filter is for.
-    filter : WienerFilter
     solver : VideoSolver or None
         None until it was made: a filter is made in a moment, for the first picture.
     """

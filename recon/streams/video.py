@@ -49,7 +49,6 @@ def stream_problem(
     ----------
     frame : Measurement or array, (height, width[, n_channels])
         Background subtracted. A bright one, where the video has brighter and darker ones.
-    calibration : Calibration or array
     options : ReconstructionOptions, optional
         Any camera model, prior, background and depths; ``"auto"`` is one PSF a depth here, as the quickest,
         and the exact-data ADMM where that has a way.

@@ -133,14 +133,12 @@ def measure(
 
     Parameters
     ----------
-    seen : Observation
     volume : ndarray, (n_z, rows, columns)
         The result: ``measurement = sum_z PSF_z * volume_z``.
     psfs : ndarray, (n_z, height, width)
         On-axis PSFs as calibrated.
     residual_norm : float
         ``||A x - b||`` over the valid pixels, in units of the noise.
-    unsettled : float
     points : bool
         Whether to look for its bright points as well.
     """
@@ -368,7 +366,6 @@ def evidence_of(
         As calibrated.
     residuals : sequence of float
         Residual norms in units of the noise: one a channel, or one of all together.
-    unsettled : float
     points : bool
         Whether to look for the result's bright points as well: of volumes.
     """

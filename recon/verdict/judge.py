@@ -184,7 +184,6 @@ class Verdict:
 
     Attributes
     ----------
-    region : Region
     method : str
         The maps' name of the method.
     failing : float or None

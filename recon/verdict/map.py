@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -131,12 +131,10 @@ class Stress:
 
     Attributes
     ----------
-    key, label, unit : str
     values : tuple of float
         For the full size, rising.
     quick : tuple of float
         For the quick size.
-    logarithmic : bool
     named : callable, optional
         ``named(value, size)`` says what a value is in other units: the name of its tick.
     """
@@ -183,16 +181,10 @@ class StressMap:
 
     Attributes
     ----------
-    name, title : str
     question : str
         What it answers, in plain words.
-    x, y : Stress
-    methods : tuple of str
-    trial : callable
     error : str
         What the errors are.
-    draws : int
-        Scenes a cell in the full size; the median severity counts.
     base : str
         What the trials start from, in words that change when it does; empty where that is not known.
     """
@@ -205,13 +197,12 @@ class StressMap:
     methods: tuple[str, ...]
     trial: TrialFunction
     error: str = "NRMSE"
-    draws: int = 1
     base: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What a method gave at one place of a map: the median of the draws."""
+    """What a method gave at one place of a map."""
 
     method: str
     ix: int
@@ -220,7 +211,7 @@ class Cell:
     severity: float
     failure: Failure | None
     evidence: tuple[Mapping[str, float], ...]
-    """One mapping a draw, each with its own ``severity``."""
+    """Of each scene drawn, with its own ``severity``."""
     seconds: float
 
     def as_json(self) -> dict[str, Any]:
@@ -231,23 +222,16 @@ class Cell:
     @staticmethod
     def from_json(entry: Mapping[str, Any]) -> Cell:
         """Return the cell of a file's entry."""
-        names = ("method", "ix", "iy", "error", "severity", "failure", "evidence", "seconds")
         failure = None if entry["failure"] is None else Failure[entry["failure"].upper()]
-        return Cell(
-            **{n: entry[n] for n in names} | {"failure": failure, "evidence": tuple(entry["evidence"])}
-        )
+        known = {field.name: entry[field.name] for field in fields(Cell)}
+        return Cell(**known | {"failure": failure, "evidence": tuple(entry["evidence"])})
 
 
-def cell_of(method: str, ix: int, iy: int, trials: list[Trial], seconds: float) -> Cell:
-    """Summarise the draws of a cell."""
-    judged = [worst(t.severities) for t in trials]
-    order = np.argsort([severity for severity, _ in judged])
-    severity, failure = judged[int(order[len(order) // 2])]
-    evidence = tuple(
-        {**t.evidence, "severity": of} for t, (of, _) in zip(trials, judged, strict=True) if t.evidence
-    )
-    error = float(np.median([t.error for t in trials]))
-    return Cell(method, ix, iy, error, severity, failure, evidence, seconds)
+def cell_of(method: str, ix: int, iy: int, trial: Trial, seconds: float) -> Cell:
+    """Return the cell that a trial makes."""
+    severity, failure = worst(trial.severities)
+    evidence = ({**trial.evidence, "severity": severity},) if trial.evidence else ()
+    return Cell(method, ix, iy, float(trial.error), severity, failure, evidence, seconds)
 
 
 def severity_grid(cells: list[Cell], method: str, shape: tuple[int, int]) -> npt.NDArray[np.float64]:

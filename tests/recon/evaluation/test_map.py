@@ -22,7 +22,7 @@ def fake(_method: str, x: float, y: float, _seed: int, _size: str) -> Trial:
     return Trial(severity / 10, {Failure.TRIVIAL: severity}, {"snr": x / y})
 
 
-MAP = StressMap("fake", "Fake", "None.", X, Y, ("one", "two"), fake, draws=3)
+MAP = StressMap("fake", "Fake", "None.", X, Y, ("one", "two"), fake)
 
 
 def test_every_cell_is_made_once_and_known_ones_are_left_out() -> None:
