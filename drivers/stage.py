@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -117,7 +118,26 @@ class Stage(Device):
             settings[f"speed_{axis.name}_per_s"] = axis.speed_per_s
         return settings
 
+    def _acceleration_per_s2(self, name: str) -> float:
+        """Return an axis' acceleration in units a second squared; infinite where it is not known."""
+        return math.inf
+
     def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
         """Estimated seconds for a move; axes move together, so the slowest counts."""
-        speeds = {axis.name: axis.speed_per_s for axis in self.axes}
-        return max((abs(target[a] - start[a]) / speeds[a] for a in target if a in start), default=0.0)
+        durations = (
+            trapezoid_duration_s(
+                target[axis.name] - start[axis.name], axis.speed_per_s, self._acceleration_per_s2(axis.name)
+            )
+            for axis in self.axes
+            if axis.name in start and axis.name in target
+        )
+        return max(durations, default=0.0)
+
+
+def trapezoid_duration_s(distance: float, speed: float, acceleration: float) -> float:
+    """Seconds that a move takes from rest to rest."""
+    distance = abs(distance)
+    ramp = speed**2 / acceleration
+    if distance < ramp:
+        return 2 * math.sqrt(distance / acceleration)
+    return distance / speed + speed / acceleration

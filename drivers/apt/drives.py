@@ -94,8 +94,8 @@ class Motor:
                 raise DeviceError(
                     self._link.device, f"bay {self._bay} of {self._link.port} is empty.", "Check channel."
                 )
-        self._link.send(short(HW_STOP_UPDATEMSGS, self._address))
-        self._link.send(short(MOD_SET_CHANENABLESTATE, self._address, self._channel, ENABLE))
+        self._link.send_now(short(HW_STOP_UPDATEMSGS, self._address))
+        self._link.send_now(short(MOD_SET_CHANENABLESTATE, self._address, self._channel, ENABLE))
         enabled = self._link.ask(
             short(MOD_REQ_CHANENABLESTATE, self._address, self._channel),
             MOD_GET_CHANENABLESTATE,
@@ -117,15 +117,15 @@ class Motor:
 
     def move(self, counts: int) -> None:
         """Begin a move."""
-        self._link.send(long(MOT_MOVE_ABSOLUTE, self._address, "Hl", self._channel, counts))
+        self._link.send_now(long(MOT_MOVE_ABSOLUTE, self._address, "Hl", self._channel, counts))
 
     def home(self) -> None:
         """Begin to look for the reference."""
-        self._link.send(short(MOT_MOVE_HOME, self._address, self._channel))
+        self._link.send_now(short(MOT_MOVE_HOME, self._address, self._channel))
 
     def stop(self) -> None:
         """Stop at once; from any thread."""
-        self._link.send(short(MOT_MOVE_STOP, self._address, self._channel, STOP_AT_ONCE))
+        self._link.send_now(short(MOT_MOVE_STOP, self._address, self._channel, STOP_AT_ONCE))
 
     def speed(self) -> float:
         """Ask for the speed of moves, counts a second."""
@@ -136,7 +136,7 @@ class Motor:
         _, slowest, acceleration, _ = self._velocity()
         wanted = round(counts_per_s * self._scale)
         values = (self._channel, slowest, acceleration, wanted)
-        self._link.send(long(MOT_SET_VELPARAMS, self._address, "Hlll", *values))
+        self._link.send_now(long(MOT_SET_VELPARAMS, self._address, "Hlll", *values))
 
     def _velocity(self) -> tuple[int, int, int, int]:
         reply = self._link.ask(
@@ -208,14 +208,14 @@ class InertiaUnit:
         self._stops += 1  # whoever is about to begin a move sees it
         self._waiting = {}
         self._current = None
-        self.link.send(
+        self.link.send_now(
             short(MOT_MOVE_STOP, self._address, _bit(channel), STOP_AT_ONCE)
             + long(PZMOT_SET_PARAMS, self._address, "HH", PZMOT_ENABLED, 0)
         )
 
     def _begin(self, channel: int, target: int, stops: int) -> None:
         self._current = (channel, target, time.monotonic())
-        self.link.send(
+        self.link.send_now(
             long(PZMOT_SET_PARAMS, self._address, "HH", PZMOT_ENABLED, channel)
             + long(PZMOT_MOVE_ABSOLUTE, self._address, "Hl", _bit(channel), target)
         )
@@ -237,7 +237,7 @@ class InertiaChannel:
     def prepare(self) -> None:
         """Forget the zero unless the steps say that the unit was under power all the time."""
         self._unit.forget()
-        self._link.send(short(HW_STOP_UPDATEMSGS, self._address))
+        self._link.send_now(short(HW_STOP_UPDATEMSGS, self._address))
         last = self._last
         self._zeroed = self._zeroed and last != 0 and self.state().counts == last
 
@@ -257,7 +257,7 @@ class InertiaChannel:
     def home(self) -> None:
         """Call the present place zero."""
         values = (PZMOT_POSITION, _bit(self._channel), 0, 0)
-        self._link.send(long(PZMOT_SET_PARAMS, self._address, "HHll", *values))
+        self._link.send_now(long(PZMOT_SET_PARAMS, self._address, "HHll", *values))
         self._zeroed = True
 
     def stop(self) -> None:
@@ -272,7 +272,7 @@ class InertiaChannel:
         """Set the step rate; voltage and acceleration stay."""
         _, _, volts, _, acceleration = self._drive()
         values = (PZMOT_DRIVE, _bit(self._channel), volts, round(counts_per_s), acceleration)
-        self._link.send(long(PZMOT_SET_PARAMS, self._address, "HHHll", *values))
+        self._link.send_now(long(PZMOT_SET_PARAMS, self._address, "HHHll", *values))
 
     def _drive(self) -> tuple[int, int, int, int, int]:
         request = short(PZMOT_REQ_PARAMS, self._address, PZMOT_DRIVE, _bit(self._channel))

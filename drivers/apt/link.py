@@ -39,7 +39,7 @@ class HardwareInfo:
     firmware: str
 
 
-class Link:
+class Link(SerialTransport):
     """The serial port of one controller.
 
     Parameters
@@ -51,12 +51,10 @@ class Link:
     """
 
     def __init__(self, port: str, device: str, name: ControllerName) -> None:
-        self.port = port
-        self.device = device
         self.name = name
         self.controller = CONTROLLERS[name]
         address = self.controller.address
-        self._transport = SerialTransport(
+        super().__init__(
             port,
             device,
             baud_rate=_BAUD_RATE,
@@ -67,19 +65,10 @@ class Link:
         )
         self._complaint = ""
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open and has not failed."""
-        return self._transport.is_open
-
     def open(self) -> None:
         """Open the port."""
         self._complaint = ""
-        self._transport.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self._transport.close()
+        super().open()
 
     def ask(self, request: bytes, number: int, source: int | None, channel: int | None = None) -> Message:
         """Send a request, again if need be, and return its reply.
@@ -104,7 +93,7 @@ class Link:
         """
         for attempt in range(_ATTEMPTS):
             try:
-                return decode(self._transport.request(request, _reply(number, source, channel))[-1])
+                return decode(self.request(request, _reply(number, source, channel))[-1])
             except DeviceTimeoutError as error:
                 if attempt == _ATTEMPTS - 1:
                     raise DeviceTimeoutError(
@@ -114,10 +103,6 @@ class Link:
                     ) from error
                 _log.info("%s: %s gave no whole answer, asking again", self.device, self.name)
         raise AssertionError("unreachable")
-
-    def send(self, message: bytes) -> None:
-        """Send messages that are not answered; at once, from any thread."""
-        self._transport.send_now(message)
 
     def info(self) -> HardwareInfo:
         """Ask who the controller is.

@@ -1,4 +1,4 @@
-"""Counting the frames that a camera lost, from its frame numbers or, where it has none, its timestamps."""
+"""Counting the frames that a camera lost, from its frame numbers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ class FrameNumberCounter:
     first_after_wrap : int
         The number that follows ``modulus - 1``: 0, or 1 where 0 is reserved (GigE Vision 1).
     """
-
-    counted_by = "device frame numbers"
 
     def __init__(self, modulus: int | None = None, first_after_wrap: int = 0) -> None:
         self._modulus = modulus
@@ -33,28 +31,3 @@ class FrameNumberCounter:
         if step <= 0:
             raise ValueError(f"frame number {number} came after {previous}")
         return step - 1
-
-
-class TimestampCounter:
-    """Counts by timestamps and a known frame period: right while jitter stays under half a period.
-
-    Parameters
-    ----------
-    period_ns : float
-        Time from frame to frame as the camera is set.
-    """
-
-    counted_by = "timestamps"
-
-    def __init__(self, period_ns: float) -> None:
-        if period_ns <= 0:
-            raise ValueError(f"a frame period of {period_ns} ns")
-        self._period_ns = period_ns
-        self._previous_ns: int | None = None
-
-    def lost(self, time_ns: int) -> int:
-        """Return the frames lost between the frame of this time and the one asked for before."""
-        previous_ns, self._previous_ns = self._previous_ns, time_ns
-        if previous_ns is None:
-            return 0
-        return max(0, round((time_ns - previous_ns) / self._period_ns) - 1)

@@ -134,15 +134,6 @@ class AxisMap:
         return StageAxis(self.name, soft_low, soft_high, abs(self.scale * speed_per_s), step)
 
 
-def trapezoid_duration_s(distance: float, speed: float, acceleration: float) -> float:
-    """Seconds that a move takes from rest to rest."""
-    distance = abs(distance)
-    ramp = speed**2 / acceleration
-    if distance < ramp:
-        return 2 * math.sqrt(distance / acceleration)
-    return distance / speed + speed / acceleration
-
-
 def check_target(device: str, axes: Iterable[StageAxis], target: Mapping[str, float], homed: bool) -> None:
     """Refuse a move that a stage must not make, whole and before anything moves.
 

@@ -27,7 +27,7 @@ _RESET_S = 2.0
 _OFFSET_REPORTS = 40  # GRBL sends the offset with every thirtieth report at least
 
 
-class GrblLink:
+class GrblLink(SerialTransport):
     """A serial port with a GRBL controller at its other end.
 
     Parameters
@@ -41,14 +41,13 @@ class GrblLink:
     """
 
     def __init__(self, port: str, device: str, baud_rate: int, timeout_s: float) -> None:
-        self.device = device
         self._place = f"{port} at {baud_rate} baud"
-        self._transport = SerialTransport(
+        super().__init__(
             port,
             device,
             baud_rate=baud_rate,
             probe=(b"$G\n", modes_matcher()),
-            on_message=self._on_message,
+            on_message=self._unasked,
             timeout_s=timeout_s,
         )
         self._offset: tuple[float, ...] | None = None
@@ -58,19 +57,10 @@ class GrblLink:
         self._ends: list[bytes] = []
         self._said: list[str] = []
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open and was not lost."""
-        return self._transport.is_open
-
     def open(self) -> None:
         """Open the port."""
-        self._transport.open()
+        super().open()
         self._offset = None
-
-    def close(self) -> None:
-        """Close the port."""
-        self._transport.close()
 
     # Asking ----------------------------------------------------------------------------------------
     def report(self) -> Report:
@@ -97,10 +87,10 @@ class GrblLink:
         So a question that meets another one, or the byte that stops a move, may share its answer.
         """
         try:
-            (line,) = self._transport.request(STATUS, report_matcher)
+            (line,) = self.request(STATUS, report_matcher)
         except DeviceTimeoutError as error:
             _log.warning("%s Asked again.", error)
-            (line,) = self._transport.request(STATUS, report_matcher)
+            (line,) = self.request(STATUS, report_matcher)
         return line
 
     def command(self, line: bytes) -> list[bytes]:
@@ -111,7 +101,7 @@ class GrblLink:
         DeviceError
             When the controller refuses it, with the error's meaning.
         """
-        *lines, end = self._transport.request(line, line_matcher())
+        *lines, end = self.request(line, line_matcher())
         code = parse_error(end)
         if code is not None:
             raise self.refused(line, code)
@@ -132,26 +122,18 @@ class GrblLink:
         with self._heard:
             self._ends.clear()
             self._said.clear()
-        self._transport.send_now(line)
+        self.send_now(line)
 
     def ended(self) -> bytes | None:
         """Return ``ok`` or ``error:n`` of the line that was begun; None while it goes on."""
         with self._heard:
             return self._ends[0] if self._ends else None
 
-    def send_now(self, byte: bytes) -> None:
-        """Send a real-time command, which has no reply."""
-        self._transport.send_now(byte)
-
-    def overtake(self, byte: bytes) -> None:
-        """Cancel what waits for a reply, and send a real-time command."""
-        self._transport.overtake(byte)
-
     def reset(self) -> None:
         """Reset the controller, and wait until it has said so."""
         with self._heard:
             before = self._banners
-            self._transport.overtake(SOFT_RESET)
+            self.overtake(SOFT_RESET)
             if not self._heard.wait_for(lambda: self._banners > before, _RESET_S):
                 raise DeviceTimeoutError(
                     self.device,
@@ -176,7 +158,7 @@ class GrblLink:
         """Return what an alarm means."""
         return f"{ALARMS.get(alarm, 'see the list of alarm codes')} (alarm {alarm})"
 
-    def _on_message(self, line: bytes) -> None:
+    def _unasked(self, line: bytes) -> None:
         alarm = parse_alarm(line)
         with self._heard:
             if alarm is not None:

@@ -9,7 +9,6 @@ import time
 from collections.abc import Mapping
 
 from drivers.common.polled_stage import PolledStage, StageState
-from drivers.common.stage_axes import trapezoid_duration_s
 from drivers.device import DeviceIdentity, DriverOptions, FoundDevice, Setting, SharedPart, port_claim
 from drivers.errors import DeviceError, DeviceTimeoutError, StoppedError
 from drivers.grbl.link import GrblLink
@@ -197,17 +196,6 @@ class GrblStage(PolledStage):
             speed_per_s=wanted,
             resolution=max(1 / self._controller.steps_per_unit(index), REPORTED_STEP),
         )
-
-    def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
-        """Estimated seconds for a move, with acceleration; axes move together, so the slowest counts."""
-        durations = (
-            trapezoid_duration_s(
-                target[axis.name] - start[axis.name], axis.speed_per_s, self._acceleration_per_s2(axis.name)
-            )
-            for axis in self._axes
-            if axis.name in start and axis.name in target
-        )
-        return max(durations, default=0.0)
 
     def _acceleration_per_s2(self, name: str) -> float:
         return abs(self._maps[name].scale) * self._controller.acceleration_per_s2(self._index(name))

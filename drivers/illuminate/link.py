@@ -145,7 +145,7 @@ _SHOWN_BYTES = 60
 _DARK_AT_ONCE = b"x\n"
 
 
-class Link:
+class Link(SerialTransport):
     """A serial port with an Illuminate array at its other end.
 
     Parameters
@@ -158,8 +158,7 @@ class Link:
     """
 
     def __init__(self, port: str, device: str, timeout_s: float = 1.0) -> None:
-        self.device = device
-        self._transport = SerialTransport(
+        super().__init__(
             port,
             device,
             baud_rate=BAUD_RATE,
@@ -168,11 +167,6 @@ class Link:
         )
         self._version: Version | None = None
         self._dialect: Dialect | None = None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open and was not lost."""
-        return self._transport.is_open
 
     @property
     def version(self) -> Version:
@@ -194,9 +188,9 @@ class Link:
         DeviceError
             When nobody answers, or the firmware is one this driver does not know.
         """
-        self._transport.open()
+        self.open()
         try:
-            lines = self._transport.request(b"version\n", version_matcher())
+            lines = self.request(b"version\n", version_matcher())
             version = parse_version(lines)
             if version is None:  # the matcher lets no other reply through
                 raise DeviceError(self.device, f"answered {lines!r} when asked for its version.")
@@ -210,12 +204,8 @@ class Link:
             self._version, self._dialect = version, dialect
             self.command(b"x")
         except BaseException:
-            self._transport.close()
+            self.close()
             raise
-
-    def close(self) -> None:
-        """Close the port."""
-        self._transport.close()
 
     def command(self, words: bytes, timeout_s: float | None = None) -> list[bytes]:
         """Send a command (without newline) and return the lines of its reply.
@@ -225,7 +215,7 @@ class Link:
         DeviceError
             When the array refuses it, with the firmware's own words.
         """
-        lines = self._transport.request(words + b"\n", reply_matcher, timeout_s)
+        lines = self.request(words + b"\n", reply_matcher, timeout_s)
         refused = refusal(lines)
         if refused is not None:
             code, text = refused
@@ -260,4 +250,4 @@ class Link:
 
     def darken_at_once(self) -> None:
         """Send what turns the light off, ahead of everything; whoever awaits a reply gets a StoppedError."""
-        self._transport.overtake(_DARK_AT_ONCE, answered=True)
+        self.overtake(_DARK_AT_ONCE, answered=True)

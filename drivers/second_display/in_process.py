@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 import numpy as np
@@ -19,44 +19,22 @@ _T = TypeVar("_T")
 _ANSWER_S = 10.0
 
 
-class _Errand:
-    """A call to be made in the GUI thread, and what came of it."""
-
-    def __init__(self, call: Callable[[], object]) -> None:
-        self._call = call
-        self._given_up = False
-        self._lock = threading.Lock()
-        self.done = threading.Event()
-        self.result: object = None
-        self.error: BaseException | None = None
-
-    def run(self) -> None:
-        with self._lock:
-            if self._given_up:
-                return
-            try:
-                self.result = self._call()
-            except BaseException as error:  # noqa: BLE001 - raised again in the thread that asked
-                self.error = error
-        self.done.set()
-
-    def give_up(self) -> None:
-        """See to it that a call that was not made yet never is; waits for one that is being made."""
-        with self._lock:
-            self._given_up = True
-
-
 class _Messenger(QObject):
-    """Brings errands to the GUI thread."""
+    """Brings calls to the GUI thread, and what came of them back."""
 
-    sent = Signal(object)
+    sent = Signal(object, object)
 
     def __init__(self) -> None:
         super().__init__()
         self.sent.connect(self._run, Qt.ConnectionType.QueuedConnection)
 
-    def _run(self, errand: _Errand) -> None:
-        errand.run()
+    def _run(self, call: Callable[[], object], outcome: Future[object]) -> None:
+        if not outcome.set_running_or_notify_cancel():
+            return
+        try:
+            outcome.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - raised again in the thread that asked
+            outcome.set_exception(error)
 
 
 class WindowHere:
@@ -100,17 +78,13 @@ class WindowHere:
     def _there(self, call: Callable[[], _T], *, gives_up: bool = True) -> _T:
         if QThread.currentThread() is self._thread:
             return call()
-        errand = _Errand(call)
-        self._messenger.sent.emit(errand)
-        if not errand.done.wait(_ANSWER_S):
-            if gives_up:
-                errand.give_up()
-            if not errand.done.is_set():
-                raise DeviceTimeoutError(
-                    self._device,
-                    f"the program's GUI thread did not draw within {_ANSWER_S:g} s.",
-                    "Is its event loop running, and not blocked by a long computation?",
-                )
-        if errand.error is not None:
-            raise errand.error
-        return errand.result  # type: ignore[return-value]
+        outcome: Future[_T] = Future()
+        self._messenger.sent.emit(call, outcome)
+        if not wait([outcome], _ANSWER_S).done and (not gives_up or outcome.cancel()):
+            # A call that was not made yet never is; one that is being made is waited for below.
+            raise DeviceTimeoutError(
+                self._device,
+                f"the program's GUI thread did not draw within {_ANSWER_S:g} s.",
+                "Is its event loop running, and not blocked by a long computation?",
+            )
+        return outcome.result()

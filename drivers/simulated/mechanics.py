@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.common.stage_axes import trapezoid_duration_s
 from drivers.simulated.surroundings import Clock
+from drivers.stage import trapezoid_duration_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.common.polled_stage import PolledStage, StageState
-from drivers.common.stage_axes import AXIS_NAMES, trapezoid_duration_s
+from drivers.common.stage_axes import AXIS_NAMES
 from drivers.device import DeviceIdentity, DriverOptions, SharedPart
 from drivers.simulated.mechanics import AxisSpec, Carriage
 from drivers.simulated.options import NotNegative, Positive
@@ -146,20 +146,8 @@ class CarriageStage(SimulatedDevice, PolledStage):
             self._referenced_after_s = None
             self.carriage.halt()
 
-    # Stage ---
-    def move_duration_s(self, start: Mapping[str, float], target: Mapping[str, float]) -> float:
-        """Seconds for a move, with acceleration; axes move together, so the slowest counts."""
-        specs = self.carriage.axes
-        return max(
-            (
-                trapezoid_duration_s(
-                    target[name] - start[name], specs[name].speed_per_s, specs[name].acceleration_per_s2
-                )
-                for name in target
-                if name in start and name in specs
-            ),
-            default=0.0,
-        )
+    def _acceleration_per_s2(self, name: str) -> float:
+        return self.carriage.axes[name].acceleration_per_s2
 
 
 class SimulatedStage(CarriageStage):

@@ -35,7 +35,7 @@ _ATTEMPTS = 3
 _REPLY_S = 0.5
 
 
-class Chain:
+class Chain(SerialTransport):
     """The devices behind one serial port.
 
     Every command carries a message number, so that no reply is taken for another's, and a checksum. A command
@@ -49,28 +49,16 @@ class Chain:
     """
 
     def __init__(self, port: str, device: str, baud_rate: int) -> None:
-        self.device = device
-        self._transport = SerialTransport(
-            port, device, baud_rate=baud_rate, timeout_s=_REPLY_S, on_message=self._unasked
-        )
+        super().__init__(port, device, baud_rate=baud_rate, timeout_s=_REPLY_S, on_message=self._unasked)
         self._numbers = itertools.cycle(range(_NUMBERS))
         self._counting = threading.Lock()
         self._checksummed: set[int] = set()
         """Devices that were told to send checksums: what comes without is torn."""
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open and has not failed."""
-        return self._transport.is_open
-
     def open(self) -> None:
         """Open the port."""
         self._checksummed.clear()
-        self._transport.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self._transport.close()
+        super().open()
 
     def ask(self, text: str, device: int, axis: int = 0) -> Message:
         """Send a command to one device or axis and return its reply.
@@ -86,12 +74,12 @@ class Chain:
             with self._counting:
                 number = next(self._numbers)
             try:
-                reply = self._exchange(text, device, axis, number)
+                reply = self._ask_once(text, device, axis, number)
             except DeviceTimeoutError as error:
                 if attempt == _ATTEMPTS - 1:
                     raise DeviceTimeoutError(
                         self.device,
-                        f"device {device} did not answer {text!r} on {self._transport.port}.",
+                        f"device {device} did not answer {text!r} on {self.port}.",
                         "Check its power, the cable, its number and the baud rate (Zaber's software shows "
                         "both).",
                     ) from error
@@ -132,16 +120,16 @@ class Chain:
 
     def stop(self) -> None:
         """Stop every axis of every device at once, whatever reply is awaited; callable from any thread."""
-        self._transport.send_now(command("stop"))
+        self.send_now(command("stop"))
 
-    def _exchange(self, text: str, device: int, axis: int, number: int) -> Message:
+    def _ask_once(self, text: str, device: int, axis: int, number: int) -> Message:
         def judge(line: bytes) -> Belongs:
             message = self._parsed(line)
             if message is None or (message.kind, message.device, message.number) != ("@", device, number):
                 return Belongs.OTHER
             return Belongs.END
 
-        lines = self._transport.request(command(text, device, axis, number), judge)
+        lines = self.request(command(text, device, axis, number), judge)
         message = self._parsed(lines[-1])
         if message is None:
             raise AssertionError("a reply that was matched can be parsed")

@@ -282,19 +282,13 @@ class SpotMaker:
         return SpotPattern(slm, tuple(spots), self.ideal(len(spots)))
 
     # Steps -------------------------------------------------------------------------------------
-    def _window(self, spot: Spot) -> npt.NDArray[np.complex64]:
-        """Spectrum of conjugate mask times plane wave at the frequencies that the SLM can make."""
-        height, width = self._spectrum.shape
-        rows = (self._rows - spot.row) % height
-        columns = (self._columns - spot.column) % width
-        window: npt.NDArray[np.complex64] = self._spectrum[np.ix_(rows, columns)]
-        return window
-
     def _at_slm(self, spot: Spot, shift: npt.NDArray[np.float64]) -> npt.NDArray[np.complex64]:
         """Field in the SLM's image plane, two samples per SLM pixel, in the frame of a shifted mask."""
         pose = spot.pose
         height, width = self.display.mask.shape
-        spectrum = self._window(spot) * self._centre
+        # Of the conjugate mask times a plane wave, at the frequencies that the SLM can make.
+        window = np.ix_((self._rows - spot.row) % height, (self._columns - spot.column) % width)
+        spectrum = self._spectrum[window] * self._centre
         spectrum *= np.exp(-2j * np.pi * self._rows * (shift[0] / height)).astype(np.complex64)[:, None]
         spectrum *= np.exp(-2j * np.pi * self._columns * (shift[1] / width)).astype(np.complex64)
         if pose.z_um:

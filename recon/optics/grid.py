@@ -42,30 +42,26 @@ class PixelGrid:
     @property
     def x_um(self) -> FloatArray:
         """Centres of the columns, ``(width,)``."""
-        return np.asarray(
-            self.center_um[0] + (np.arange(self.shape[1]) - (self.shape[1] - 1) / 2) * self.pitch_um
-        )
+        return self._places(0, self.shape[1])
 
     @property
     def y_um(self) -> FloatArray:
         """Centres of the rows, ``(height,)``."""
-        return np.asarray(
-            self.center_um[1] + (np.arange(self.shape[0]) - (self.shape[0] - 1) / 2) * self.pitch_um
-        )
+        return self._places(1, self.shape[0])
 
     @property
     def x_edges_um(self) -> FloatArray:
         """Edges of the columns, ``(width + 1,)``."""
-        return np.asarray(
-            self.center_um[0] + (np.arange(self.shape[1] + 1) - self.shape[1] / 2) * self.pitch_um
-        )
+        return self._places(0, self.shape[1] + 1)
 
     @property
     def y_edges_um(self) -> FloatArray:
         """Edges of the rows, ``(height + 1,)``."""
-        return np.asarray(
-            self.center_um[1] + (np.arange(self.shape[0] + 1) - self.shape[0] / 2) * self.pitch_um
-        )
+        return self._places(1, self.shape[0] + 1)
+
+    def _places(self, axis: int, count: int) -> FloatArray:
+        """Return places a pixel apart with the centre in their middle; axis 0 is x."""
+        return np.asarray(self.center_um[axis] + (np.arange(count) - (count - 1) / 2) * self.pitch_um)
 
     def refined(self, factor: int) -> PixelGrid:
         """Return the grid with every pixel cut into ``factor`` x ``factor``."""

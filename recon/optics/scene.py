@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.optics.fall_off import FallOff
-from recon.optics.grid import FloatArray, overlap_matrix
+from recon.optics.grid import FloatArray, resample_energy
 
 Image = npt.NDArray[np.float32]
 Weights = tuple[float, float, float]
@@ -74,9 +74,7 @@ class Layer:
         """
         mixed = self.radiance @ np.asarray(weights, np.float32)
         mixed *= np.float32(self.size_um[0] * self.size_um[1] * 1e-6 / mixed.size)
-        rows = overlap_matrix(self.y_edges_um, y_edges)
-        columns = overlap_matrix(self.x_edges_um, x_edges)
-        return np.ascontiguousarray((columns @ (rows @ mixed).T).T, np.float32)
+        return resample_energy(mixed, self.y_edges_um, self.x_edges_um, y_edges, x_edges)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

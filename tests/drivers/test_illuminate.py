@@ -384,7 +384,7 @@ def test_ctrl_c_in_a_sequence_leaves_nothing_lit(
 
     def interrupted(words: bytes, timeout_s: float | None = None) -> list[bytes]:
         if words.startswith(b"rseq"):
-            leds.link._transport.send_now(words + b"\n")
+            leds.link.send_now(words + b"\n")
             wait_until(lambda: array.lit.any())
             raise KeyboardInterrupt
         return command(words, timeout_s)
