@@ -158,10 +158,7 @@ def read_picture() -> npt.NDArray[np.float32]:
 def new_folder(parent: Path) -> Path:
     """Make a folder ``demo-DATE-TIME`` in ``parent``, which is made as well where missing.
 
-    Raises
-    ------
-    FileError
-        When it cannot be made.
+    Raises FileError when it cannot be made.
     """
     name = f"demo-{datetime.now(UTC):%Y-%m-%d-%H%M%S}"
     for suffix in ("", *(f"-{n}" for n in range(2, 100))):
@@ -245,28 +242,18 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What the demo made and how good it is.
-
-    Attributes
-    ----------
-    folder : Path
-    measured : Measured
-    reconstruction : Reconstruction
-    comparison : Comparison
-        Of the reconstruction with the ground truth, inside the picture on the screen.
-    seconds : dict
-        Seconds of each stage.
-    files : dict
-        What it is, and where.
-    """
+    """What the demo made and how good it is."""
 
     folder: Path
     settings: DemoSettings
     measured: Measured
     reconstruction: Reconstruction
     comparison: Comparison
+    """Of the reconstruction with the ground truth, inside the picture on the screen."""
     seconds: dict[str, float]
+    """Seconds of each stage."""
     files: dict[str, Path]
+    """What it is, and where."""
 
 
 def run_demo(
@@ -277,12 +264,8 @@ def run_demo(
     Its ``demo.json`` always says how far it came: ``state`` is ``running``, ``completed``, ``failed`` or
     ``aborted``. On every way out the light is off and the stage stands.
 
-    Raises
-    ------
-    BenchError, DeviceError, OSError
-        What made it fail.
-    KeyboardInterrupt, SystemExit
-        After the bench was made safe and the run marked as aborted.
+    Raises what made it fail (BenchError, DeviceError, OSError); KeyboardInterrupt or SystemExit after the
+    bench was made safe and the run marked as aborted.
     """
     settings = settings or DemoSettings()
     place = new_folder(Path(folder))

@@ -10,7 +10,7 @@ upside down, and pixel offset ``p`` from the centre looks at ``x = -p pitch z / 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -78,3 +78,14 @@ class Calibration:
                 f"background must have the shape of one PSF {self.psfs.shape[1:]}, "
                 f"not {self.background.shape}."
             )
+
+    def part(self, members: Any) -> Calibration:
+        """Return the calibration with some of its PSFs: a slice, a mask, or their numbers."""
+        positions_um = self.source_positions_um[members]
+        return replace(self, psfs=self.psfs[members], source_positions_um=positions_um)
+
+    def nearest_to_axis(self, members: npt.ArrayLike | None = None) -> int:
+        """Return which PSF, of some or all, is nearest to the axis; unknown places count as on it."""
+        numbers = np.arange(len(self.psfs)) if members is None else np.asarray(members)
+        x, y = self.source_positions_um[numbers, :2].T
+        return int(numbers[np.argmin(np.nan_to_num(np.hypot(x, y)))])

@@ -125,12 +125,7 @@ def bring_mask(bench: Bench, place: Mapping[str, float]) -> None:
 
     An empty place moves nothing.
 
-    Raises
-    ------
-    BenchError
-        When there is a place and no stage.
-    DeviceError
-        When the stage refuses or fails.
+    Raises BenchError when there is a place and no stage; DeviceError when the stage refuses or fails.
     """
     if not place:
         return
@@ -150,10 +145,7 @@ def find_camera(io: DisplayBench, display: Display) -> tuple[CameraMap, float]:
     float
         Counts a millisecond of the mean intensity.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
+    Raises InputError when the speckle is not recognised.
     """
     camera = io.bench.camera
     pitch_um = camera.pixel_pitch_um * camera.binning
@@ -204,28 +196,20 @@ def writable(bench: Bench, folder: Path | None, out: Path | None, label: str) ->
 
 @dataclass(frozen=True, slots=True)
 class SpotLook:
-    """One picture of spots: each a hypothesis, and how bright it turned out.
-
-    Attributes
-    ----------
-    frame : ndarray, float64, (height, width)
-        Camera counts a millisecond, background subtracted.
-    rows, columns : ndarray, float64, (n,)
-        Where the spots are looked for, camera pixels.
-    spots : tuple of Spot
-        Places in the field of view, and the poses they were computed for.
-    brightness : ndarray, float64, (n,)
-        In units of an ideal spot; for sections' spots all of their light, in arbitrary units.
-    of_whole_slm : bool
-        Whether each spot is made by the whole SLM, not by a section of it.
-    """
+    """One picture of spots: each a hypothesis, and how bright it turned out."""
 
     frame: Array
+    """Float64, (height, width): camera counts a millisecond, background subtracted."""
     rows: Array
     columns: Array
+    """Float64, (n,): where the spots are looked for, camera pixels."""
     spots: tuple[Spot, ...]
+    """Places in the field of view, and the poses they were computed for."""
     brightness: Array
+    """Float64, (n,): in units of an ideal spot; for sections' spots all of their light, in arbitrary
+    units."""
     of_whole_slm: bool
+    """Whether each spot is made by the whole SLM, not by a section of it."""
 
 
 class SpotCamera:
@@ -269,10 +253,7 @@ class SpotCamera:
 
         The first time a frame of random phases tells how bright the mean intensity is.
 
-        Raises
-        ------
-        InputError
-            When the speckle is not recognised.
+        Raises InputError when the speckle is not recognised.
         """
         self._before_frame()
         self.camera, blank_per_ms = find_camera(self.io, self.display)

@@ -31,62 +31,41 @@ _ITERATIONS = 15  # between two photographs
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A photographed hologram.
-
-    Attributes
-    ----------
-    seen : ndarray, float64, (height, width)
-        Low-passed picture over the field of view, the axis in the middle, in units of the target's white.
-    wanted : ndarray, float64
-        The target on the same grid, low-passed.
-    scores : Scores
-    saturated_fraction : float
-        Of the photograph's pixels.
-    """
+    """A photographed hologram."""
 
     seen: npt.NDArray[np.float64]
+    """(height, width): low-passed picture over the field of view, the axis in the middle, in units
+    of the target's white."""
     wanted: npt.NDArray[np.float64]
+    """The target on the same grid, low-passed."""
     scores: Scores
     saturated_fraction: float
+    """Of the photograph's pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """The best hologram found.
-
-    Attributes
-    ----------
-    slm : ndarray, complex64, (1, height, width)
-    first, best : Capture
-        Of the hologram given and of the best one; the same where nothing was gained.
-    psnr_db : tuple of float
-        Captured, round by round; the first is the hologram given.
-    """
+    """The best hologram found."""
 
     slm: npt.NDArray[np.complex64]
+    """(1, height, width)."""
     first: Capture
     best: Capture
+    """Of the hologram given and of the best one; the same where nothing was gained."""
     psnr_db: tuple[float, ...]
+    """Captured, round by round; the first is the hologram given."""
 
 
 @dataclass(frozen=True, slots=True)
 class HologramCamera:
-    """The bench's camera on a display whose picture is known where it lies on the sensor.
-
-    Attributes
-    ----------
-    io : DisplayBench
-    display : Display
-        With the mask's displacement where it is known.
-    camera : CameraMap
-    mean_per_ms : float
-        Counts a millisecond of the mean intensity, from the registration.
-    """
+    """The bench's camera on a display whose picture is known where it lies on the sensor."""
 
     io: DisplayBench
     display: Display
+    """With the mask's displacement where it is known."""
     camera: CameraMap
     mean_per_ms: float
+    """Counts a millisecond of the mean intensity, from the registration."""
 
     @classmethod
     def registered(cls, io: DisplayBench, display: Display) -> HologramCamera:
@@ -176,24 +155,15 @@ def wanted_picture(target: Target, display: Display) -> tuple[npt.NDArray[np.flo
 
 @dataclass(frozen=True, slots=True)
 class Photographed:
-    """What the camera saw of a hologram.
-
-    Attributes
-    ----------
-    capture : Capture
-        Of the pattern given, or of the best one where it was refined.
-    refined : Refinement or None
-    camera_residual_px : float
-        Of the camera's registration.
-    background_estimated : bool
-        Rather than measured with the laser off.
-    simulated : bool
-    """
+    """What the camera saw of a hologram."""
 
     capture: Capture
+    """Of the pattern given, or of the best one where it was refined."""
     refined: Refinement | None
     camera_residual_px: float
+    """Of the camera's registration."""
     background_estimated: bool
+    """Rather than measured with the laser off."""
     simulated: bool
 
 
@@ -237,12 +207,7 @@ def photograph_hologram(
     progress : callable, optional
         ``progress(round, psnr_db)``.
 
-    Raises
-    ------
-    InputError
-        When the speckle is not recognised.
-    DeviceError
-        When a device fails.
+    Raises InputError when the speckle is not recognised; DeviceError when a device fails.
     """
     options = options or CaptureOptions()
     seen = HologramCamera.registered(io, display)

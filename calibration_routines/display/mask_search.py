@@ -156,20 +156,13 @@ class AlignmentSession:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A pose as measured.
-
-    Attributes
-    ----------
-    pose : Pose
-    error : ndarray, float64, (8,)
-        Standard uncertainty of each parameter.
-    efficiency : float
-        Brightness of spots at the pose that was probed last, over the model's ideal.
-    """
+    """A pose as measured."""
 
     pose: Pose
     error: npt.NDArray[np.float64]
+    """(8,): standard uncertainty of each parameter."""
     efficiency: float
+    """Brightness of spots at the pose that was probed last, over the model's ideal."""
 
 
 def refine_pose(
@@ -177,10 +170,7 @@ def refine_pose(
 ) -> Measured:
     """Step to the best pose: ``quick`` steps of one picture each, then one by all pictures together.
 
-    Raises
-    ------
-    AlignmentFailedError
-        When spots stay below ``floor`` of the ideal.
+    Raises AlignmentFailedError when spots stay below ``floor`` of the ideal.
     """
     tilt = session.settings.tilt_mrad
     prior = np.array([np.inf] * 6 + [tilt, tilt])
@@ -204,10 +194,7 @@ def measure_sections(session: AlignmentSession, pose: Pose) -> tuple[SmoothField
 
     One picture with widely spaced hypotheses, one closer, then several about what was found.
 
-    Raises
-    ------
-    InputError
-        When spots of too few sections are seen.
+    Raises InputError when spots of too few sections are seen.
     """
     settings, k = session.settings, session.display.factor
     sections = Sections(session.display.slm_shape, settings.division.shape)

@@ -157,10 +157,7 @@ class MaskStage:
         Pose
             By how much that differs from before: repeatability of stage and measurement together.
 
-        Raises
-        ------
-        AlignmentFailedError
-            When an axis did not do what it was asked for.
+        Raises AlignmentFailedError when an axis did not do what it was asked for.
         """
         session, here = self.session, self.position
         steps = self._test_move(at.pose)

@@ -87,26 +87,17 @@ class DpcSetup(Checked):
 
 @dataclass(frozen=True)
 class DiffuserSurface:
-    """What was measured.
-
-    Attributes
-    ----------
-    height_um : ndarray, float32, (height, width)
-        Relative to the plane that fits best.
-    phase_rad : ndarray, float32, (height, width)
-    pitch_um : float
-        In the sample.
-    slope_deg, deflection_deg : ndarray, float64, (height, width)
-        Magnitudes of the surface's slope, and of a normal ray's deflection.
-    bench : str
-    simulated : bool
-    """
+    """What was measured."""
 
     height_um: Image
+    """(height, width): relative to the plane that fits best."""
     phase_rad: Image
+    """(height, width)."""
     pitch_um: float
+    """In the sample."""
     slope_deg: npt.NDArray[np.float64]
     deflection_deg: npt.NDArray[np.float64]
+    """(height, width): magnitudes of the surface's slope, and of a normal ray's deflection."""
     bench: str = ""
     simulated: bool = False
 
@@ -134,10 +125,7 @@ def half_width_deg(deflection_deg: npt.NDArray[np.float64]) -> float:
 def dpc_plan(array: LedArray, setup: DpcSetup, exposure_ms: float) -> Plan:
     """Return the plan: dark frames, then the four halves.
 
-    Raises
-    ------
-    BenchError
-        When the array does not reach beyond the objective's aperture.
+    Raises BenchError when the array does not reach beyond the objective's aperture.
     """
     na, rgb = _illumination_na(array, setup), _rgb(setup)
     lights = [Light.of(HalfCircle(side, na).on(array, rgb)) for side in SIDES]
@@ -181,10 +169,7 @@ _RESULT = RecordFormat("diffuserbench dpc", "diffuser's surface")
 def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: Listener) -> Outcome:
     """Compute the surface from a complete run, and save it with its picture in its folder.
 
-    Raises
-    ------
-    CalibrationError
-        When a half saturates.
+    Raises CalibrationError when a half saturates.
     """
     listener.step("analysing")
     record = DPC.read(run.path)
@@ -220,10 +205,7 @@ def _finish(run: Run, _bench: Bench | None, _control: RunControl, listener: List
 def dpc_optics(bench: Bench, setup: DpcSetup) -> DpcOptics:
     """Return the optics that the phase is computed with.
 
-    Raises
-    ------
-    BenchError
-        As :func:`dpc_plan`.
+    Raises BenchError as :func:`dpc_plan`.
     """
     array = _array(bench)
     sines = array.led_na
@@ -324,11 +306,9 @@ def surface_line(surface: DiffuserSurface) -> str:
 
 def surface_figure(surface: DiffuserSurface) -> Figure:
     """Draw a diffuser's height, a cut, and histograms of slope and deflection (Kuo 2020, Fig. A.1)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), height_ratios=(1.6, 1))
     height, width = (n * surface.pitch_um for n in surface.height_um.shape)
     axes = figure.add_subplot(grid[0, 0])

@@ -171,10 +171,7 @@ def auto_expose(
     AutoExposure
         ``usable`` says whether a PSF can be taken; ``message`` says why not, and what to do.
 
-    Raises
-    ------
-    ValueError
-        When the fractions make no sense or ``hot`` does not fit the frames.
+    Raises ValueError when the fractions make no sense or ``hot`` does not fit the frames.
     """
     if not 0.0 < target <= ceiling < 1.0:
         raise ValueError(f"0 < target <= ceiling < 1 must hold, not target={target}, ceiling={ceiling}.")
@@ -223,10 +220,7 @@ def measure_exposure(
 ) -> ExposureTrial:
     """Judge one frame: its percentile, its brightest pixel and its saturated pixels, hot ones excepted.
 
-    Raises
-    ------
-    ValueError
-        When ``hot`` does not have the frame's shape.
+    Raises ValueError when ``hot`` does not have the frame's shape.
     """
     counts = frame.image
     if hot is not None:
@@ -278,12 +272,8 @@ def expose_light(
     looks : int
         Dark frames at most: another one where the exposure became much longer than that of the last.
 
-    Raises
-    ------
-    TooDarkError
-        When the longest exposure does not reach ``dimmest``.
-    CalibrationError
-        When the light saturates at the shortest exposure, or flickers; the text says what to do.
+    Raises TooDarkError when the longest exposure does not reach ``dimmest``; CalibrationError when the light
+    saturates at the shortest exposure, or flickers; the text says what to do.
     """
     camera = bench.camera
     for _ in range(looks):

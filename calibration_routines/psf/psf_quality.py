@@ -44,10 +44,7 @@ def remove_low_frequencies(
     background : ndarray, float32, shape of ``image``
         What the removed coefficients stand for; may be negative where the PSF's own low frequencies were cut.
 
-    Raises
-    ------
-    ValueError
-        When ``order`` is negative or larger than the image.
+    Raises ValueError when ``order`` is negative or larger than the image.
     """
     height, width = image.shape[-2:]
     if not 0 <= order <= min(height, width):

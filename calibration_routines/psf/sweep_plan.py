@@ -30,10 +30,7 @@ LEAST_SIDE_PX = 16
 def check_image_settings(sweep: PointSweep, frame_shape: Sequence[int]) -> None:
     """Refuse a binning or a number of DCT coefficients that leaves nothing of frames of this shape.
 
-    Raises
-    ------
-    SettingsError
-        Naming the largest values that fit.
+    Raises SettingsError, which names the largest values that fit.
     """
     height, width = frame_shape[:2]
     binning = max(sweep.binning, 1)  # automatic: known only once there are frames
@@ -96,12 +93,8 @@ def check_sweep(bench: Bench, sweep: PointSweep, folder: Path | None = None) -> 
     ones. The stage need not be homed yet: limits hold all the same, and the sweep itself is checked
     again.
 
-    Raises
-    ------
-    PlanError
-        Naming every step that cannot be done.
-    SettingsError
-        When binning or DCT order do not fit the camera's frames.
+    Raises PlanError, which names every step that cannot be done, or SettingsError when binning or DCT order
+    do not fit the camera's frames.
     """
     check_image_settings(sweep, bench.camera.frame_shape)
     present_ms, (shortest_ms, longest_ms) = bench.camera.exposure_ms, bench.camera.exposure_limits_ms
@@ -196,12 +189,8 @@ def expose_sweep(bench: Bench, sweep: PointSweep, *, control: RunControl | None 
     line in logarithms. Where a depth has points off the axis, one of them about two thirds out is asked as
     well: the logarithm of a Gaussian response goes with the square of the tangent. Ends with the light off.
 
-    Raises
-    ------
-    CalibrationError
-        When a PSF saturates at the shortest exposure, stays too dark at the longest, or flickers.
-    EndedEarlyError
-        When it was ended through ``control``.
+    Raises CalibrationError when a PSF saturates at the shortest exposure, stays too dark at the longest, or
+    flickers; EndedEarlyError when it was ended through ``control``.
     """
     depths = sweep.depths_um
     asked = sorted({depths[0], depths[len(depths) // 2], depths[-1]})

@@ -54,7 +54,6 @@ def fill_indices(
     image : ndarray, (height, width), uint8 or uint16
     table : ndarray, uint8
         From :func:`index_table`.
-    step : int
     out : ndarray, (height // step, width // step), uint8
     """
     height, width = out.shape
@@ -127,7 +126,6 @@ def sensor_roi(metadata: FrameMetadata, left: float, top: float, width: float, h
 
     Parameters
     ----------
-    metadata : FrameMetadata
     left, top, width, height : float
         In pixels of the frame; cut at its borders.
     """

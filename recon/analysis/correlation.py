@@ -39,15 +39,10 @@ def similarity(first: Array, second: Array) -> float:
 
 @dataclass(frozen=True)
 class Correlation:
-    """Inner products of two images at every shift in whole pixels.
-
-    Attributes
-    ----------
-    values : ndarray, float64, (2 height - 1, 2 width - 1)
-        Divided by both norms: 1 is identity. The middle is no shift.
-    """
+    """Inner products of two images at every shift in whole pixels."""
 
     values: Floats
+    """(2 height - 1, 2 width - 1): divided by both norms: 1 is identity. The middle is no shift."""
 
     @property
     def peak(self) -> tuple[int, int]:
@@ -66,22 +61,14 @@ class Correlation:
         row, column = (p + n // 2 for p, n in zip(self.peak, self.values.shape, strict=True))
         return self.values[:, column] if axis == 0 else self.values[row]
 
-    def half_width(self, axis: int, level: float, *, relative: bool = True) -> float:
-        """Return the distance from the peak at which a cut falls to ``level``, pixels.
+    def half_width(self, axis: int, level: float) -> float:
+        """Return how far from the peak a cut (:meth:`profile`) falls to ``level`` of it, pixels.
 
         Linear between pixels, mean of both sides; infinite where it never falls so low.
-
-        Parameters
-        ----------
-        axis : int
-            0: rows, 1: columns.
-        level : float
-        relative : bool
-            Whether ``level`` is relative to the peak (else an inner product).
         """
         cut = self.profile(axis)
         middle = int(np.argmax(cut))
-        bar = level * float(cut[middle]) if relative else level
+        bar = level * float(cut[middle])
         return float(np.mean([_crossing(side, bar) for side in (cut[middle:], cut[middle::-1])]))
 
     @property
@@ -112,8 +99,8 @@ def autocorrelate(psf: Array) -> Correlation:
     return correlate(psf, psf)
 
 
-def critical_scale(psf: Array, level: float, *, largest: float = 2.0) -> float:
-    """Return the enlargement at which a PSF is only ``level`` similar to itself; infinite beyond ``largest``.
+def critical_scale(psf: Array, level: float) -> float:
+    """Return the enlargement at which a PSF is only ``level`` similar to itself; infinite beyond 2.
 
     Doubled from a tenth of a pixel at the PSF's edge until it is less similar, then bisected twice; linear
     between what is left.
@@ -129,7 +116,7 @@ def critical_scale(psf: Array, level: float, *, largest: float = 2.0) -> float:
     while (at_high := seen(high)) > level:
         low, at_low = high, at_high
         high *= 2
-        if high > largest - 1:
+        if high > 1:
             return float("inf")
     for _ in range(2):
         middle = 0.5 * (low + high)
@@ -140,12 +127,9 @@ def critical_scale(psf: Array, level: float, *, largest: float = 2.0) -> float:
     return float(1.0 + low + (high - low) * (at_low - level) / (at_low - at_high))
 
 
-def cut_to_light(image: Array, margin: int = 8) -> Array:
-    """Cut an image (height, width) to the rows and columns with light: above a hundredth of the peak.
-
-    ``margin`` pixels are kept around it, as far as there are any.
-    """
-    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in lit_extent(image))
+def cut_to_light(image: Array) -> Array:
+    """Cut an image (height, width) to its light, eight pixels around it kept as far as there are any."""
+    rows, columns = (slice(max(first - 8, 0), last + 9) for first, last in lit_extent(image))
     return image[rows, columns]
 
 
@@ -167,8 +151,7 @@ def centre_of_light(psf: Array) -> tuple[float, float]:
     total = float(light.sum())
     if total <= 0:
         raise InputError("The PSF holds no light.")
-    row = float(light.sum(axis=1) @ np.arange(light.shape[0])) / total
-    column = float(light.sum(axis=0) @ np.arange(light.shape[1])) / total
+    row, column = (float(light.sum(axis=1 - a) @ np.arange(n)) / total for a, n in enumerate(light.shape))
     return row, column
 
 
@@ -185,21 +168,14 @@ def _crossing(cut: Floats, level: float) -> float:
 # Across the field -----------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FieldOfView:
-    """Half the angle of view along one axis, degrees, and what limits it.
-
-    Attributes
-    ----------
-    half_deg : float
-        ``beta + min(alpha_c, atan((l + w) / d))``.
-    geometric_deg : float
-        ``atan((l + w) / d)``: beyond it no light reaches the sensor.
-    cutoff_deg : float or None
-        ``alpha_c``: the pixels' response is down to 20 %; None where it was not measured.
-    """
+    """Half the angle of view along one axis, degrees, and what limits it."""
 
     half_deg: float
+    """``beta + min(alpha_c, atan((l + w) / d))``."""
     geometric_deg: float
+    """``atan((l + w) / d)``: beyond it no light reaches the sensor."""
     cutoff_deg: float | None
+    """``alpha_c``: the pixels' response is down to 20 %; None where it was not measured."""
 
     @property
     def limited_by(self) -> str:
@@ -240,45 +216,30 @@ def field_of_view(
 
 @dataclass(frozen=True, slots=True)
 class FieldPoint:
-    """One PSF of the field compared with the central one of its depth (Figs. 5.1d and 5.1e).
-
-    Attributes
-    ----------
-    angle_deg : float
-        Between the directions of both sources.
-    similarity : float
-        Inner product after registration between pixels, over those that both show.
-    spot : float
-        Width of the cross-correlation over that of the central PSF's autocorrelation: the size of the spot
-        that the convolution model makes of a point there.
-    """
+    """One PSF of the field compared with the central one of its depth (Figs. 5.1d and 5.1e)."""
 
     x_um: float
     y_um: float
     z_um: float
     angle_deg: float
+    """Between the directions of both sources."""
     similarity: float
+    """Inner product after registration between pixels, over those that both show."""
     spot: float
+    """Width of the cross-correlation over that of the central PSF's autocorrelation: the size of the spot
+    that the convolution model makes of a point there."""
 
 
-def across_field(calibration: Calibration, z_um: float | None = None) -> tuple[FieldPoint, ...]:
-    """Compare every PSF of one depth with the one nearest to the axis, nearest directions first.
+def across_field(calibration: Calibration) -> tuple[FieldPoint, ...]:
+    """Compare every PSF of the depth calibrated at most places with the one nearest to the axis.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    z_um : float, optional
-        The nearest depth in 1/z is taken; default the one calibrated at most places.
+    The nearest directions come first.
     """
     positions = calibration.source_positions_um
     if not np.isfinite(positions).all():
         return ()
-    groups = members_of_depths(positions)
-    if z_um is None:
-        members = max(groups, key=len)
-    else:
-        members = min(groups, key=lambda g: abs(1 / float(positions[g, 2].mean()) - 1 / z_um))
-    centre = members[int(np.argmin(np.hypot(positions[members, 0], positions[members, 1])))]
+    members = max(members_of_depths(positions), key=len)
+    centre = calibration.nearest_to_axis(members)
     reference = calibration.psfs[centre].mean(axis=0)
     width = autocorrelate(reference).spot_px
     points = []
@@ -286,16 +247,9 @@ def across_field(calibration: Calibration, z_um: float | None = None) -> tuple[F
         psf = calibration.psfs[k].mean(axis=0)
         # Off the axis the sensor's edge cuts the pattern: only pixels that both show are compared.
         likeness = 1.0 if k == centre else register(psf, reference).similarity
-        points.append(
-            FieldPoint(
-                x_um=float(positions[k, 0]),
-                y_um=float(positions[k, 1]),
-                z_um=float(positions[k, 2]),
-                angle_deg=_angle_between_deg(positions[k], positions[centre]),
-                similarity=likeness,
-                spot=correlate(reference, psf).spot_px / width,
-            )
-        )
+        angle_deg = _angle_between_deg(positions[k], positions[centre])
+        x, y, z = map(float, positions[k])
+        points.append(FieldPoint(x, y, z, angle_deg, likeness, correlate(reference, psf).spot_px / width))
     return tuple(sorted(points, key=lambda p: p.angle_deg))
 
 

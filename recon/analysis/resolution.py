@@ -30,27 +30,19 @@ CUT_PX = 40
 
 @dataclass(frozen=True)
 class DepthSimilarity:
-    """PSFs of different depths compared.
-
-    Attributes
-    ----------
-    z_um : ndarray, (n_z,)
-        Ascending.
-    middle_um : float
-        Depth of the PSF that the others are compared with.
-    to_middle : ndarray, (n_z,)
-        Inner product with the middle PSF, both on the axis (Fig. A.3b).
-    near_cut, far_cut, cross_cut : ndarray, (2 CUT_PX + 1,)
-        Cuts along the columns through the peaks of both autocorrelations and of the cross-correlation of the
-        nearest and the farthest PSF (Fig. A.3a).
-    """
+    """PSFs of different depths compared."""
 
     z_um: Floats
+    """(n_z,): ascending."""
     middle_um: float
+    """Depth of the PSF that the others are compared with."""
     to_middle: Floats
+    """(n_z,): inner product with the middle PSF, both on the axis (Fig. A.3b)."""
     near_cut: Floats
     far_cut: Floats
     cross_cut: Floats
+    """``near_cut``, ``far_cut`` and ``cross_cut``: (2 CUT_PX + 1,): cuts along the columns through the peaks
+    of both autocorrelations and of the cross-correlation of the nearest and the farthest PSF (Fig. A.3a)."""
 
 
 def across_depth(depths_um: Floats, planes: Array) -> DepthSimilarity:
@@ -80,16 +72,11 @@ degrees, nearest objects at 1.7 mm) needs a PSF every 0.4 mm, as the dissertatio
 MOST_PLANES = 512
 
 
-def lateral_spacing_um(
-    response: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]],
-    z_um: float,
-    *,
-    level: float = SPECTRUM_LEVEL,
-) -> float:
+def lateral_spacing_um(response: Callable[[Floats], Floats], z_um: float) -> float:
     """Spacing of calibration points that samples the angular fall-off at Nyquist's rate (Eqs. 5.8, 5.9).
 
     The registered fall-off is ``f(atan(x / z))``; its spectrum is computed numerically and cut where it is
-    below ``level`` of its value at zero from there on.
+    below :data:`SPECTRUM_LEVEL` of its value at zero from there on.
 
     Parameters
     ----------
@@ -109,21 +96,14 @@ def lateral_spacing_um(
     spectrum = np.abs(np.fft.rfft(values))
     if spectrum[0] <= 0:
         return float("inf")
-    above = np.flatnonzero(spectrum > level * spectrum[0])
+    above = np.flatnonzero(spectrum > SPECTRUM_LEVEL * spectrum[0])
     highest = (int(above[-1]) + 1) / (n * step)
     return float(z_um / (2 * highest))
 
 
-def gaussian_response(
-    sigma_deg: float,
-) -> Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]:
+def gaussian_response(sigma_deg: float) -> Callable[[Floats], Floats]:
     """Return a Gaussian angular response (Fig. 5.3a: 13 degrees)."""
-    sigma = np.deg2rad(sigma_deg)
-
-    def response(angles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.asarray(np.exp(-0.5 * (angles / sigma) ** 2))
-
-    return response
+    return lambda angles: np.asarray(np.exp(-0.5 * (angles / np.deg2rad(sigma_deg)) ** 2))
 
 
 def axial_spacing_per_um(lenslet_um: float, wavelength_um: float) -> float:
@@ -135,27 +115,18 @@ def axial_spacing_per_um(lenslet_um: float, wavelength_um: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class VoxelGrid:
-    """A grid that samples the resolution twice: fine where the camera is sharp, coarse where it is not.
-
-    Attributes
-    ----------
-    binning : int
-        Sensor pixels to bin so that two binned pixels are one resolved step, at least 1.
-    lateral_px : float
-        Voxel size on the sensor, in the calibration's pixels (equal to ``binning``).
-    z_um : tuple of float
-        Depth planes, nearest first: evenly spaced in 1/z (Eq. 4.7).
-    lateral_um : tuple of float
-        Voxel size at each plane, in the object.
-    complete : bool
-        False where more than :data:`MOST_PLANES` would be needed and the list was cut.
-    """
+    """A grid that samples the resolution twice: fine where the camera is sharp, coarse where it is not."""
 
     binning: int
+    """Sensor pixels to bin so that two binned pixels are one resolved step, at least 1."""
     lateral_px: float
+    """Voxel size on the sensor, in the calibration's pixels (equal to ``binning``)."""
     z_um: tuple[float, ...]
+    """Depth planes, nearest first: evenly spaced in 1/z (Eq. 4.7)."""
     lateral_um: tuple[float, ...]
+    """Voxel size at each plane, in the object."""
     complete: bool = True
+    """False where more than :data:`MOST_PLANES` would be needed and the list was cut."""
 
 
 def voxel_grid(
@@ -195,18 +166,12 @@ def voxel_grid(
 
 @dataclass(frozen=True, slots=True)
 class LateralResolution:
-    """The smallest lateral step that changes the PSF enough, from its autocorrelation.
-
-    Attributes
-    ----------
-    level : float
-        Autocorrelation taken for resolved: 0.7 (sec. 3.2) or 0.8 (sec. 6.4).
-    half_width_px : (float, float)
-        Shift on the sensor along rows (y) and columns (x).
-    """
+    """The smallest lateral step that changes the PSF enough, from its autocorrelation."""
 
     level: float
+    """Autocorrelation taken for resolved: 0.7 (sec. 3.2) or 0.8 (sec. 6.4)."""
     half_width_px: tuple[float, float]
+    """Shift on the sensor along rows (y) and columns (x)."""
 
     @property
     def mean_px(self) -> float:
@@ -235,19 +200,13 @@ class AxialResolution:
     Two depths are told apart when the pattern of one is so much larger that its inner product with the other
     is down to ``level``. The scale between them is ``(1 + d/z1) / (1 + d/z2)``, so they differ by a constant
     ``c = 1/z1 - 1/z2 = (scale - 1) (1 + d/z) / d`` where ``scale`` was found on a PSF taken at ``z``.
-
-    Attributes
-    ----------
-    level : float
-    scale : float
-        Enlargement at which the PSF is only ``level`` similar to itself.
-    step_per_um : float
-        The constant ``c`` of Eq. 4.7, per micrometre.
     """
 
     level: float
     scale: float
+    """Enlargement at which the PSF is only ``level`` similar to itself."""
     step_per_um: float
+    """The constant ``c`` of Eq. 4.7, per micrometre."""
 
     @property
     def hyperfocal_um(self) -> float:
@@ -272,8 +231,8 @@ def axial_resolution(
     return AxialResolution(level, scale, (scale - 1) * (1 + distance_um / z_um) / distance_um)
 
 
-def support_extent_px(psf: Array, share: float = 0.99) -> tuple[float, float]:
-    """Return height and width of the box about the centre of light that holds ``share`` of it each way."""
+def support_extent_px(psf: Array) -> tuple[float, float]:
+    """Return height and width of the box about the centre of light that holds 99 % of it each way."""
     light = np.maximum(np.asarray(psf, np.float64), 0)
     # What is below a thousandth of the brightest blocks is noise and stray light, not pattern.
     light[light < 1e-3 * np.quantile(light, 0.999)] = 0
@@ -282,6 +241,6 @@ def support_extent_px(psf: Array, share: float = 0.99) -> tuple[float, float]:
         profile = light.sum(axis=1 - axis)
         distance = np.abs(np.arange(len(profile)) - centre)
         order = np.argsort(distance)
-        reached = np.searchsorted(np.cumsum(profile[order]), share * profile.sum())
+        reached = np.searchsorted(np.cumsum(profile[order]), 0.99 * profile.sum())
         sizes.append(2 * float(distance[order[min(int(reached), len(order) - 1)]]) + 1)
     return sizes[0], sizes[1]

@@ -166,12 +166,7 @@ def one_depth(calibration: Calibration, z_um: float | None) -> Calibration:
         _, chosen = select_psf(calibration, z_um)
         z = calibration.source_positions_um[:, 2]
         groups = [g for g in groups if chosen in z[g]]
-    group = groups[0]
-    return replace(
-        calibration,
-        psfs=calibration.psfs[group],
-        source_positions_um=calibration.source_positions_um[group],
-    )
+    return calibration.part(groups[0])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -73,7 +73,7 @@ def registered_field(calibration: Calibration, group: Group) -> tuple[Array, Fie
     if len(group) == 1:
         alone = calibration.psfs[group]
         return alone[0], FieldOfPsfs(alone, [(0.0, 0.0)]), []
-    central = _nearest_to_axis(calibration, group)
+    central = calibration.nearest_to_axis(group)
     reference = calibration.psfs[central]
     found, warnings = [], []
     for k in group:
@@ -104,7 +104,7 @@ def one_psf(calibration: Calibration) -> Array:
     The nearest PSF as it is, or put together where none is near (see :func:`registered_field`).
     """
     group = np.arange(len(calibration.psfs))
-    central = _nearest_to_axis(calibration, group)
+    central = calibration.nearest_to_axis()
     if _axis_from(calibration, group, central) is None:
         return np.asarray(calibration.psfs[central])
     return registered_field(calibration, group)[0]
@@ -120,11 +120,6 @@ def shown(shape: tuple[int, ...], rows: float, columns: float) -> npt.NDArray[np
         place = np.arange(n) + by
         inside.append((place >= (by != round(by))) & (place <= n - 1 - (by != round(by))))
     return np.asarray(inside[0][:, None] & inside[1])
-
-
-def _nearest_to_axis(calibration: Calibration, group: Group) -> int:
-    positions = calibration.source_positions_um[group]
-    return int(group[np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1])))])
 
 
 def _found(calibration: Calibration, k: int, central: int) -> tuple[Registration, list[str]]:

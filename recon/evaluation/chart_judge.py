@@ -11,7 +11,7 @@ for it (docs/benchmarks/charts.md).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -59,17 +59,14 @@ class Score:
 def score(found: npt.NDArray[Any], truth: npt.NDArray[Any], *, volume: bool | None = None) -> Score:
     """Judge a reconstruction.
 
+    Raises InputError when the shapes differ.
+
     Parameters
     ----------
     found, truth : ndarray
         Pictures (height, width[, n_channels]), or volumes (n_z, height, width[, n_channels]) of one shape.
     volume : bool, optional
         Whether the first axis is depth; default: 3 axes of which the last is longer than 4, or 4 axes.
-
-    Raises
-    ------
-    InputError
-        When the shapes differ.
     """
     if found.shape != truth.shape:
         raise InputError(f"The reconstruction is {found.shape} and the truth {truth.shape}.")
@@ -129,21 +126,11 @@ class Judge:
         )
 
     @property
-    def central(self) -> Calibration:
-        """The PSF nearest to the axis alone."""
-        positions = self.calibration.source_positions_um
-        nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
-        return replace(
-            self.calibration,
-            psfs=self.calibration.psfs[nearest : nearest + 1],
-            source_positions_um=positions[nearest : nearest + 1],
-        )
-
-    @property
     def used(self) -> Calibration:
-        """What the setting reconstructs with: of a picture with one PSF that PSF alone."""
-        plain = self.setting.is_plain and not self.problem.volume
-        return self.central if plain else self.calibration
+        """What the setting reconstructs with: of a picture with one PSF the one nearest to the axis alone."""
+        if self.problem.volume or not self.setting.is_plain:
+            return self.calibration
+        return self.calibration.part([self.calibration.nearest_to_axis()])
 
     def point(self, found: Array, iterations: int, seconds: float) -> Point:
         """Score a picture or volume of the full field."""

@@ -28,7 +28,7 @@ APERTURE = 0.66
 """Side of the aperture relative to the sensor's."""
 PITCH_UM = 20.0
 DISTANCE = 0.9
-"""Defaults: pixel pitch, and the diffuser's distance from the sensor relative to the sensor's longer side."""
+"""Pixel pitch, and the diffuser's distance from the sensor relative to the sensor's longer side."""
 
 
 @njit(nogil=True, cache=True)
@@ -47,7 +47,8 @@ def stamp(image, y, x, sigma, light):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _cast(image, points, facets, pitch, distance, width, power, aberration, fall_off, spot):  # type: ignore[no-untyped-def]  # noqa: PLR0913 - compiled
+def _cast(image, points, facets, optics):  # type: ignore[no-untyped-def]
+    pitch, distance, width, power, aberration, fall_off, spot = optics
     height, columns = image.shape
     for p in range(points.shape[0]):
         x, y, z, light = points[p]
@@ -71,35 +72,24 @@ def _cast(image, points, facets, pitch, distance, width, power, aberration, fall
 
 @dataclass(frozen=True)
 class LensletCamera:
-    """Diffuser and sensor.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        ``(height, width)`` of the sensor in pixels; pixel ``(height // 2, width // 2)`` lies on the axis.
-    pitch_um, distance_um : float
-        Of the pixels, and from the diffuser to the sensor.
-    facets : ndarray, float64, (n, 5)
-        ``y, x`` in the diffuser's plane (micrometres), deflection in tangents along y and x, transmitted
-        share of the light.
-    facet_um : float
-        Diameter of a lenslet; 0 for facets that only deflect.
-    focus_um : float
-        Depth whose image is sharpest.
-    aberration : float
-        Relative increase of a lenslet's power with the squared tangent of the angle of incidence.
-    fall_off_deg : float
-        Standard deviation of the pixels' Gaussian angular response; infinite for none (Kuo 2020, Eq. 5.1).
-    """
+    """Diffuser and sensor."""
 
     shape: tuple[int, int]
+    """``(height, width)`` of the sensor in pixels; pixel ``(height // 2, width // 2)`` lies on the axis."""
     pitch_um: float
     distance_um: float
+    """``pitch_um`` and ``distance_um``: of the pixels, and from the diffuser to the sensor."""
     facets: Floats
+    """(n, 5): ``y, x`` in the diffuser's plane (micrometres), deflection in tangents along y and x,
+    transmitted share of the light."""
     facet_um: float
+    """Diameter of a lenslet; 0 for facets that only deflect."""
     focus_um: float
+    """Depth whose image is sharpest."""
     aberration: float = 0.0
+    """Relative increase of a lenslet's power with the squared tangent of the angle of incidence."""
     fall_off_deg: float = np.inf
+    """Standard deviation of the pixels' Gaussian angular response; infinite for none (Kuo 2020, Eq. 5.1)."""
     dispersion: float = 0.0
     """Relative change of power and deflection from green to blue, and its negative to red."""
     spot_px: float = SPOT_PX
@@ -115,18 +105,11 @@ class LensletCamera:
         strength = 1 + self.dispersion * (channel - 1)
         facets = self.facets * np.array([1, 1, strength, strength, 1])
         facets[:, 4] *= self.focus_um**2
-        _cast(
-            image,
-            np.ascontiguousarray(points, np.float64).reshape(-1, 4),
-            facets,
-            self.pitch_um,
-            self.distance_um,
-            self.facet_um,
-            strength * (1 / self.distance_um + 1 / self.focus_um),
-            self.aberration,
-            np.deg2rad(self.fall_off_deg),
-            self.spot_px,
-        )
+        power = strength * (1 / self.distance_um + 1 / self.focus_um)
+        lengths_um = (self.pitch_um, self.distance_um, self.facet_um)
+        optics = (*lengths_um, power, self.aberration, np.deg2rad(self.fall_off_deg), self.spot_px)
+        places = np.ascontiguousarray(points, np.float64).reshape(-1, 4)
+        _cast(image, places, facets, tuple(map(float, optics)))
         return image.astype(np.float32)
 
     def moved(
@@ -146,8 +129,6 @@ def build_camera(
     *,
     optics: Optics = "random",
     seed: int = 0,
-    pitch_um: float = PITCH_UM,
-    distance: float = DISTANCE,
     focus: float = 6.0,
     **imperfections: float,
 ) -> LensletCamera:
@@ -159,17 +140,15 @@ def build_camera(
         Pixels of the sensor.
     optics : str
         ``"random"`` or ``"regular"`` lenslets, or a ``"smooth"`` diffuser.
-    distance : float
-        From the diffuser to the sensor, relative to the sensor's longer side.
     focus : float
-        Depth of best focus, relative to that distance.
+        Depth of best focus, relative to the distance of diffuser and sensor.
     **imperfections
         ``aberration``, ``fall_off_deg``, ``dispersion``, ``spot_px`` of :class:`LensletCamera`.
     """
     shape = (size, size) if isinstance(size, int) else size
     rng = np.random.default_rng(seed)
-    distance_um = distance * max(shape) * pitch_um
-    extent = APERTURE * np.asarray(shape) * pitch_um
+    distance_um = DISTANCE * max(shape) * PITCH_UM
+    extent = APERTURE * np.asarray(shape) * PITCH_UM
     count = PATCHES if optics == "smooth" else LENSLETS
     side = round(np.sqrt(count))
     lattice = (np.arange(side) + 0.5) / side - 0.5
@@ -180,12 +159,12 @@ def build_camera(
         places = places + rng.uniform(-0.5, 0.5, places.shape) / side
         light = rng.uniform(0.6, 1.4, count)
     elif optics == "smooth":
-        tilts = _smooth_tilts(rng, side) * 0.035 / distance
+        tilts = _smooth_tilts(rng, side) * 0.035 / DISTANCE
     facets = np.column_stack([places * extent, tilts, light / count])
     lens = 0.0 if optics == "smooth" else float(extent.mean()) / side
     return LensletCamera(
         shape=shape,
-        pitch_um=pitch_um,
+        pitch_um=PITCH_UM,
         distance_um=distance_um,
         facets=facets,
         facet_um=lens,

@@ -14,7 +14,7 @@ from recon.analysis.points import DIP, Noise, PointGrid, try_points
 from recon.camera.base import LinearOperator
 from recon.camera.convolution import Convolution
 from recon.evaluation.lenslets import LensletCamera, build_camera
-from recon.evaluation.scene import SceneSpec, TestScene
+from recon.evaluation.scene import SceneSpec, TestScene, shared
 from recon.evaluation.scene_trial import PIXELS, judge_image, scene_of, spec_at
 from recon.holography import Display, Target, random_mask
 from recon.holography.pose import PlacedHologram, Pose
@@ -199,20 +199,14 @@ FLASHES = f"{POINTS} points, {FRAMES['full']} frames, flashes of {FLASH} in {SHA
 
 @dataclass(frozen=True)
 class Video:
-    """Frames of points that drift and flash.
-
-    Attributes
-    ----------
-    psf : ndarray, (height, width)
-    frames : ndarray, float32, (n_frames, height, width)
-        Photo-electrons.
-    truth : ndarray, (n_frames, height, width)
-        The points' light, blurred by one pixel.
-    """
+    """Frames of points that drift and flash."""
 
     psf: Array
+    """(height, width)."""
     frames: Array
+    """float32, (n_frames, height, width): photo-electrons."""
     truth: Array
+    """(n_frames, height, width): the points' light, blurred by one pixel."""
 
 
 @lru_cache(maxsize=2)
@@ -241,14 +235,7 @@ def _picture(pixels: int, places: Array, light: Array) -> Array:
     """Return points as a picture, each shared by its four nearest pixels, blurred by one pixel."""
     from scipy.ndimage import gaussian_filter
 
-    image = np.zeros((pixels, pixels))
-    for place, value in zip(places + pixels // 2, light, strict=True):
-        corner = np.floor(place).astype(int)
-        for offset in np.ndindex(2, 2):
-            y, x = corner + offset
-            if 0 <= y < pixels and 0 <= x < pixels:
-                image[y, x] += value * float(np.prod(1 - np.abs(place - (y, x))))
-    return np.asarray(gaussian_filter(image, 1.0))
+    return np.asarray(gaussian_filter(shared((pixels, pixels), places + pixels // 2, light), 1.0))
 
 
 @lru_cache(maxsize=2)

@@ -6,8 +6,10 @@ every second depth. All predict the same held-out pixels of one photograph, so t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,51 +26,38 @@ from recon.evaluation.trial import Setting, Subject, Turn, in_turns
 from recon.reconstruction.measurement import Measurement
 from recon.reconstruction.reconstruct import reconstruct
 from recon.reconstruction.result import Reconstruction
+from recon.types import Calibration
 
+Members = npt.NDArray[np.intp]
 _SCENES: dict[str, str] = {"tv": "as an extended scene (tv)", "l1": "as a sparse scene (l1)"}
 """What a photograph is of is for its owner to say: both fronts are drawn."""
 
 
 @dataclass(frozen=True)
 class OwnCalibration:
-    """A calibration, and the photograph that it is tried on.
-
-    Attributes
-    ----------
-    label : str
-        Different for each.
-    problem : ChartProblem
-        The same photograph for all; the calibration of this one.
-    photographs : float
-        How many were taken for each of its PSFs; of a blind one: for all of them together, over their number.
-    whole : bool
-        Whether it can only be had as a whole: a blind one.
-    """
+    """A calibration, and the photograph that it is tried on."""
 
     label: str
+    """Different for each."""
     problem: ChartProblem
+    """The same photograph for all; the calibration of this one."""
     photographs: float = 1.0
+    """How many were taken for each of its PSFs; of a blind one: for all of them together, over their
+    number."""
     whole: bool = False
+    """Whether it can only be had as a whole: a blind one."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnSetting:
-    """A part of a calibration.
-
-    Attributes
-    ----------
-    label, part : str
-    members : tuple of int
-        Its PSFs.
-    images : int
-        Photographs.
-    model : str
-    """
+    """A part of a calibration."""
 
     label: str
     part: str
     members: tuple[int, ...]
+    """Its PSFs."""
     images: int
+    """Photographs."""
     model: ModelName
 
     @property
@@ -116,12 +105,7 @@ class OwnCalibrationsProblem(Subject[OwnSetting]):
     def _curve(self, setting: OwnSetting, limit_s: float | None, aside: Aside) -> Curve:
         """Reconstruct with either prior, and score."""
         own = next(c for c in self.calibrations if c.label == setting.label)
-        members = list(setting.members)
-        calibration = replace(
-            own.problem.calibration,
-            psfs=own.problem.calibration.psfs[members],
-            source_positions_um=own.problem.calibration.source_positions_um[members],
-        )
+        calibration = own.problem.calibration.part(list(setting.members))
         problem = replace(self.calibrations[0].problem, volume=True, calibration=calibration)
         return in_turns((_turn(problem, setting, prior) for prior in _SCENES), limit_s, aside)
 
@@ -163,17 +147,22 @@ def _turn(problem: ChartProblem, setting: OwnSetting, prior: str) -> Turn:
 
 def _parts(own: OwnCalibration) -> list[OwnSetting]:
     """Return a calibration as a whole, and thinned over field and depth."""
-    positions = own.problem.calibration.source_positions_um
+    calibration = own.problem.calibration
+    positions = calibration.source_positions_um
     depths = members_of_depths(positions)
     parts: dict[tuple[int, ...], str] = {}
     middle = len(depths) // 2
     thinned = [depths, depths[::2], depths[middle : middle + 1]]
-    choosers = (lambda _positions, group: group, _every_second, _central)
-    for chosen in thinned[:1] if own.whole else thinned:
-        for chooser in choosers[:1] if own.whole else choosers:
-            members = tuple(sorted(int(m) for group in chosen for m in chooser(positions, group)))
-            psfs = f"{len(members)} PSF" + ("s" if len(members) > 1 else "")
-            parts.setdefault(members, psfs + _which(chosen, depths, positions))
+    choosers: tuple[Callable[[Members], Any], ...] = (
+        lambda group: group,
+        partial(_every_second, calibration),
+        lambda group: [calibration.nearest_to_axis(group)],
+    )
+    ways = [(chosen, chooser) for chosen in thinned for chooser in choosers]
+    for chosen, chooser in ways[:1] if own.whole else ways:
+        members = tuple(sorted(int(m) for group in chosen for m in chooser(group)))
+        psfs = f"{len(members)} PSF" + ("s" if len(members) > 1 else "")
+        parts.setdefault(members, psfs + _which(chosen, depths, positions))
     return [
         OwnSetting(
             own.label,
@@ -187,8 +176,8 @@ def _parts(own: OwnCalibration) -> list[OwnSetting]:
 
 
 def _which(
-    chosen: list[npt.NDArray[np.intp]],
-    depths: list[npt.NDArray[np.intp]],
+    chosen: list[Members],
+    depths: list[Members],
     positions: npt.NDArray[np.float64],
 ) -> str:
     """Say at which of several depths; of a single one its number too: z may be unknown, or the steps fine."""
@@ -201,14 +190,9 @@ def _which(
     return f" at depth {number} of {len(depths)}" + (f" (z {z_mm:.4g} mm)" if np.isfinite(z_mm) else "")
 
 
-def _central(positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    off_axis = np.nan_to_num(np.hypot(positions[group, 0], positions[group, 1]))
-    return group[[int(np.argmin(off_axis))]]
-
-
-def _every_second(positions: npt.NDArray[np.float64], group: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+def _every_second(calibration: Calibration, group: Members) -> Members:
     """Return every second point of a grid of 5 x 5 or more, with its corners; else all."""
-    places = positions[group][:, 1::-1]
+    places = calibration.source_positions_um[group][:, 1::-1]
     if len(group) < 25 or not np.isfinite(places).all():
         return group
     grid = grid_axes(places)

@@ -77,24 +77,16 @@ LEFT_OUT, SUBTRACTED = ", left out", ", subtracted"
 
 @dataclass(frozen=True)
 class Options:
-    """What the reconstruction is told besides the method.
-
-    Attributes
-    ----------
-    model : str, optional
-        Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
-        map shows what one model does, so it leaves no choice to ``"auto"`` unless it says so.
-    leave_out_saturated : bool
-    subtract_background : bool
-        Give the true background, as a user who photographed it would.
-    estimate_background : bool or None
-        Of a volume; None as the model says.
-    """
+    """What the reconstruction is told besides the method."""
 
     model: ModelName | None = None
+    """Default: local convolution where there are several PSFs a depth, one convolution where there is one. A
+    map shows what one model does, so it leaves no choice to ``"auto"`` unless it says so."""
     leave_out_saturated: bool = False
     subtract_background: bool = True
+    """Give the true background, as a user who photographed it would."""
     estimate_background: bool | None = False
+    """Of a volume; None as the model says."""
 
 
 @lru_cache(maxsize=4)
@@ -272,7 +264,7 @@ def spot_severity(
         return 1 / LOST_SHARE
     alone = inside & _apart(places, APART_PX, np.inf)
     if alone.sum() >= min(ENOUGH, inside.sum() / 2):
-        return _on_their_own(peaks * scale, heights, places * scale, alone)
+        return _wrong(peaks * scale, heights, places * scale, alone) if alone.any() else 0.0
     asked = inside & _apart(places, resolved_px, reach_planes)
     at, height = _peaks(truth)
     nearest = _highest_within_reach(at * scale, height, places * scale)
@@ -282,38 +274,33 @@ def spot_severity(
     field = _field(places[inside])
     nominal = np.array([resolved_px / reach_planes, 1.0, 1.0])
     clear = _distance(field * nominal, places * nominal) > resolved_px
-    return _crowded(peaks * scale, heights, places * scale, asked, field * scale, clear)
+    return _wrong(peaks * scale, heights, places * scale, asked, (field * scale, clear))
 
 
-def _on_their_own(peaks: Floats, heights: Floats, places: Floats, asked: Chosen) -> float:
-    if not asked.any():
-        return 0.0
-    nearest = _highest_within_reach(peaks, heights, places)
-    least = _least(nearest, asked)
-    high = peaks[heights >= least]
-    if least <= 0 or not len(high):
-        return 1 / LOST_SHARE
-    lost = float(np.mean(nearest[asked] < least))
-    made_up = float(np.mean(_distance(high, places) > 2 * REACH_PX))
-    return max(lost, made_up) / LOST_SHARE
-
-
-def _crowded(
-    peaks: Floats, heights: Floats, places: Floats, asked: Chosen, field: Floats, clear: Chosen
+def _wrong(
+    peaks: Floats,
+    heights: Floats,
+    places: Floats,
+    asked: Chosen,
+    crowded: tuple[Floats, Chosen] | None = None,
 ) -> float:
-    """Return the same where points are crowded, less what chance would give.
+    """Return the severity of points on their own, or of ``crowded`` ones less what chance would give.
 
-    ``field`` are all places, and ``clear`` those among them at which a point could have been asked for.
+    Those come with all places, and which among them could have been asked for a point.
     """
     nearest = _highest_within_reach(peaks, heights, places)
     least = _least(nearest, asked)
     high = peaks[heights >= least]
     if least <= 0 or not len(high):
         return 1 / LOST_SHARE
+    lost = float(np.mean(nearest[asked] < least))
+    away = _distance(high, places)
+    if crowded is None:
+        return max(lost, float(np.mean(away > 2 * REACH_PX))) / LOST_SHARE
+    field, clear = crowded
     by_chance = float(np.mean(_distance(field[clear] if clear.any() else field, high) <= REACH_PX))
     empty = float(np.mean(_distance(field, places) > REACH_PX))
-    lost = float(np.mean(nearest[asked] < least))
-    made_up = float(np.mean(_distance(high, places) > REACH_PX))
+    made_up = float(np.mean(away > REACH_PX))
     # Where peaks are everywhere it proves nothing that points have one.
     lost = lost / (1 - by_chance) if by_chance < 1 else 1.0
     return max(lost, made_up / empty if empty > 0 else 0.0) / LOST_SHARE

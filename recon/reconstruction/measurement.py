@@ -190,12 +190,7 @@ def depths_of(
     if options.model == "convolution":
         psf, _ = select_psf(calibration, _asked(calibration, options.z_um))
         same = next(k for k, own in enumerate(calibration.psfs) if np.shares_memory(own, psf))
-        own = slice(same, same + 1)
-        calibration = replace(
-            calibration,
-            psfs=calibration.psfs[own],
-            source_positions_um=calibration.source_positions_um[own],
-        )
+        calibration = calibration.part(slice(same, same + 1))
         return calibration, sort_by_depth(calibration), []
     depth = one_depth(calibration, options.z_um)
     try:
@@ -209,10 +204,8 @@ def depths_of(
 
 def central(calibration: Calibration) -> Calibration:
     """Return one PSF for the whole field of one depth: the one on the axis."""
-    positions = calibration.source_positions_um
-    nearest = int(np.argmin(np.nan_to_num(np.hypot(positions[:, 0], positions[:, 1]))))
-    own = slice(nearest, nearest + 1)
-    return replace(calibration, psfs=one_psf(calibration)[None], source_positions_um=positions[own])
+    nearest = calibration.part([calibration.nearest_to_axis()])
+    return replace(nearest, psfs=one_psf(calibration)[None])
 
 
 def _frames(frames: npt.ArrayLike, light: Floats) -> Floats:

@@ -120,10 +120,8 @@ OVER_TIME: tuple[OverTimeName, ...] = ("tv", "lowrank")
 
 JOINT_ITERATIONS = 60
 """Of a block that is solved together; its first ones are all cold."""
-
 JOINT_BLOCK = 16
 """Frames of such a block: 16 of a megapixel take 5 GB."""
-
 TIME_SHARE = 1.0
 """Penalty of the split over time relative to that of the pixels, whose scale it shares."""
 
@@ -142,7 +140,6 @@ class JointAdmm(SensorAdmm):
         A ``Convolution`` with a channel a frame, with or without ``Erasures`` after it.
     data, prior
         As of :class:`~recon.solvers.SensorAdmm`.
-    over_time : OverTime
     """
 
     def __init__(self, operator: LinearOperator, data: Array, prior: Prior, over_time: OverTime) -> None:
@@ -177,11 +174,8 @@ class JointAdmm(SensorAdmm):
 def require_joint(problem: Problem) -> None:
     """Refuse what a prior over time has no way for: frames are the channels of one problem.
 
-    Raises
-    ------
-    InputError
-        When frames are colour, or their camera has more than one PSF, one depth, or a background, which a
-        solver of one channel at a time cannot join; or another solver was asked for.
+    Raises InputError when frames are colour, or their camera has more than one PSF, one depth, or a
+    background, which a solver of one channel at a time cannot join; or another solver was asked for.
     """
     if not problem.flat:
         raise InputError("Priors over time take grey frames; reconstruct each channel on its own.")
@@ -208,6 +202,8 @@ def solve_together(
 ) -> Floats | None:
     """Reconstruct a block of frames with a prior over time.
 
+    Raises InputError when there are fewer than two frames, or as of :func:`require_joint`.
+
     Parameters
     ----------
     problem : Problem
@@ -218,7 +214,6 @@ def solve_together(
         Total variation along time, or low rank plus sparse (background and activity).
     weight : float, optional
         Of the prior over time relative to the frames' own; default 1.
-    iterations : int
     ended : callable
         Asked before each iteration; True gives the block up.
 
@@ -226,11 +221,6 @@ def solve_together(
     -------
     ndarray, float32, (n_frames, height, width), or None
         In the units of :func:`recon.reconstruct`; None when given up.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than two frames, or as of :func:`require_joint`.
     """
     require_joint(problem)
     if frames.ndim != 3 or len(frames) < 2:

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -127,27 +127,18 @@ def convergence_severity(
 # Maps -----------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Stress:
-    """A stress.
-
-    Attributes
-    ----------
-    key, label, unit : str
-    values : tuple of float
-        For the full size, rising.
-    quick : tuple of float
-        For the quick size.
-    logarithmic : bool
-    named : callable, optional
-        ``named(value, size)`` says what a value is in other units: the name of its tick.
-    """
+    """A stress."""
 
     key: str
     label: str
     unit: str
     values: tuple[float, ...]
+    """For the full size, rising."""
     quick: tuple[float, ...]
+    """For the quick size."""
     logarithmic: bool = False
     named: Callable[[float, Size], str] | None = None
+    """``named(value, size)`` says what a value is in other units: the name of its tick."""
 
     def at(self, size: Size) -> tuple[float, ...]:
         """Return the values of a size."""
@@ -156,21 +147,14 @@ class Stress:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One reconstruction under stress.
-
-    Attributes
-    ----------
-    error : float
-        What the map's ``error`` says: NRMSE after the best scale, or decibels.
-    severities : mapping
-        By criterion, see :mod:`recon.verdict.map`.
-    evidence : mapping
-        What the data alone tell (see :mod:`recon.verdict.evidence`); empty where nothing was reconstructed.
-    """
+    """One reconstruction under stress."""
 
     error: float
+    """What the map's ``error`` says: NRMSE after the best scale, or decibels."""
     severities: Severities
+    """By criterion, see :mod:`recon.verdict.map`."""
     evidence: Mapping[str, float] = field(default_factory=dict)
+    """What the data alone tell (see :mod:`recon.verdict.evidence`); empty where nothing was reconstructed."""
 
 
 TrialFunction = Callable[[str, float, float, int, Size], Trial]
@@ -179,39 +163,25 @@ TrialFunction = Callable[[str, float, float, int, Size], Trial]
 
 @dataclass(frozen=True, slots=True)
 class StressMap:
-    """A map to be made.
-
-    Attributes
-    ----------
-    name, title : str
-    question : str
-        What it answers, in plain words.
-    x, y : Stress
-    methods : tuple of str
-    trial : callable
-    error : str
-        What the errors are.
-    draws : int
-        Scenes a cell in the full size; the median severity counts.
-    base : str
-        What the trials start from, in words that change when it does; empty where that is not known.
-    """
+    """A map to be made."""
 
     name: str
     title: str
     question: str
+    """What it answers, in plain words."""
     x: Stress
     y: Stress
     methods: tuple[str, ...]
     trial: TrialFunction
     error: str = "NRMSE"
-    draws: int = 1
+    """What the errors are."""
     base: str = ""
+    """What the trials start from, in words that change when it does; empty where that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What a method gave at one place of a map: the median of the draws."""
+    """What a method gave at one place of a map."""
 
     method: str
     ix: int
@@ -220,7 +190,7 @@ class Cell:
     severity: float
     failure: Failure | None
     evidence: tuple[Mapping[str, float], ...]
-    """One mapping a draw, each with its own ``severity``."""
+    """Of each scene drawn, with its own ``severity``."""
     seconds: float
 
     def as_json(self) -> dict[str, Any]:
@@ -231,38 +201,24 @@ class Cell:
     @staticmethod
     def from_json(entry: Mapping[str, Any]) -> Cell:
         """Return the cell of a file's entry."""
-        names = ("method", "ix", "iy", "error", "severity", "failure", "evidence", "seconds")
         failure = None if entry["failure"] is None else Failure[entry["failure"].upper()]
-        return Cell(
-            **{n: entry[n] for n in names} | {"failure": failure, "evidence": tuple(entry["evidence"])}
-        )
+        known = {field.name: entry[field.name] for field in fields(Cell)}
+        return Cell(**known | {"failure": failure, "evidence": tuple(entry["evidence"])})
 
 
-def cell_of(method: str, ix: int, iy: int, trials: list[Trial], seconds: float) -> Cell:
-    """Summarise the draws of a cell."""
-    judged = [worst(t.severities) for t in trials]
-    order = np.argsort([severity for severity, _ in judged])
-    severity, failure = judged[int(order[len(order) // 2])]
-    evidence = tuple(
-        {**t.evidence, "severity": of} for t, (of, _) in zip(trials, judged, strict=True) if t.evidence
-    )
-    error = float(np.median([t.error for t in trials]))
-    return Cell(method, ix, iy, error, severity, failure, evidence, seconds)
-
-
-def severity_grid(cells: list[Cell], method: str, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """Return the severities of a method, (n_y, n_x); NaN where there is no cell yet."""
-    grid = np.full(shape, np.nan)
-    for cell in cells:
-        if cell.method == method:
-            grid[cell.iy, cell.ix] = cell.severity
-    return grid
+def cell_of(method: str, ix: int, iy: int, trial: Trial, seconds: float) -> Cell:
+    """Return the cell that a trial makes."""
+    severity, failure = worst(trial.severities)
+    evidence = ({**trial.evidence, "severity": severity},) if trial.evidence else ()
+    return Cell(method, ix, iy, float(trial.error), severity, failure, evidence, seconds)
 
 
 def boundary(
     x: tuple[float, ...], y: tuple[float, ...], severity: npt.NDArray[np.float64], *, logarithmic: bool
 ) -> list[tuple[float, float]]:
     """Return where each row crosses from working to failing, ``(x, y)``; other rows have no point.
+
+    ``severity`` is (n_y, n_x), NaN where it is not known.
 
     Between two cells the crossing is interpolated on the logarithm of the severity, along ``x`` or its
     logarithm. A row that crosses more than once counts where most of its cells are on the right side.
