@@ -35,7 +35,7 @@ from scipy import fft
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from instrument.reconstruction.options import InputOptions
+from instrument.reconstruction.options import InputOptions, VideoOptions
 from instrument.reconstruction.video import VideoRequest, prepare_video
 from instrument.reconstruction.video_work import cluster, in_process, on_cluster
 from recon.base.metrics import psnr
@@ -144,7 +144,7 @@ def overhead(psf, frames) -> dict[str, float]:
                     out=out,
                     psf=folder / "psf.npy",
                     inputs=InputOptions(dark=0.0, binning=1),
-                    block=8,
+                    video=VideoOptions(block=8),
                 )
                 job = prepare_video(request).job
                 blocks = list(range(len(job.blocks)))
@@ -173,7 +173,7 @@ def offline(psf, frames) -> float:
                 out=out,
                 psf=folder / "psf.npy",
                 inputs=InputOptions(dark=0.0, binning=1),
-                block=len(frames) // 2,
+                video=VideoOptions(block=len(frames) // 2),
             )
             job = prepare_video(request).job
             began_s = time.perf_counter()

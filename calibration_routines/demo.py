@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -36,7 +36,7 @@ from instrument.bench.bench import Bench, open_bench
 from instrument.bench.config_file import parse_config
 from instrument.files.atomic import write_text
 from instrument.files.errors import FileError
-from instrument.runs.finish import CtrlC
+from instrument.runs.finish import ctrl_c_remembered
 from instrument.runs.runner import RunStatus
 from instrument.runs.writer import free_name
 from recon import Reconstruction, reconstruct
@@ -204,8 +204,8 @@ class Journal:
 class _Stages(Listener):
     """Times the demo's stages, and hands on how each goes; Ctrl-C ends it at any of these moments."""
 
-    def __init__(self, journal: Journal, listener: Listener, ctrl_c: CtrlC) -> None:
-        self._journal, self._listener, self._ctrl_c = journal, listener, ctrl_c
+    def __init__(self, journal: Journal, listener: Listener, check: Callable[[], None]) -> None:
+        self._journal, self._listener, self._check = journal, listener, check
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -213,10 +213,10 @@ class _Stages(Listener):
         with self._journal.stage(name):
             self._listener.step(name)
             yield
-            self._ctrl_c.check()
+            self._check()
 
     def share(self, done: float, total: float, *, at_most: bool = False) -> None:
-        self._ctrl_c.check()
+        self._check()
         self._listener.share(done, total, at_most=at_most)
 
     def frame(self, status: RunStatus) -> None:
@@ -265,8 +265,8 @@ def run_demo(
     journal = Journal(place)
     try:
         journal.note(state="running")
-        with CtrlC() as ctrl_c:
-            return _run(place, listener or Listener(), settings, journal, ctrl_c)
+        with ctrl_c_remembered() as check:
+            return _run(place, listener or Listener(), settings, journal, check)
     except BaseException as error:
         aborted = isinstance(error, KeyboardInterrupt | SystemExit)
         journal.note(state="aborted" if aborted else "failed", error=str(error) or type(error).__name__)
@@ -275,9 +275,9 @@ def run_demo(
 
 
 def _run(
-    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, ctrl_c: CtrlC
+    place: Path, listener: Listener, settings: DemoSettings, journal: Journal, check: Callable[[], None]
 ) -> DemoResult:
-    stages = _Stages(journal, listener, ctrl_c)
+    stages = _Stages(journal, listener, check)
     stage = stages.stage
     write_text(place / "bench.toml", settings.bench_toml())
     with stage("open the bench"):
