@@ -80,6 +80,11 @@ def settle_checkpoint(
         return told
     if keeper.resumed_from:
         told["Went on"] = f"from iteration {keeper.resumed_from} in {keeper.folder}"
+    if keeper.left_aside:
+        told["Begun anew"] = (
+            f"{', '.join(keeper.left_aside)} in {keeper.folder} is of an older version, or of another "
+            "choice of auto, and was not gone on with"
+        )
     if all(reason in _FINISHED for reason in reasons):
         keeper.remove()
         told["Checkpoint"] = "removed: the work has come to its end"
@@ -109,6 +114,11 @@ class CheckpointFolder:
         What decides the result, JSON-compatible: a folder kept for something else is refused.
     every_s : float
         Least time between two writings of a part.
+
+    Attributes
+    ----------
+    left_aside : tuple of str
+        Files of work that is not gone on with: of an older version, or of another choice of ``auto``.
     """
 
     def __init__(self, folder: Path, problem: Mapping[str, Any], *, every_s: float = EVERY_S) -> None:
@@ -116,6 +126,8 @@ class CheckpointFolder:
         self._every_s = every_s
         self._written = time.monotonic()
         self._resumed: dict[str, int] = {}
+        self._kept = False
+        self.left_aside: tuple[str, ...] = ()
         problem = plain(dict(problem))
         if folder.exists() and not folder.is_dir():
             raise FileError(
@@ -139,6 +151,8 @@ class CheckpointFolder:
         """Restore what was kept of a part, if anything, and return its history so far."""
         path = self._path(part)
         if not path.is_file():
+            if not self._resumed and not self._kept:
+                self.left_aside = tuple(sorted(other.name for other in self.folder.glob("*.npz")))
             return ()
         try:
             with np.load(path, allow_pickle=False) as kept:
@@ -166,7 +180,7 @@ class CheckpointFolder:
         state = {f"{_STATE}{name}": value for name, value in _flat(solver.checkpoint(copy=False)).items()}
         with whole_file(self._path(part)) as temporary:
             np.savez(temporary, history=np.array([astuple(r) for r in history]), **state)
-        self._written = time.monotonic()
+        self._written, self._kept = time.monotonic(), True
 
     def remove(self) -> None:
         """Delete the folder: there is nothing left to go on with."""
